@@ -11,6 +11,7 @@ from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging import addresses
+from shearloop.drivers import ranges
 from shearloop.drivers.defaults import (
     ADC_FULL_SCALE_V,
     DAQ_RATE_HZ,
@@ -43,7 +44,8 @@ def _known_transport(address: str) -> str:
 
 
 Address = Annotated[str, AfterValidator(_known_transport)]
-Channel = Annotated[int, Field(ge=1)]
+# A multimeter's channels are numbered with the slot first, such as 1601.
+Channel = Annotated[int, Field(ge=1, le=9999)]
 FingertipName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
 
 
@@ -200,8 +202,8 @@ class RecordingConfig(ConfigModel):
 class EventConfig(ConfigModel):
     """A command to an emulated device during an experiment."""
 
-    step: int = Field(ge=1, description="number of the experiment's step, from 1")
-    held_for_s: float = Field(0.0, ge=0, description="delay after the step begins to hold its torque or angle")
+    step: int = Field(ge=1, le=1000, description="number of the experiment's step, from 1")
+    held_for_s: ranges.Seconds = Field(0.0, description="delay after the step begins to hold its torque or angle")
     command: str = Field(min_length=1, pattern=r"^[^\n]*$", description="see the emulator's --help")
 
 

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 from pydantic import TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema
 
+from shearloop.units import unit_of
+
 # Module and class that read each kind of file.
 MODELS = {
     "configuration": ("shearloop.daemon.config", "DaemonConfig"),
@@ -16,8 +18,6 @@ MODELS = {
     "bank": ("shearloop.daemon.bank_config", "BankConfig"),
     "fingertip": ("shearloop.daemon.bank_config", "FingertipGeometryConfig"),
 }
-_UNITS = {"nm": "N·m", "ma": "mA", "deg": "°", "hz": "Hz", "v": "V", "n": "N", "hour": "h", "s2": "s²"}
-_UNITS |= {unit: unit for unit in ("m", "cm", "mm", "rad", "s")}
 
 
 class _Untitled(GenerateJsonSchema):
@@ -33,18 +33,6 @@ class Section(NamedTuple):
 
     paths: list[str]
     schema: dict[str, Any]
-
-
-def unit_of(key: str) -> str:
-    """Return the unit that a key ends with, such as rad/s for `wrist_speed_rad_per_s`, or an empty text."""
-    name, _, per = key.partition("_per_")
-    units: list[str] = []
-    for part in reversed(name.split("_")[1:]):
-        if part not in _UNITS:
-            break
-        units.insert(0, _UNITS[part])
-    unit = ", ".join(units)
-    return f"{unit or 1}/{_UNITS[per]}" if per in _UNITS else unit
 
 
 def schema_of(kind: str) -> dict[str, Any]:

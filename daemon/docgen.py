@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from shearloop.daemon.cli.command import COMMANDS
-from shearloop.daemon.config_schema import MODELS, Section, references, schema_of, schema_text, sections, unit_of
+from shearloop.daemon.config_schema import MODELS, Section, references, schema_of, schema_text, sections
 from shearloop.daemon.control.safety import TABLE, Response
 from shearloop.daemon.messaging.messages import TOPICS, Message
 from shearloop.daemon.recording.schema import json_type
+from shearloop.units import unit_of
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 EXAMPLES = DOCS / "examples"
@@ -113,9 +114,9 @@ def _value(found: Mapping[str, Any]) -> str:
     if any(references(found)) or found["type"] == "object":
         return "list of sections" if "items" in found else "section"
     if found["type"] == "array":
-        items = found.get("items") or found["prefixItems"][0]
         count = f" of {found['minItems']}" if found.get("minItems") == found.get("maxItems", 0) else ""
-        return f"list{count}: {_value(items)}"
+        kinds = dict.fromkeys(_value(one) for one in found.get("prefixItems") or [found["items"]])
+        return f"list{count}: {', then '.join(kinds)}"
     names = {"string": "path" if found.get("format") == "path" else "text", "boolean": "true or false"}
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
     bounds = [f"{sign} {found[name]:g}" for name, sign in signs.items() if name in found]

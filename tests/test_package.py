@@ -51,7 +51,8 @@ def test_no_module_imports_the_folders_at_the_top_by_themselves():
 
 def test_the_version_and_its_date_are_the_same_everywhere():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    newest = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)[0]
+    sections = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    newest = next(section for section in sections if section != "Unreleased")
     assert newest == f"{citation['version']} ({citation['date-released']})"
     assert citation["version"] == PROJECT["version"]
     links = PROJECT["urls"].values()

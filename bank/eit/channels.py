@@ -5,6 +5,7 @@ recording; files made under another table are refused by name.
 """
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeVar
@@ -107,11 +108,62 @@ class ChannelTable:
         first, second = self.twins
         return np.asarray((differences[..., first] + differences[..., second]) / 2)
 
+    def name_dead(self, dead: BoolArray) -> list[str]:
+        """Return the electrodes, pairs and currents whose channels are all dead, by (n,) dead channels.
+
+        An electrode measures in two pairs, and drives in two injections, which an opposite one shares with another.
+        """
+        if dead.all():
+            return ["every electrode"]
+        named, explained = [], np.zeros(self.n_channels, dtype=np.bool_)
+        for name, own in self._groups:
+            if dead[own].all() and not explained[own].all():
+                named.append(f"{np.count_nonzero(own)} channels {name}")
+                explained |= own
+        return named
+
+    def still_groups(self, still: BoolArray) -> BoolArray:
+        """Return the (n,) channels that one contact can silence together, and that are all still by (n,) `still`.
+
+        A single channel may stand still by chance.
+        """
+        own = [group for _, group in self._groups if still[group].all()]
+        return np.any(own, axis=0) if own else np.zeros_like(still)
+
+    @cached_property
+    def _groups(self) -> tuple[tuple[str, BoolArray], ...]:
+        return tuple(self._list_groups())
+
+    def _list_groups(self) -> Iterator[tuple[str, BoolArray]]:
+        """Yield the channels that one contact can silence, with its name, the largest groups first."""
+        sink, source, positive, negative = self.electrodes.T
+        every = range(self.n_electrodes)
+        for electrode in every:
+            yield f"of {electrode_name(electrode)}", (positive == electrode) | (negative == electrode)
+        for electrode in every:
+            driven = (sink == electrode) | (source == electrode)
+            # An opposite injection is the only one of both its electrodes.
+            shared = sorted({*sink[driven].tolist(), *source[driven].tolist()})
+            electrodes = shared if len(shared) == 2 else [electrode]
+            yield f"driven through {' and '.join(map(electrode_name, electrodes))}", driven
+        for electrode in every:
+            pair = electrode_name(electrode), electrode_name((electrode + 1) % self.n_electrodes)
+            yield f"between {' and '.join(pair)}", positive == electrode
+        for electrode in every:
+            own = sink == electrode
+            source_name = electrode_name(int(source[own][0]))
+            yield f"driven from {source_name} to {electrode_name(electrode)}", own
+
     def _pairs(self) -> IntArray:
         injection, pair = np.divmod(np.arange(self.n_line_values), self.n_electrodes)
         step = self.n_electrodes // 2 if self.injection == "opposite" else 1
         source, negative = (injection + step) % self.n_electrodes, (pair + 1) % self.n_electrodes
         return np.column_stack([injection, source, pair, negative])
+
+
+def electrode_name(electrode: int) -> str:
+    """Return the name of an electrode, counted from 0 as in a fingertip's file, and of its pin, counted from 1."""
+    return f"electrode {electrode} (pin {electrode + 1})"
 
 
 PAPER_TABLE = ChannelTable()

@@ -87,7 +87,10 @@ class Calibration:
             )
         tools = f"tools of {law.low_mm:g} to {law.high_mm:g} mm, whose torques differ"
         if tool is None:
-            raise CalibrationError(f"the calibration is of {tools}: name the held tool's diameter")
+            raise CalibrationError(
+                f"there is no torque without the tool's diameter, because the calibration is of {tools}: name the "
+                "tool's diameter, or let a calibrated gripper measure it"
+            )
         if (gain := law.gain(tool.value)) is None:
             raise CalibrationError(
                 f"the tool has {tool.value:.3g} mm, too far from the calibration's {tools}: calibrate with this tool"

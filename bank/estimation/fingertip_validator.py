@@ -60,6 +60,8 @@ _LEAST_LOADED = 3
 _LEAST_RELEASED = 10
 
 
+# A channel that reads 0 in more of a part's frames is dead at calibration.
+_SILENT_SHARE = 0.05
 # The threshold's largest share of the way from idle to the weakest grip.
 _LARGEST_RISE = 1 / 3
 
@@ -96,6 +98,8 @@ class FingertipValidator:
             )
         bases = [np.median(idle, axis=0) for idle, _, _ in recordings]
         noise = np.sqrt(np.mean([channel_noise(gripped) ** 2 for _, gripped, _ in recordings], axis=0))
+        silent = np.max([(part == 0.0).mean(axis=0) for one in recordings for part in one[:2]], axis=0)
+        noise = np.where(silent > _SILENT_SHARE, np.inf, noise)
         base = np.mean(bases, axis=0)
         scale = np.where(np.isfinite(noise), noise, 1.0) / (base + SMALL_V)
         floor = 0.3 * float(np.median(scale))
@@ -284,8 +288,9 @@ def relative_change(frame: FloatArray, idle: FloatArray) -> FloatArray:
     return np.asarray((frame - idle) / (idle + SMALL_V))
 
 
-def mask_saturated(channels: FloatArray, usable: BoolArray) -> BoolArray:
-    """Return the (m, c) usable channels without those at an amplifier's rail."""
+def mask_unmeasured(channels: FloatArray, usable: BoolArray) -> BoolArray:
+    """Return the (m, c) usable channels without those at an amplifier's rail, and those where the board sends 0."""
+    usable = usable & (channels != 0.0)
     heights = np.where(usable, channels, -np.inf)
     largest = heights == heights.max(axis=-1, keepdims=True)
     at_rail = largest & (np.count_nonzero(largest, axis=-1) >= _FEWEST_AT_RAIL)[:, None]

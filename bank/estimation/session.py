@@ -63,12 +63,37 @@ class Adaptation:
     after: LoadedFit
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Grip:
-    """The latest frames of a grip with a torque: times and features; and the torque's model with the grip's gain."""
+    """The latest frames of a grip with a torque: times and features; and the correction of its gain."""
 
     frames: deque[tuple[float, FloatArray]] = field(default_factory=lambda: deque(maxlen=_ADAPTED_FRAMES))
-    adapted: dict[Quantity, OutputModel] = field(default_factory=dict)
+    corrected: "_Corrected | None" = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Corrected:
+    """The torque's model with the gain of a grip, and the held tool that it was made with."""
+
+    model: OutputModel
+    tool: Measured | None
+
+    def for_tool(self, tool: Measured | None, whole: Calibration) -> OutputModel:
+        """Return the model for a tool that is measured anew, by the law of the tools in the `whole` calibration.
+
+        The correction is the fingertip's, and the law the tool's: a torque on another diameter is as much larger as
+        without the correction. A diameter within the uncertainty of the earlier one is the same tool's.
+        """
+        law, before, regressor = whole.tools, self.tool, self.model.regressor
+        if law is None or tool is None or before is None or tool == before:
+            return self.model
+        gain_before, gain = law.gain(before.value), law.gain(tool.value)
+        if gain_before is None or gain is None:
+            # Such a tool has no torque.
+            return self.model
+        same_tool = abs(tool.value - before.value) <= tool.half_width + before.half_width
+        spread = regressor.gain.between if same_tool else math.hypot(regressor.gain.between, law.spread)
+        return replace(self.model, regressor=regressor.scaled(gain / gain_before, spread))
 
 
 class EstimatorSession:
@@ -100,6 +125,7 @@ class EstimatorSession:
 
     def set_tool(self, tool: Measured | None) -> None:
         """Set the diameter in mm of the held tool, None where unknown."""
+        self._tool = tool
         self._tool_reasons: tuple[str, ...] = ()
         try:
             self._calibration = self.calibration.for_tool(tool)
@@ -132,6 +158,11 @@ class EstimatorSession:
         self._grip = _Grip()
 
     @property
+    def why_no_torque(self) -> str:
+        """Why the held tool leaves no torque, though there may be a diameter; empty where it does not."""
+        return "; ".join(self._tool_reasons)
+
+    @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
         return self._state.taring
@@ -144,14 +175,18 @@ class EstimatorSession:
     def adapt(self, torque_nm: FloatArray) -> Adaptation:
         """Correct the gain until the next grip or tare, by torques (n,) measured at `grip_t_s`, NaN where unknown.
 
-        Always starts from the calibration's gain. Raises CalibrationError as `Calibration.correct_gain` does.
+        Always starts from the calibration's gain. Raises CalibrationError as `Calibration.correct_gain` does, and for a
+        tool without a torque.
         """
+        if self._tool_reasons:
+            raise CalibrationError(self._tool_reasons[0])
         calibration, grip, known = self._calibration, self._grip, np.isfinite(torque_nm)
         width = len(calibration.gain_regressor().mean_feature)
         features = np.array([row for _, row in grip.frames]).reshape(-1, width)[known]
+        before = self._models()["torque"]
         adapted, correction = calibration.correct_gain(features, torque_nm[known])
-        before, after = (calibration.outputs | grip.adapted)["torque"], adapted.outputs["torque"]
-        grip.adapted["torque"] = after
+        after = adapted.outputs["torque"]
+        grip.corrected = _Corrected(after, self._tool)
         rows = np.concatenate(find_twists(torque_nm[known]))
         truth = torque_nm[known][rows]
         return Adaptation(correction, *(LoadedFit.of(one, features[rows], truth) for one in (before, after)))
@@ -168,8 +203,8 @@ class EstimatorSession:
                 f"shape {frame.channels.shape}"
             )
         self.difference = None
-        # Noise makes every side of a new frame differ.
-        repeats = (frame.channels == self._latest).all(axis=1).any()
+        # Noise makes every side of a new frame differ, except where no channel has a signal.
+        repeats = ((frame.channels == self._latest).all(axis=1) & frame.channels.any(axis=1)).any()
         self._latest = frame.channels
         if repeats and self.calibration.kind == "raw":
             return Estimate(valid=False, reasons=REPEATED_FRAME)
@@ -212,11 +247,16 @@ class EstimatorSession:
             values.clear()
         return _estimate(values, reasons, match)
 
+    def _models(self) -> dict[Quantity, OutputModel]:
+        """Return the model of each quantity for the held tool, with the grip's gain."""
+        models, corrected = self._calibration.outputs, self._grip.corrected
+        return models if corrected is None else models | {"torque": corrected.for_tool(self._tool, self.calibration)}
+
     def _select_outputs(self, frame: ProcessedFrame) -> tuple[dict[Quantity, OutputModel], dict[str, None]]:
         """Return the models to apply to a frame, and the reasons against the others, in order."""
         outputs: dict[Quantity, OutputModel] = {}
         reasons: dict[str, None] = dict.fromkeys(() if self.calibration.outputs else _UNCALIBRATED)
-        for quantity, model in (self._calibration.outputs | self._grip.adapted).items():
+        for quantity, model in self._models().items():
             if quantity == "diameter" and not frame.has_baseline:
                 # The gel's position means nothing without its idle position.
                 continue

@@ -22,7 +22,7 @@ from shearloop.bank.estimation.fingertip_validator import (
     FingertipSet,
     FingertipValidator,
     GripDetector,
-    mask_saturated,
+    mask_unmeasured,
 )
 from shearloop.bank.estimation.values import TactileFrame
 from shearloop.words import counted
@@ -307,7 +307,7 @@ class SessionState:
 
         There are no shares without an earlier frame.
         """
-        usable = mask_saturated(frame.channels, frame.usable)
+        usable = mask_unmeasured(frame.channels, frame.usable)
         channels = frame.channels if usable.all() else self._fill(frame.channels, usable)
         reasons, lost = self._fingertips.check(channels, usable)
         # Channels that stay lost are left out; while they are being lost they count as jumping.
@@ -352,7 +352,7 @@ class SessionState:
         for layer in self._idle.idle_sides(channels):
             back = self._unknown[layer]
             if back.any():
-                back = back & (mask_saturated(frame.channels, frame.usable) & ~self._lost)[layer]
+                back = back & (mask_unmeasured(frame.channels, frame.usable) & ~self._lost)[layer]
                 channels[layer, back] = frame.channels[layer, back]
                 self._unknown[layer] &= ~back
             self._idle.follow(layer, channels[layer], restart=bool(back.any()))
@@ -392,6 +392,10 @@ class PaperState:
         self._max_gap_s = max_gap_s
         self._tare_frames: list[FloatArray] = []
         self._latest: deque[tuple[float, FloatArray]] = deque(maxlen=average_frames)
+        # The channels of the last frame; an unusable one keeps its last usable value.
+        self._before: FloatArray | None = None
+        # Channels that were unusable when the tare began: their idle voltages are unknown.
+        self._unknown: BoolArray = np.zeros(0, dtype=np.bool_)
 
     @property
     def taring(self) -> bool:
@@ -400,29 +404,34 @@ class PaperState:
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next frame of one side and return it with the reasons against it."""
-        channels = frame.channels
-        unusable = int(np.count_nonzero(~frame.usable))
-        if unusable > _PAPER_UNUSABLE_SHARE * channels.size:
+        usable = frame.usable & (frame.channels != 0.0)
+        if self._before is not None:
+            usable &= ~self._unknown
+        unusable = int(np.count_nonzero(~usable))
+        if unusable > _PAPER_UNUSABLE_SHARE * usable.size:
             return ProcessedFrame.refused(
-                frame.usable,
-                f"{unusable} of {channels.size} channels are saturated or dead; "
+                usable,
+                f"{unusable} of {usable.size} channels are saturated or dead; "
                 "check the ribbon cable and the gel's contact with the electrodes",
             )
+        if self._before is None:
+            self._unknown, self._before = ~usable[0], frame.channels[0]
+        self._before = channels = np.where(usable[0], frame.channels[0], self._before)
         if self.taring:
-            self._tare_frames.append(channels[0])
+            self._tare_frames.append(channels)
             n, wanted = len(self._tare_frames), self._baseline_frames
-            return ProcessedFrame.refused(frame.usable, f"taking the idle frame, {n} of {wanted}")
+            return ProcessedFrame.refused(usable, f"taking the idle frame, {n} of {wanted}")
         if self._latest and frame.t_s - self._latest[-1][0] > self._max_gap_s:
             self._latest.clear()
-        self._latest.append((frame.t_s, channels[0]))
+        self._latest.append((frame.t_s, channels))
         mean = np.mean([one for _, one in self._latest], axis=0)
         difference = mean - self._idle_frame
         n = len(self._latest)
         noise = self._noise * math.sqrt(1.0 / n + 1.0 / self._baseline_frames)
         if (reason := signal_above_noise(difference, noise)) is not None:
-            return ProcessedFrame.refused(frame.usable, reason)
+            return ProcessedFrame.refused(usable, reason)
         lag_s = frame.t_s - sum(t_s for t_s, _ in self._latest) / n
-        return ProcessedFrame(difference[None], (), frame.usable, lag_s=lag_s)
+        return ProcessedFrame(difference[None], (), usable, lag_s=lag_s)
 
     @cached_property
     def _idle_frame(self) -> FloatArray:

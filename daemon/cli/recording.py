@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -95,6 +96,12 @@ def _summary_text(found: "RecordingSummary") -> str:
         lines.append(f"  It was not closed, or is being written; {torn} incomplete. {cure}.")
     if found.damaged_chunks:
         lines.append(f"  {counted(found.damaged_chunks, 'chunk is', 'chunks are')} damaged and left out.")
+    if found.damaged_attachments:
+        lines.append(
+            f"  {counted(found.damaged_attachments, 'attachment is', 'attachments are')} damaged and left out."
+        )
+    if found.lost:
+        lines.append(f"  Lost with them: {_lost_text(found.lost)}.")
     if found.dropped:
         dropped = counted(found.dropped, "message was", "messages were")
         lines.append(f"  {dropped} dropped because the disk was too slow.")
@@ -109,9 +116,15 @@ def _repair(args: argparse.Namespace) -> int:
         result = repair(path, args.out, progress)
     lost = [f"{counted(result.torn_bytes, 'incomplete byte')} at the end"] if result.torn_bytes else []
     lost += [counted(result.damaged_chunks, "damaged chunk")] if result.damaged_chunks else []
+    lost += [counted(result.damaged_attachments, "damaged attachment")] if result.damaged_attachments else []
     saved = counted(result.messages, "message is", "messages are")
-    sentence = f"{result.path}: {saved} saved; left out: {' and '.join(lost) or 'nothing'}."
-    return print_result({**asdict(result), "path": str(result.path)}, [sentence], as_json=args.json)
+    sentences = [f"{result.path}: {saved} saved; left out: {' and '.join(lost) or 'nothing'}."]
+    sentences += [f"Lost: {_lost_text(result.lost)}."] if result.lost else []
+    return print_result({**asdict(result), "path": str(result.path)}, sentences, as_json=args.json)
+
+
+def _lost_text(lost: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} of {topic}" for topic, count in lost.items())
 
 
 def _export(args: argparse.Namespace) -> int:

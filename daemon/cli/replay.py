@@ -71,7 +71,7 @@ async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Nam
         opened.callback(publisher.close)
         replay = Replay(run, config, publisher, clock)
         if args.show:
-            publisher.add_listener(partial(print_estimate, sys.stdout))
+            publisher.add_listener(partial(print_estimate, sys.stdout), raises=True)
         while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - the publisher has no event
             await asyncio.sleep(0.05)
         progress = opened.enter_context(progress_bar(run.path.name, sum(run.counts.values()), "message"))

@@ -171,41 +171,50 @@ def message_json(topic: str, content: Mapping[str, Any]) -> str:
     def plain(value: Any) -> Any:
         return value.tolist() if hasattr(value, "tolist") else str(value)
 
-    return to_json({"topic": topic, **content}, inf_nan_mode="null", bytes_mode="base64", fallback=plain).decode()
+    compact = to_json({"topic": topic, **content}, inf_nan_mode="null", bytes_mode="base64", fallback=plain)
+    return json.dumps(json.loads(compact), ensure_ascii=False)
 
 
 def _estimate(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no estimate: {content['reason']}"
-    parts = [f"torque {_number(content, 'torque_nm', '+.4f', 'N·m')} {_interval(content, 'torque', 'nm', '+.4f')}"]
-    if content["diameter_mm"] is not None:
-        parts.append(f"diameter {_number(content, 'diameter_mm', '5.1f', 'mm')}")
-    if content["k"] is not None:
-        # The model of the bank decides whether k is a length.
-        parts.append(f"k {_number(content, 'k', '.3f')}  sigma {_number(content, 'sigma', '.3f', 'cm')}")
-    if content["score"] is not None:
-        parts.append(f"score {_number(content, 'score', '.3f')}")
-    return "   ".join(parts)
+    torque = _with_interval(content, "torque", "nm", "torque {:+.4f} N·m", "[{:+.4f}, {:+.4f}]")
+    details = (
+        _present("diameter {:5.1f} mm", content["diameter_mm"]),
+        _present("k {:.3f}  sigma {:.3f} cm", content["k"], content["sigma"]),
+        _present("score {:.3f}", content["score"]),
+    )
+    return "   ".join(filter(None, (torque or "no torque", *details)))
 
 
 def _shear(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no force: {content['reason']}"
-    parts = [f"shear {_number(content, 'shear_n', '+.3f', 'N')} {_interval(content, 'shear', 'n', '+.3f')}"]
-    if content["torque_nm"] is not None:
-        parts.append(f"torque {_number(content, 'torque_nm', '+.4f', 'N·m')}")
-    parts.append(f"response {_number(content, 'response', '+.5f')}")
-    parts.append("within the deadband" if content["deadband"] else content["direction"])
-    return "   ".join(parts)
+    shear = _with_interval(content, "shear", "n", "shear {:+.3f} N", "[{:+.3f}, {:+.3f}]")
+    details = (
+        _present("torque {:+.4f} N·m", content["torque_nm"]),
+        _present("response {:+.5f}", content["response"]),
+        "within the deadband" if content["deadband"] else content["direction"],
+    )
+    return "   ".join(filter(None, (shear or "no force", *details)))
 
 
-def _number(content: Mapping[str, Any], key: str, form: str, unit: str = "") -> str:
-    """Return a value with its unit, or "unknown" where there is none."""
-    return "unknown" if content[key] is None else f"{content[key]:{form}} {unit}".rstrip()
+def _with_interval(content: Mapping[str, Any], name: str, unit: str, value: str, interval: str) -> str:
+    """Return a value with its interval, or alone without one end of it; empty without the value."""
+    shown = _present(value, content[f"{name}_{unit}"])
+    ends = _present(interval, content[f"{name}_low_{unit}"], content[f"{name}_high_{unit}"])
+    return f"{shown} {ends}" if shown and ends else shown
 
 
-def _interval(content: Mapping[str, Any], name: str, unit: str, form: str) -> str:
-    return f"[{_number(content, f'{name}_low_{unit}', form)}, {_number(content, f'{name}_high_{unit}', form)}]"
+def _present(pattern: str, *values: float | None) -> str:
+    """Return the values in their pattern, empty if one of them is None."""
+    return "" if any(value is None for value in values) else pattern.format(*values)
+
+
+def _load(content: Mapping[str, Any]) -> str:
+    if not content["valid"]:
+        return f"no torque: {content['reason']}   raw {content['raw']:.10g}"
+    return f"torque {content['torque_nm']:+.4f} N·m   raw {content['raw']:.10g}"
 
 
 def loop_line(content: Mapping[str, Any]) -> str:
@@ -283,6 +292,7 @@ def _value(value: object) -> str:
 _BODIES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "eit.estimate": _estimate,
     "skin.shear": _shear,
+    "load.torque": _load,
     "loop.state": loop_line,
     "health": _health,
 }

@@ -289,15 +289,16 @@ class ControlLoop:
             experiment.fail(f"{uncertain}; put a `grip` or a `release` before it")
         awaited = self._awaited_torques(experiment, t_ns)
         still = held or awaited is not None or experiment.phase is ExperimentPhase.PAUSED
-        if isinstance(command.wrist, TrackTorque) and wrist.tracked != command.wrist and not still:
-            reason = wrist.close_loop(command.wrist, t_ns, wrist_rad, experiment.limits.torque_nm)
+        limit_nm = experiment.limits.torque_nm
+        if isinstance(command.wrist, TrackTorque) and not still and not wrist.tracks(command.wrist, limit_nm):
+            reason = wrist.close_loop(command.wrist, t_ns, wrist_rad, limit_nm)
             if reason:
                 experiment.fail(reason)
         if not experiment.running:
             return self._ended(decision)
         action = command.action if command.action is not None and not still and experiment.begin_action() else None
         if isinstance(action, IdentifyStep):
-            wrist.begin_identification(action, experiment.limits.torque_nm)
+            wrist.begin_identification(action, limit_nm)
             action = None
         if still:
             velocity = wrist.hold()

@@ -13,18 +13,8 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.daemon.cli.check import check_parts
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
-from shearloop.daemon.doctor.devices import (
-    Finding,
-    check_daemon,
-    check_devices,
-    daemon_tasks,
-    from_error,
-    from_file,
-    good,
-    listen_for_frames,
-    note,
-    trouble,
-)
+from shearloop.daemon.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
+from shearloop.daemon.doctor.findings import Finding, from_error, from_file, good, note, trouble
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.serial_ports import list_serial_ports
 from shearloop.drivers.ur.client import missing_library

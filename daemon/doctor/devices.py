@@ -2,85 +2,51 @@
 
 import asyncio
 import contextlib
-import errno
-import os
 import time
 from collections import defaultdict
-from collections.abc import AsyncIterator, Awaitable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Awaitable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from shearloop.daemon.cli.terminal import task_row
-from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
+from shearloop.daemon.config import DaemonConfig, GripperConfig, SerialDevice
+from shearloop.daemon.doctor.boards import (
+    check_adc,
+    check_channels,
+    check_fingertip,
+    check_load_cell,
+    check_port,
+    check_rate,
+)
+from shearloop.daemon.doctor.findings import Finding, from_error, good, note, split_cure, trouble
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.sensing.frame_estimator import fingertip_table
-from shearloop.daemon.serial_ports import access_error
-from shearloop.drivers.connection import SerialLink, find_port
-from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
 from shearloop.drivers.ur.control_box import query_controller, untested_sentence
 from shearloop.drivers.ur.settings import read_settings
 
-# A larger relative difference between measured and configured rate is reported.
-RATE_TOLERANCE = 0.1
 ROBOT_TIMEOUT_S = 2.0
 DAEMON_TIMEOUT_S = 1.0
-MISSING = os.strerror(errno.ENOENT)
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One check's result. `means` and `next_step` are empty when all is well."""
-
-    subject: str
-    found: str
-    means: str = ""
-    next_step: str = ""
-    state: Literal["good", "note", "trouble"] = "good"
-
-
-# All is well; something works, but not as well as it could; something keeps the loop from working.
-good, note, trouble = Finding, partial(Finding, state="note"), partial(Finding, state="trouble")
-
-
-def from_error(subject: str, error: Exception | str, means: str) -> Finding:
-    """Return the finding for an error; the text after its last `;` or full stop is the cure."""
-    sentence = str(error)
-    for mark in ("; ", ". "):
-        what, found, cure = sentence.rpartition(mark)
-        if found:
-            return trouble(subject, what, means, cure.rstrip("."))
-    return from_file(subject, sentence, means)
-
-
-def from_file(subject: str, sentence: str, means: str) -> Finding:
-    """Return the finding for a file; the sentence names all of its mistakes."""
-    cure = "make the file, or correct its name" if MISSING in sentence else "correct the file"
-    return trouble(subject, sentence, means, f"{cure}, then run `shearloop doctor CONFIG` again")
 
 
 async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
     """Open every device, listen to all at once for `seconds`, and return findings in the configuration's order."""
     checks: list[Awaitable[list[Finding]]] = [
-        _check_fingertip(name, fingertip, seconds) for name, fingertip in config.fingertips.items()
+        check_fingertip(name, fingertip, seconds) for name, fingertip in config.fingertips.items()
     ]
     if config.load_cell is not None:
-        checks.append(_check_load_cell(config.load_cell, seconds))
+        checks.append(check_load_cell(config.load_cell, seconds))
     if config.skin is not None:
-        daq = config.skin.daq.adc
-        ports = {"skin's source": config.skin.source.serial, "skin's DAQ": None if daq is None else daq.device}
-        for name, device in ports.items():
-            if device is not None:
-                checks.append(asyncio.to_thread(lambda *args: [check_port(*args)], name, device))
+        if config.skin.source.serial is not None:
+            checks.append(asyncio.to_thread(_check_source, config.skin.source.serial))
+        if config.skin.daq.adc is not None:
+            checks.append(check_adc("skin's DAQ", config.skin.daq.adc, config.skin.daq.rate_hz, seconds))
     if config.gripper is not None:
         checks.append(_check_gripper(config.gripper))
     if config.robot is not None:
@@ -88,98 +54,8 @@ async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
     return [finding for findings in await asyncio.gather(*checks) for finding in findings]
 
 
-def check_port(name: str, device: SerialDevice) -> Finding:
-    """Check that a serial device is plugged in and may be opened; does not open it."""
-    subject = f"port of {name}"
-    try:
-        path = find_port(serial_number=device.serial_number, path=str(device.path) if device.path else None)
-    except DriverError as error:
-        cure = "plug the board in, or correct its name in the configuration: `shearloop ports` lists the boards"
-        return trouble(subject, str(error), "the board is not plugged in, or has another serial number", cure)
-    denied = access_error(path)
-    if denied:
-        what, _, cure = denied.partition("; ")
-        return trouble(subject, f"{path} exists, but {what}", "the daemon cannot read the board", cure)
-    by = f"serial number {device.serial_number}" if device.serial_number else "its path"
-    return good(subject, f"{os.path.realpath(path)}, found by {by}")
-
-
-def check_rate(subject: str, measured_hz: float | None, configured_hz: float) -> Finding:
-    """Compare a measured rate with the configured one; None means that nothing came."""
-    if measured_hz is None:
-        means = "the device is silent: no power, another program's port, or another board"
-        cure = "check its power; unplug it and plug it in again"
-        return trouble(subject, "nothing was received", means, cure)
-    found = f"{measured_hz:.3g} Hz measured, {configured_hz:.3g} Hz configured"
-    if abs(measured_hz / configured_hz - 1.0) > RATE_TOLERANCE:
-        means = "freshness is judged by the configured rate: the loop may hold needlessly, or too late"
-        cure = f"configure {measured_hz:.3g} Hz (frame_period_s {1.0 / measured_hz:.4f})"
-        return note(subject, found, means, cure)
-    return good(subject, found)
-
-
-def check_channels(name: str, saturated: int, dead: int, frames: int) -> Finding:
-    """Judge the numbers of saturated and dead channels."""
-    subject = f"channels of {name}"
-    found = f"{saturated} saturated and {dead} dead of the channels in {frames} frames"
-    if saturated:
-        means = "more signal than the converter can measure: a short, or too much current; every estimate lacks them"
-        cure = "look for bridges at the electrodes' connector; wet the gel; lower the injected current"
-        return trouble(subject, found, means, cure)
-    if dead:
-        means = "an electrode without contact, or a broken wire; every estimate lacks these channels"
-        cure = "press the connector on; 28 or 56 dead channels that belong together point to one electrode"
-        return trouble(subject, found, means, cure)
-    return good(subject, found)
-
-
-async def _received(source: AsyncIterator[Any], seconds: float) -> list[Any]:
-    found = []
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(seconds), contextlib.aclosing(source) as items:  # type: ignore[type-var]
-            async for item in items:
-                found.append(item)  # noqa: PERF401 - a timeout keeps what came before
-    return found
-
-
-async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -> list[Finding]:
-    port = check_port(name, config.device)
-    if port.state == "trouble":
-        return [port]
-    link = SerialLink(**config.device.model_dump())
-    board = EitKit(link, fingertip_table(config).zero_slots, config.frame_period_s)
-    frames = await _received(board.readings(), seconds)
-    facts = board.diagnostics()
-    if not frames and facts["last_loss"]:
-        return [port, from_error(f"rate of {name}", str(facts["last_loss"]), "no frame came")]
-    measured_hz = _rate_hz([frame.t_arrival_ns for frame in frames])
-    findings = [port, check_rate(f"rate of {name}", measured_hz, 1 / config.frame_period_s)]
-    refused = facts["errors"]
-    if isinstance(refused, dict) and sum(refused.values()):
-        found = f"{sum(refused.values())} refused; {facts['last_frame_error']}"
-        means = "a bad cable, or another program on the same board"
-        findings.append(note(f"lines of {name}", found, means, "replace the USB cable"))
-    if frames:
-        channels = np.array([frame.channels for frame in frames])
-        saturated = np.array([frame.saturated for frame in frames]).any(axis=0)
-        dead = (channels == 0).all(axis=0)
-        findings.append(check_channels(name, int(saturated.sum()), int(dead.sum()), len(frames)))
-    return findings
-
-
-async def _check_load_cell(config: LoadCellConfig, seconds: float) -> list[Finding]:
-    port = check_port("load_cell", config.device)
-    if port.state == "trouble":
-        return [port]
-    cell = LoadCell(SerialLink(**config.device.model_dump()), LoadCalibration.of_torque_lines(), config.rate_hz)
-    samples = await _received(cell.readings(), seconds)
-    measured_hz = _rate_hz([sample.t_arrival_ns for sample in samples])
-    findings = [port, check_rate("rate of load_cell", measured_hz, config.rate_hz)]
-    if saturated := sum(sample.saturated for sample in samples):
-        found = f"{saturated} of {len(samples)} readings are at the converter's limit"
-        cure = "take the load off; check the four wires of the cell"
-        findings.append(trouble("signal of load_cell", found, "overload, or a loose wire of the bridge", cure))
-    return findings
+def _check_source(device: SerialDevice) -> list[Finding]:
+    return [check_port("skin's source", device)]
 
 
 async def _check_gripper(config: GripperConfig) -> list[Finding]:
@@ -188,7 +64,8 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
         await client.connect()
         state = await client.read()
     except DriverError as error:
-        return [from_error("gripper", error, "nothing can be gripped")]
+        cure = "check its power and cable, and end other programs that use it"
+        return [from_error("gripper", error, "nothing can be gripped", cure)]
     finally:
         await client.close()
     if state.flt:
@@ -206,7 +83,8 @@ def _check_robot(settings: Path) -> Iterator[Finding]:
         host = read_settings(settings).host
         seen = query_controller(host, ROBOT_TIMEOUT_S)
     except DriverError as error:
-        yield from_error("robot", error, "the robot cannot be driven")
+        cure = "look at the teach pendant, and check the cable and `host` in the robot's settings"
+        yield from_error("robot", error, "the robot cannot be driven", cure)
         return
     answers = f"{host} answers, PolyScope {seen.version}"
     if untested := untested_sentence(seen.version):
@@ -232,12 +110,6 @@ def _check_robot(settings: Path) -> Iterator[Finding]:
         means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
         cure = "close the other program, or disable the adapter under Installation → Fieldbus"
         yield trouble("robot's registers", "in use", means, cure)
-
-
-def _rate_hz(times_ns: list[int]) -> float | None:
-    if len(times_ns) < 2 or times_ns[-1] == times_ns[0]:
-        return None
-    return (len(times_ns) - 1) * 1e9 / (times_ns[-1] - times_ns[0])
 
 
 def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
@@ -273,10 +145,21 @@ def check_daemon(
         yield check_task(name, status)
     for name, own in config.fingertips.items():
         if frames := received.get(name):
-            measured_hz = _rate_hz([int(frame["t_mono_ns"]) for frame in frames])
-            yield check_rate(f"rate of {name}", measured_hz, 1.0 / own.frame_period_s)
-            saturated, dead = (max(int(frame.get(key) or 0) for frame in frames) for key in ("saturated", "dead"))
-            yield check_channels(name, saturated, dead, len(frames))
+            # The daemon opens a silent board again; such a pause is no period of the board.
+            period_s = _usual_period_s(frames)
+            if period_s:
+                measured_hz = 1.0 / period_s
+                key = f"fingertips.{name}.frame_period_s"
+                yield check_rate(f"rate of {name}", measured_hz, 1.0 / own.frame_period_s, key, as_period=True)
+            saturated = max(int(frame.get("saturated") or 0) for frame in frames)
+            channels = np.array([frame["channels"] for frame in frames], dtype=np.float64)
+            yield check_channels(name, channels, saturated, fingertip_table(own))
+
+
+def _usual_period_s(frames: Sequence[Mapping[str, Any]]) -> float:
+    """Return the median distance of the frames' times; 0 for a single frame."""
+    steps_ns = np.diff([int(frame["t_mono_ns"]) for frame in frames])
+    return float(np.median(steps_ns)) / 1e9 if len(steps_ns) else 0.0
 
 
 def check_task(name: str, status: Mapping[str, Any]) -> Finding:
@@ -288,7 +171,8 @@ def check_task(name: str, status: Mapping[str, Any]) -> Finding:
         means = "an error ended it, and it starts again by itself"
         return judge(subject, found, means, "read the daemon's log; report it if it comes back")
     if state == "not connected":
-        return trouble(subject, found, "nothing comes from its device", "check its port, cable and power")
+        return from_error(subject, found, "nothing comes from its device", "check its port, cable and power")
     if notes:
-        return note(subject, found, "refused data is not used", "see docs/troubleshooting.md")
+        what, cure = split_cure(found)
+        return note(subject, what, "what is refused or dead is not used", cure or "see docs/troubleshooting.md")
     return good(subject, found)

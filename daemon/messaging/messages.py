@@ -69,7 +69,7 @@ class EitFrame(Message):
     frame: int = column("", "number of the frame since the daemon began")
     age_s: float = column("s", "from the middle of the acquisition to the arrival of the last byte")
     saturated: int = column("", "channels at the converter's full scale")
-    dead: int = column("", "channels unchanged for many frames")
+    dead: int = column("", "channels that read 0, or the same for 200 frames")
     repeated: bool = column("", "whether the line equals the one before it exactly")
 
 
@@ -300,8 +300,8 @@ def with_packed_arrays(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def encode(content: Mapping[str, Any]) -> bytes:
-    """Return the second frame of a message."""
-    packed: bytes = msgpack.packb(content)
+    """Return the second frame of a message; bytes of a path that are not UTF-8 are written as `\\udcff`."""
+    packed: bytes = msgpack.packb(content, unicode_errors="backslashreplace")
     return packed
 
 

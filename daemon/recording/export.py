@@ -13,7 +13,8 @@ from scipy.io import savemat
 from shearloop.daemon.errors import UserError, require
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.columns import columns
-from shearloop.daemon.recording.reader import Progress, read_messages
+from shearloop.daemon.recording.intact_records import Progress
+from shearloop.daemon.recording.reader import read_messages
 from shearloop.daemon.recording.tables import Rows, arrays, columns_of, read_rows, row_of
 
 # Numbers of a Parquet table that are written at once.

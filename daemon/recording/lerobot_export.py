@@ -25,7 +25,8 @@ from shearloop.daemon.messaging.messages import (
 )
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.columns import ContentError, check_length
-from shearloop.daemon.recording.reader import Progress, open_recording, read_messages, refusing_content
+from shearloop.daemon.recording.intact_records import Progress
+from shearloop.daemon.recording.reader import open_recording, read_messages, refusing_content
 
 ROWS_PER_S = 25
 _PERIOD_NS = 10**9 // ROWS_PER_S

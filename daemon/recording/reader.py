@@ -5,22 +5,20 @@
 index that is written when a file is closed.
 """
 
-import os
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import MCAP0_MAGIC
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, McapRecord, Message, Metadata
+from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.writer import MCAP0_MAGIC, Writer
 from numpy.typing import NDArray
 from pydantic_core import from_json
 
@@ -29,14 +27,18 @@ from shearloop.bank.estimation import Measured
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.columns import ContentError, OtherKeysError, check_time, read_content
+from shearloop.daemon.recording.intact_records import (
+    LARGEST_RECORD_BYTES,
+    IntactRecords,
+    Progress,
+    check_magic,
+    check_size,
+)
 from shearloop.daemon.recording.writer import PARTIAL, new_writer
 from shearloop.daemon.sensing.fingertip_diameters import tool_from_bytes
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.files import open_file, replace_file
 
-Progress = Callable[[int], None]
-# A recorder makes chunks of 16 MB and attaches files of up to 32 MB.
-_LARGEST_RECORD_BYTES = 64 << 20
 _NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
 _OTHER_PROGRAM = "another program made or changed this recording: record or import it again"
 # Metadata of every recording; the other keys are notes of this one.
@@ -75,13 +77,13 @@ class OpenRecording:
         """Check that the file was closed, matches its checksums and is usable; raises many types of errors."""
         file.seek(0)
         ends: list[McapRecord] = []
-        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD_BYTES)
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=LARGEST_RECORD_BYTES)
         # A file that was cut off ends anywhere.
         with suppress(EndOfFile, struct.error):
             for record in reader.records:
                 match record:
                     case Chunk():
-                        _check_size(record)
+                        check_size(record)
                     # Names of files that an export makes.
                     case Channel(topic=name) if not name.isprintable() or "/" in name:
                         raise ValueError(f"it has the topic {name[:40]!r}")
@@ -143,7 +145,13 @@ def reading(path: Path) -> Iterator[None]:
         raise UserError(f"{path}: the recording cannot be read: {error.strerror or error}") from error
     except Exception as error:
         detail = str(error) if isinstance(error, McapError | ValueError) and str(error) else repr(error)
-        intact = any(isinstance(record, Message) for record in IntactRecords(path, lambda _: None))
+        records = IntactRecords(path)
+        intact = sum(isinstance(record, Message) for record in records)
+        if not isinstance(error, McapError | CRCValidationError) and not records.is_damaged:
+            raise UserError(
+                f"{path}: the recording is whole, and its content cannot be used: {detail}; another program wrote or "
+                "changed it, so make it again there"
+            ) from error
         cure = f"`shearloop recording repair {path}` saves the intact part" if intact else _NOTHING_INTACT
         raise UserError(f"{path}: the recording was not closed, or is damaged ({detail}); {cure}") from error
 
@@ -188,12 +196,6 @@ def read_messages(
         for number, (channel, message) in enumerate(recording.messages(topics), start=1):
             yield channel.topic, recording.content(channel, message), message
             progress(number)
-
-
-def check_magic(path: Path, file: IO[bytes]) -> None:
-    """Raise UserError for a file that is not MCAP; leaves it after the magic bytes."""
-    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        raise UserError(f"{path}: this is not an MCAP file, or is empty; there is nothing to read")
 
 
 def _checked_identity(path: Path, identity: dict[str, str] | None) -> tuple[dict[str, str], ChannelTable]:
@@ -266,76 +268,18 @@ def _side_frames(rows: list[tuple[int, list[float]]]) -> SideFrames:
 
 
 def _check_index(file: IO[bytes], footer: Footer) -> None:
-    """Raise ValueError for an index that does not match its checksum, which the mcap library does not check."""
+    """Raise McapError for an index that does not match its checksum, which the mcap library does not check."""
     # The checksum covers the footer up to itself, four bytes before the magic ones.
     index_end = file.tell() - len(MCAP0_MAGIC) - 4
     file.seek(footer.summary_start)
     if footer.summary_crc and zlib.crc32(file.read(index_end - footer.summary_start)) != footer.summary_crc:
-        raise ValueError("its index does not match its checksum")
-
-
-def _check_size(chunk: Chunk) -> None:
-    """Raise ValueError for a chunk that would fill the memory, or whose packed size is not known."""
-    size = max(chunk.uncompressed_size, zstandard.frame_content_size(chunk.data) if chunk.compression == "zstd" else 0)
-    if size > _LARGEST_RECORD_BYTES or chunk.compression not in ("", "zstd"):
-        raise ValueError(f"a chunk of {size >> 20} MB, packed by {chunk.compression or 'nothing'}")
+        raise McapError("its index does not match its checksum")
 
 
 def _unusable(path: Path, reason: str) -> UserError:
     return UserError(
         f"{path}: this recording cannot be used: {reason}; record it again, or import it again with `shearloop import`"
     )
-
-
-class IntactRecords:
-    """The records of a file, chunks opened, up to its end or its first damaged record.
-
-    While it is iterated, it counts the intact bytes and the damaged chunks. `progress` receives the bytes read.
-    """
-
-    def __init__(self, path: Path, progress: Progress) -> None:
-        self._path = path
-        self._progress = progress
-        self.closed = False
-        self.size = self.damaged_chunks = self._intact_bytes = 0
-
-    @property
-    def torn_bytes(self) -> int:
-        """Bytes after the last intact record."""
-        return 0 if self.closed else self.size - self._intact_bytes
-
-    def __iter__(self) -> Iterator[McapRecord]:
-        """Read the file; raises UserError if it is missing or not MCAP."""
-        try:
-            with open_file(self._path) as file:
-                self.size = os.fstat(file.fileno()).st_size
-                check_magic(self._path, file)
-                file.seek(0)
-                for record in StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records:
-                    inside = self._opened(record) if isinstance(record, Chunk) else [record]
-                    self._intact_bytes = file.tell()
-                    self._progress(self._intact_bytes)
-                    if isinstance(record, Footer):
-                        self.closed = True
-                        return
-                    yield from inside
-        except UserError:
-            raise
-        except OSError as error:
-            raise UserError(f"{self._path}: the recording cannot be read: {error.strerror}") from error
-        # The library raises many types of exceptions for a damaged record.
-        except Exception:  # noqa: BLE001
-            return
-
-    def _opened(self, chunk: Chunk) -> list[McapRecord]:
-        """Return the records of a chunk, or nothing if it does not match its checksum."""
-        try:
-            _check_size(chunk)
-            return breakup_chunk(chunk, validate_crc=True)
-        # zstandard raises a plain subclass of Exception.
-        except Exception:  # noqa: BLE001
-            self.damaged_chunks += 1
-            return []
 
 
 @dataclass(slots=True)
@@ -355,6 +299,9 @@ class FileCondition:
     closed: bool
     torn_bytes: int
     damaged_chunks: int
+    damaged_attachments: int
+    # Lost messages by topic, as far as the file shows them.
+    lost: dict[str, int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -377,17 +324,14 @@ class RecordingSummary(FileCondition):
 def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSummary:
     """Return the summary of a recording, closed or not; raises UserError for another file."""
     records = IntactRecords(path, progress)
-    channels: dict[int, str] = {}
     topics: dict[str, TopicSummary] = {}
     spans: dict[str, tuple[int, int]] = {}
     named: dict[str, list[dict[str, str]]] = {}
     attachments = []
     for record in records:
         match record:
-            case Channel():
-                channels[record.id] = record.topic
-            case Message() if record.channel_id in channels:
-                name, t_ns = channels[record.channel_id], record.log_time
+            case Message():
+                name, t_ns = records.channels[record.channel_id].topic, record.log_time
                 topic = topics.setdefault(name, TopicSummary())
                 topic.messages += 1
                 first_ns, last_ns = spans.get(name, (t_ns, t_ns))
@@ -403,7 +347,7 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
     ends = named.get(schema.END_METADATA, [])
     with reading(path):
         dropped = int(ends[-1].get("dropped", "0")) if ends else None
-    metadata = named.get(schema.METADATA, [{}])[-1]
+    metadata = records.identity or named.get(schema.METADATA, [{}])[-1]
     experiments = named.get(schema.EXPERIMENT_METADATA, [])
     return RecordingSummary(
         path=str(path),
@@ -411,6 +355,8 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         closed=records.closed,
         torn_bytes=records.torn_bytes,
         damaged_chunks=records.damaged_chunks,
+        damaged_attachments=records.damaged_attachments,
+        lost=records.lost,
         dropped=dropped,
         first_unix_ns=first_unix_ns,
         duration_s=0.0 if first_unix_ns is None else (max(last for _, last in spans.values()) - first_unix_ns) / 1e9,
@@ -431,6 +377,9 @@ class RepairResult:
     messages: int
     torn_bytes: int
     damaged_chunks: int
+    damaged_attachments: int
+    # Lost messages by topic, as far as the file shows them.
+    lost: dict[str, int]
 
 
 def repair(source: Path, out: Path | None = None, progress: Progress = lambda _: None) -> RepairResult:
@@ -445,8 +394,9 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
     if out.exists():
         raise UserError(f"{out} exists already; move it away, or name another file with --out")
     records = IntactRecords(source, progress)
-    schemas: dict[int, int] = {}
+    schemas: dict[str, int] = {}
     channels: dict[int, int] = {}
+    identity: dict[str, str] = {}
     messages = 0
     try:
         with replace_file(out) as file:
@@ -454,25 +404,39 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
             for record in records:
                 # The copy has its own header and index.
                 match record:
-                    case Schema() if record.id not in schemas:
-                        schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
-                    case Channel() if record.id not in channels and record.schema_id in {0, *schemas}:
-                        channels[record.id] = writer.register_channel(
-                            record.topic, record.message_encoding, schemas.get(record.schema_id, 0), record.metadata
-                        )
-                    case Message() if record.channel_id in channels:
-                        copied = channels[record.channel_id], record.log_time, record.data, record.publish_time
+                    case Message():
+                        channel = records.channels[record.channel_id]
+                        if channel.id not in channels:
+                            channels[channel.id] = _registered(writer, channel, records, schemas)
+                        copied = channels[channel.id], record.log_time, record.data, record.publish_time
                         writer.add_message(*copied, record.sequence)
                         messages += 1
+                    case Metadata(name=schema.METADATA):
+                        identity = record.metadata
                     case Metadata():
                         writer.add_metadata(record.name, record.metadata)
                     case Attachment():
                         writer.add_attachment(
                             record.create_time, record.log_time, record.name, record.media_type, record.data
                         )
+            # The record has no checksum of its own, and the chunks have.
+            identity = records.identity or identity
+            if identity:
+                writer.add_metadata(schema.METADATA, identity)
             writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
             if not messages:
                 raise UserError(f"{source}: {_NOTHING_INTACT}")
     except OSError as error:
         raise UserError(f"{out}: the repaired recording cannot be written: {error.strerror}") from error
-    return RepairResult(out, messages, records.torn_bytes, records.damaged_chunks)
+    return RepairResult(
+        out, messages, records.torn_bytes, records.damaged_chunks, records.damaged_attachments, records.lost
+    )
+
+
+def _registered(writer: Writer, channel: Channel, records: IntactRecords, schemas: dict[str, int]) -> int:
+    """Register a channel, and its schema once for all channels that have it; return the channel's number."""
+    known = records.schemas.get(channel.schema_id)
+    if known is not None and known.name not in schemas:
+        schemas[known.name] = writer.register_schema(known.name, known.encoding, known.data)
+    schema_id = schemas[known.name] if known is not None else 0
+    return writer.register_channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)

@@ -306,7 +306,7 @@ class Recorder:
                     file = McapFile(FileIO(self._folder / f"{began}.mcap{PARTIAL}", "xb"))
                     break
         try:
-            file.add_metadata(schema.METADATA, self._identity.metadata)
+            file.identify(self._identity.metadata)
             for one in self._identity.attached:
                 file.attach(one.name, one.media_type, one.data, now_ns + offset_ns)
             file.flush()

@@ -225,7 +225,7 @@ class Replay:
         self._clock = clock
         self.comparison = ReplayComparison(run.counts)
         if run.has_inputs:
-            publisher.add_listener(self.comparison.add_computed)
+            publisher.add_listener(self.comparison.add_computed, raises=True)
         # Per source: the difference between recorded and replayed numbers of frames or samples, and the latest frame.
         self._number_offset: dict[str, int] = {}
         self._latest_frame: dict[str, int] = {}

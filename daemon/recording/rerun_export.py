@@ -11,7 +11,8 @@ from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.errors import require
 from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage, units
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.reader import Progress, read_messages
+from shearloop.daemon.recording.intact_records import Progress
+from shearloop.daemon.recording.reader import read_messages
 from shearloop.daemon.web.message_store import conductivity_profile
 
 TIMELINE = "time"

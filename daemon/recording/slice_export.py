@@ -21,8 +21,9 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitFrame, GripperStateMessage, LoadTorque, LoopState
 from shearloop.daemon.recording import schema
 from shearloop.daemon.recording.columns import ContentError, check_length
+from shearloop.daemon.recording.intact_records import Progress
 from shearloop.daemon.recording.matlab_import import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
-from shearloop.daemon.recording.reader import Progress, open_recording, read_messages, refusing_content
+from shearloop.daemon.recording.reader import open_recording, read_messages, refusing_content
 from shearloop.files import replace_file
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.daemon.errors import missing
-from shearloop.daemon.recording.reader import Progress, open_recording, read_messages
+from shearloop.daemon.recording.intact_records import Progress
+from shearloop.daemon.recording.reader import open_recording, read_messages
 
 if TYPE_CHECKING:
     from pandas import DataFrame

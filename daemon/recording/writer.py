@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 import numpy as np
+from mcap._chunk_builder import ChunkBuilder
+from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
@@ -26,9 +28,35 @@ _CHUNK_BYTES = 1 << 24
 _FLUSH_EVERY = 128
 
 
+class _WholeChunks(ChunkBuilder):
+    """Builds chunks that define the channels and schemas of their own messages, so that none needs another one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[int, Schema] = {}
+
+    def add_channel(self, channel: Channel) -> None:
+        self._channels[channel.id] = channel
+
+    def add_schema(self, schema: Schema) -> None:
+        self._schemas[schema.id] = schema
+
+    def add_message(self, message: Message) -> None:
+        if message.channel_id not in self.message_indices:
+            channel = self._channels[message.channel_id]
+            # The number 0 stands for no schema.
+            if channel.schema_id:
+                self._schemas[channel.schema_id].write(self.record_writer)
+            channel.write(self.record_writer)
+        super().add_message(message)
+
+
 def new_writer(stream: IO[bytes]) -> Writer:
-    """Return a started MCAP writer that stores checksums of all its data."""
+    """Return a started MCAP writer that stores checksums of all its data, and definitions in each chunk."""
     writer = Writer(stream, _CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
+    # The library has no option for this.
+    vars(writer)["_Writer__chunk_builder"] = _WholeChunks()
     writer.start(profile="shearloop", library="shearloop")
     return writer
 
@@ -80,6 +108,7 @@ class McapFile:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
+        self._identity: dict[str, str] = {}
 
     @property
     def messages(self) -> int:
@@ -95,6 +124,11 @@ class McapFile:
     def bytes_waiting(self) -> int:
         """Bytes that the last flush could not write."""
         return len(self._stream.pending)
+
+    def identify(self, identity: Mapping[str, str]) -> None:
+        """Append the recording's identity, before its first message; each chunk repeats it with its channels."""
+        self._identity = dict(identity)
+        self.add_metadata(schema.METADATA, identity)
 
     def add_metadata(self, name: str, content: Mapping[str, str]) -> None:
         """Append a metadata record."""
@@ -167,7 +201,7 @@ class McapFile:
         if name not in self._schemas:
             text = json.dumps(schema.schemas()[name], sort_keys=True, ensure_ascii=False).encode()
             self._schemas[name] = self._writer.register_schema(name, "jsonschema", text)
-        return self._writer.register_channel(topic, "json", self._schemas[name])
+        return self._writer.register_channel(topic, "json", self._schemas[name], self._identity)
 
 
 @contextmanager
@@ -181,7 +215,7 @@ def new_recording(
     try:
         file, name = McapFile(io.FileIO(f"{path}{PARTIAL}", "wb")), None
         try:
-            file.add_metadata(schema.METADATA, {**schema.basic_identity(source, table), **(notes or {})})
+            file.identify({**schema.basic_identity(source, table), **(notes or {})})
             yield file
             name = path
         finally:

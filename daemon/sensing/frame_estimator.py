@@ -101,7 +101,7 @@ class FrameEstimator:
         """
         channels, usable, t_ns = [], [], 0
         for frame in frames:
-            if frame.repeated:
+            if frame.repeated and frame.channels.any():
                 return Estimate(valid=False, reasons=REPEATED_FRAME)
             channels.append(frame.channels)
             usable.append(~(frame.saturated | frame.dead))

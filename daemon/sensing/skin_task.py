@@ -129,11 +129,11 @@ class SkinTask:
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values of voltages, zero and force for `health`."""
-        zero = self._estimator.zero
+        zero, voltages = self._estimator.zero, self._skin.diagnostics()
         return {
-            **self._skin.diagnostics(),
+            **voltages,
             "valid": self._valid,
-            "error": self._reason,
+            "error": self._reason or str(voltages.get("last_refusal", "")),
             "zero_1_ohm": zero.r1_ohm if zero is not None else None,
             "zero_2_ohm": zero.r2_ohm if zero is not None else None,
             "drift_per_hour": self._estimator.drift_per_hour,

@@ -125,6 +125,8 @@ class MotionExecutor:
                 return f"The arm is still stopping ({self.end_reason})."
             case WristSpeed(), _Move():
                 return "A linear move is under way: stop it."
+            case MoveLinear(pose), _ if outside := self._settings.limits.workspace.why_outside(pose[:3]):
+                return f"The linear move's end at {outside}."
             case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:
                 return "A linear move needs a speed and an acceleration above 0."
             case MoveLinear(), motion if isinstance(motion, _Move | _Braking) or not sample.rests:
@@ -343,24 +345,13 @@ def clip_stop(asked: float, sample: RtdeSample, settings: UrSettings) -> float:
 
 
 def clip_linear(asked: MoveLinear, limits: UrLimits) -> tuple[MoveLinear, tuple[str, ...]]:
-    """Return the linear move within the inner workspace, speed and acceleration, and each reason for a change.
-
-    The box is convex: a line between two points inside it stays inside.
-    """
-    box = limits.workspace
+    """Return the linear move within the inner speed and acceleration, and each reason for a change."""
     reasons: list[str] = []
-    position = []
-    for axis, value, low, high in zip("xyz", asked.pose[:3], box.lower_m, box.upper_m, strict=True):
-        inside = min(max(value, low + box.margin_m), high - box.margin_m)
-        if inside != value:
-            reasons.append(f"{axis} = {value:.4f} m is outside the workspace; its edge is {inside:.4f} m")
-        position.append(inside)
     speed = _at_most(asked.speed_m_per_s, limits.linear_speed_m_per_s, "linear speed", reasons)
     acceleration = _at_most(
         asked.acceleration_m_per_s2, limits.linear_acceleration_m_per_s2, "linear acceleration", reasons
     )
-    x, y, z = position
-    return MoveLinear((x, y, z, *asked.pose[3:]), speed, acceleration), tuple(reasons)
+    return MoveLinear(asked.pose, speed, acceleration), tuple(reasons)
 
 
 def is_recent(sample: RtdeSample, settings: UrSettings) -> bool:

@@ -17,6 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from shearloop.files import replace_file
+from shearloop.units import unit_hint, unit_of
 from shearloop.words import counted
 
 Model = TypeVar("Model")
@@ -297,17 +298,12 @@ def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
 
 def _unit_hint(location: Sequence[int | str], found: object, schema: Mapping[str, Any]) -> str:
     """Return a question where a number would fit in another unit."""
-    if not isinstance(found, int | float) or isinstance(found, bool) or not found or not _allowed(schema):
+    if not isinstance(found, int | float) or isinstance(found, bool) or not _allowed(schema):
         return ""
     low = schema.get("minimum", schema.get("exclusiveMinimum", -math.inf))
     high = schema.get("maximum", schema.get("exclusiveMaximum", math.inf))
     key = next((part for part in reversed(location) if isinstance(part, str)), "")
-    if key.endswith("_rad") and low <= math.radians(found) <= high:
-        return f"did you mean {math.radians(found):.4g}, {found:g} degrees in rad?"
-    for factor, name, far in ((1e-3, "thousandth", abs(found) > 10 * high), (1e3, "thousandfold", found < low / 10)):
-        if far and low <= found * factor <= high:
-            return f"did you mean {found * factor:g}, the {name}?"
-    return ""
+    return unit_hint(found, schema.get("unit") or unit_of(key), low, high)
 
 
 def _known_keys(wrong: str, schema: Mapping[str, Any]) -> str:
@@ -335,7 +331,8 @@ def _schema_at(schema: Mapping[str, Any], location: Sequence[int | str], root: M
         return _schema_at({"$ref": kind}, location[1:], root) if kind else {}
     step, rest = location[0], location[1:]
     if isinstance(step, int):
-        inside = schema.get("items")
+        each = schema.get("prefixItems", ())
+        inside = each[step] if step < len(each) else schema.get("items")
     else:
         named = schema.get("properties", {}).get(step)
         inside = (

@@ -5,15 +5,29 @@ import json
 import socket
 import subprocess
 import sys
+from itertools import cycle
 
 import pytest
 
+from shearloop.daemon.cli.calibrate import load
+from shearloop.daemon.cli.terminal import Operator
 from shearloop.drivers.calibration_files import load_device_calibration
+from shearloop.drivers.connection import SerialPort
+from shearloop.drivers.emulators.boards import Hx711Board
+from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import WidthCalibration
+from tests.running import running
 
 SHEARLOOP = (sys.executable, "-m", "shearloop")
 COUNTS_PER_NM = 420e3 / (9.80665 * 0.035)
+
+
+class Silent(Operator):
+    """An operator who presses no key."""
+
+    def __enter__(self) -> "Silent":
+        return self
 
 
 class Process(contextlib.AbstractContextManager["Process", None]):
@@ -89,6 +103,26 @@ def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_
         assert f"Written to {out}." in said
     assert calibration.nm_per_count * COUNTS_PER_NM == pytest.approx(1.0, rel=2e-3)
     assert calibration.torque_nm(81_250) == pytest.approx(0.0, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("lines", "parts"),
+    [
+        ((b"0,091\r\n",), ("'0,091'", "decimal comma", "firmware/hx711_torque")),
+        ((b"0.1234, " * 1024 + b"\n",), ("An EIT-kit sends such lines", "shearloop ports")),
+        ((b"0.1",), ("'0.10.10.1", "without a line end")),
+        ((b"",), ("HX711 has power",)),
+    ],
+)
+async def test_the_load_cells_calibration_gives_up_with_what_came(tmp_path, monkeypatch, lines, parts):
+    monkeypatch.setattr(load, "GIVE_UP_S", 0.3)
+    board = Hx711Board(cycle(lines), period_s=0.03, link=tmp_path / "load")
+    async with running(board.run()):
+        await board.port.appearances.get()
+        with SerialPort(str(tmp_path / "load")) as port, pytest.raises(DeviceLostError) as gave_up:
+            await load._measure(port, [100.0], Silent())
+    assert "within 0.3 s" in str(gave_up.value)
+    assert all(part in str(gave_up.value) for part in parts), gave_up.value
 
 
 @pytest.mark.parametrize("way", ["socket", "modbus"])

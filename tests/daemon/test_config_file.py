@@ -91,7 +91,7 @@ steps:
         "7: steps[3].angles_rad[1]: 90 is too large",
         "7: steps[3].speed: is not a known key; did you mean speed_rad_per_s?",
     ]
-    assert found[2][1].endswith("did you mean 0.03, the thousandth?")
+    assert found[2][1].endswith("did you mean 0.03, 30 mm in m?")
     assert found[3][1].endswith("did you mean 1.571, 90 degrees in rad?")
 
 

@@ -10,7 +10,9 @@ import pytest
 from shearloop.daemon import doctor
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import CurveConfig, SerialDevice, load_daemon_config
-from shearloop.daemon.doctor.devices import check_channels, check_port, check_rate, check_task, from_error
+from shearloop.daemon.doctor.boards import check_port
+from shearloop.daemon.doctor.devices import check_task
+from shearloop.daemon.doctor.findings import from_error
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
 from shearloop.daemon.serial_ports import SerialPortInfo
@@ -115,15 +117,6 @@ def test_tasks_are_judged_by_their_counters(facts, state, part):
     finding = check_task("right", facts)
     assert finding.state == state
     assert part in finding.found
-
-
-def test_rates_and_channels():
-    assert check_rate("rate", None, 1.85).state == "trouble"
-    assert check_rate("rate", 1.9, 1.85).state == "good"
-    assert "frame_period_s 1.0000" in check_rate("rate", 1.0, 1.85).next_step
-    assert check_channels("right", 0, 0, 9).state == "good"
-    assert "bridges" in check_channels("right", 2, 0, 9).next_step
-    assert "one electrode" in check_channels("right", 0, 28, 9).next_step
 
 
 def test_a_bank_of_another_geometry_is_reported(config):

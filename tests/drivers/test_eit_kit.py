@@ -94,7 +94,7 @@ async def test_a_fault_costs_its_own_frame_at_most_and_is_counted(fault, kind, l
     assert_same(frames, lines[:3] + lines[3 + lost :])
     facts = kit.diagnostics()
     assert facts["errors"] == {kind.name.lower(): 1}
-    assert kind.value in str(facts["last_frame_error"])
+    assert kind.value in str(facts["last_refusal"])
 
 
 async def test_a_board_that_fell_silent_is_opened_and_started_again(tmp_path, monkeypatch):

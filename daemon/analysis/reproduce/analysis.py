@@ -26,6 +26,7 @@ from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import MatchingError
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.intact_records import Progress
 from shearloop.daemon.recording.matlab_import import (
     DIAMETER_FOLDER,
     RAW_FRAME,
@@ -36,7 +37,6 @@ from shearloop.daemon.recording.matlab_import import (
     read_line,
     read_torque_slices,
 )
-from shearloop.daemon.recording.reader import Progress
 from shearloop.words import counted
 
 # Torque is a parabola over σ and diameter a line over k (Trehan et al. 2025, figures 8 and 9).

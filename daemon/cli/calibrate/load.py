@@ -12,15 +12,20 @@ from shearloop.daemon.cli.terminal import Operator, print_result
 
 if TYPE_CHECKING:
     from shearloop.drivers.connection import SerialPort
+    from shearloop.drivers.load_cell import LoadSample
     from shearloop.drivers.load_cell_calibration import Level
+
+# A board at one reading a second, and its boot loader, are faster.
+GIVE_UP_S = 10.0
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `calibrate load`."""
     parser.epilog = (
         "Asks for an empty cell, then for each mass, and measures each for some seconds after you press Enter. Refuses "
-        "and repeats a signal that is saturated, flat or noisy. Stop the daemon first: it uses the port. Name the file "
-        "as `load_cell.calibration` in the configuration."
+        "and repeats a signal that is saturated, flat or noisy. Gives up after "
+        f"{GIVE_UP_S:g} s without a reading. Stop the daemon first: it uses the port. Name the file as "
+        "`load_cell.calibration` in the configuration."
     )
     port = parser.add_mutually_exclusive_group(required=True)
     port.add_argument("--serial-number", metavar="NUMBER", help="the board's USB serial number")
@@ -58,30 +63,37 @@ def run(args: argparse.Namespace) -> int:
     return print_result(report, [*result.sentences, f"Written to {args.out}."], as_json=args.json)
 
 
-async def _measure(port: "SerialPort", masses_g: list[float], operator: Operator) -> list["Level"]:
-    from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError
-    from shearloop.drivers.load_cell import LoadParser, LoadSample
-    from shearloop.drivers.load_cell_calibration import (
-        SAMPLES_PER_STEP,
-        SKIP_SAMPLES,
-        UNCALIBRATED,
-        check_levels,
-        measure_level,
+async def _read_samples(port: "SerialPort", samples: "asyncio.Queue[LoadSample]") -> None:
+    """Put every sample into the queue; DeviceLostError after GIVE_UP_S without one."""
+    from shearloop.drivers.errors import DeviceLostError
+    from shearloop.drivers.load_cell import LoadParser
+    from shearloop.drivers.load_cell_calibration import UNCALIBRATED
+    from shearloop.drivers.refused_lines import shown
+
+    parser, clock = LoadParser(UNCALIBRATED), asyncio.get_running_loop()
+    until_s = clock.time() + GIVE_UP_S
+    while (left_s := until_s - clock.time()) > 0:
+        if (received := await port.read(left_s)) is None:
+            break
+        for sample in parser.feed(received.data, received.t_arrival_ns):
+            until_s = clock.time() + GIVE_UP_S
+            samples.put_nowait(sample)
+    nothing = f"no reading came from {port.path} within {GIVE_UP_S:g} s"
+    if parser.refusal:
+        raise DeviceLostError(f"{nothing}: {parser.refusal}")
+    if parser.unfinished:
+        raise DeviceLostError(f"{nothing}, only {shown(parser.unfinished)} without a line end; see its program")
+    raise DeviceLostError(
+        f"{nothing}; check that it is the load cell's board and that the HX711 has power and its DT and SCK wires"
     )
-    from shearloop.drivers.serial_sensor import BOOT_S
+
+
+async def _measure(port: "SerialPort", masses_g: list[float], operator: Operator) -> list["Level"]:
+    from shearloop.drivers.errors import DeviceCalibrationError
+    from shearloop.drivers.load_cell_calibration import SAMPLES_PER_STEP, SKIP_SAMPLES, check_levels, measure_level
 
     samples: asyncio.Queue[LoadSample] = asyncio.Queue()
     levels: list[Level] = []
-
-    async def read_port() -> None:
-        parser = LoadParser(UNCALIBRATED)
-        while (received := await port.read(BOOT_S)) is not None:
-            for sample in parser.feed(received.data, received.t_arrival_ns):
-                samples.put_nowait(sample)
-        raise DeviceLostError(
-            f"{port.path} has sent nothing for {BOOT_S:g} s; "
-            "check that it is the load cell's board and that the HX711 has power and its DT and SCK wires"
-        )
 
     async def guide_operator() -> None:
         while len(levels) <= len(masses_g):
@@ -97,11 +109,13 @@ async def _measure(port: "SerialPort", masses_g: list[float], operator: Operator
                 print(f"Refused: {error}", file=sys.stderr, flush=True)
             else:
                 levels.append(level)
-                operator.say(f"  {mass_g:g} g: {level.mean:.6g}, noise {level.std:.3g}, {level.n} readings.")
+                dropped = f", {level.dropped} corrupted ones left out" if level.dropped else ""
+                found = f"{level.mean:.6g}, noise {level.std:.3g}, {level.n} readings{dropped}"
+                operator.say(f"  {mass_g:g} g: {found}.")
 
     with operator:
         # Reading never pauses: bytes in the port's buffer belong to an earlier load.
-        tasks = {asyncio.create_task(read_port()), asyncio.create_task(guide_operator())}
+        tasks = {asyncio.create_task(_read_samples(port, samples)), asyncio.create_task(guide_operator())}
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:

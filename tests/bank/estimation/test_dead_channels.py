@@ -176,3 +176,26 @@ def test_channels_that_come_back_while_idle_are_used_from_then_on(motion_calibra
         assert one.usable.all()
         # Ten idle frames are averaged, and of fewer the mean is as much noisier.
         np.testing.assert_allclose(one.difference, other.difference, rtol=0, atol=0.003)
+
+
+@pytest.mark.parametrize("start", [0, DEATH])
+def test_a_channel_that_reads_0_is_masked_without_being_told(calibration, bank, start):
+    """Recordings and callers of the library hand over channels alone."""
+    series = twisting(seed=3, cycles=2)
+    expected = without(ELECTRODE, start, series, EstimatorSession(calibration, bank))
+    silent = np.zeros(series.channels.shape, dtype=np.bool_)
+    silent[start:, 0, ELECTRODE] = True
+    zeros = replace(series, channels=np.where(silent, 0.0, series.channels))
+    found = conftest.follow(EstimatorSession(calibration, bank), zeros)
+    assert sum(one.valid for one in found) > 60
+    np.testing.assert_array_equal(torques(found), torques(expected))
+
+
+def test_a_calibration_uses_no_channel_that_read_0_during_the_grip(recorded):
+    gripped = np.flatnonzero(recorded.t_s > IDLE_S)
+    channels = recorded.channels.copy()
+    channels[gripped[0] :, 0, ELECTRODE] = 0.0
+    (first, second) = fit("regression", [replace(recorded, channels=channels)], "rig").validators
+    assert (~np.isfinite(first.noise)).tolist() == ELECTRODE.tolist()
+    assert np.abs(first.grip_weights[ELECTRODE]).max() == 0
+    assert np.isfinite(second.noise).all()

@@ -70,6 +70,25 @@ def test_channels_that_do_not_move_have_the_converters_noise():
     np.testing.assert_allclose(state._noise, 0.00215 / np.sqrt(12))
 
 
+def test_a_channel_that_reads_0_in_some_frames_disturbs_neither_idle_frame_nor_average():
+    state, silent = PaperState(10, 4, 3.0), np.arange(896) < 56
+    for number in range(30):
+        channels = np.where(silent & (number % 3 == 2), 0.0, noisy(PATTERN if number > 9 else 0.0))
+        processed = state.process(TactileFrame.of(float(number), channels[None]))
+        assert processed.usable[0].tolist() == (channels != 0).tolist()
+        if number > 13:
+            np.testing.assert_allclose(processed.difference[0], PATTERN, atol=0.01)
+
+
+def test_a_channel_that_read_0_when_the_tare_began_stays_out_until_the_next_tare():
+    state, silent = PaperState(3, 1, 3.0), np.arange(896) < 56
+    for number in range(6):
+        channels = np.where(silent & (number == 0), 0.0, noisy(PATTERN if number > 2 else 0.0))
+        processed = state.process(TactileFrame.of(float(number), channels[None]))
+        assert processed.usable[0].tolist() == (~silent).tolist()
+    assert not processed.difference[0, silent].any()
+
+
 def test_a_signal_becomes_torque_and_diameter_with_their_intervals():
     matcher = OneCell()
     estimate = estimated(tared(matcher), 10, noisy(PATTERN))

@@ -8,7 +8,8 @@ import pytest
 from shearloop.bank.eit.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import TRUSTED, EstimatorSession, FrameSeries, Measured, TactileFrame, fit, fitting
-from shearloop.bank.estimation.fingertip_validator import mask_saturated
+from shearloop.bank.estimation.fingertip_validator import mask_unmeasured
+from shearloop.bank.gain import ToolLaw
 from tests.bank.estimation.conftest import follow, judged, kept, twisting
 
 
@@ -200,9 +201,58 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration):
     assert set(refused) <= {*range(70, 80), *range(90, 100)}
     assert len(refused) > 15
     assert all(same), "earlier tools change nothing that it remembers"
+    assert tracker.why_no_torque == ""
+    tracker.set_tool(Measured(14.0, 1.0))
+    assert tracker.why_no_torque.startswith("the tool has 14 mm")
     unknown = EstimatorSession(motion_calibration)
     unknown.set_tool(Measured(14.0, 0.1))
     assert any(one.valid for one in follow(unknown, twisted))
+
+
+LAW = ToolLaw(intercept=0.0, slope=-1.0, spread=0.05, low_mm=10.0, high_mm=40.0)
+
+
+def adapted_sessions(calibration, *tools):
+    """Return sessions that were told 1.2 times the torque on a tool of 20 mm, and then hold another in the same grip.
+
+    With them, the frames of the grip that follow.
+    """
+    twisted = twisting(seed=5)
+    frames = [TactileFrame.of(float(t_s), one) for t_s, one in zip(twisted.t_s, twisted.channels, strict=True)]
+    half = len(frames) // 2
+    sessions = [EstimatorSession(replace(calibration, tools=LAW)) for _ in tools]
+    for session, tool in zip(sessions, tools, strict=True):
+        session.set_tool(Measured(20.0, 0.5))
+        for frame in frames[:half]:
+            session.estimate(frame)
+        session.adapt(1.2 * LAW.gain(20.0) * np.interp(session.grip_t_s, twisted.torque_t_s, twisted.torque_nm))
+        session.set_tool(tool)
+    return sessions, frames[half:]
+
+
+def test_another_tool_counts_after_a_corrected_gain_too(motion_calibration):
+    """The correction is the fingertip's, the diameter the tool's: neither hides the other."""
+    (same, anew, other), frames = adapted_sessions(
+        motion_calibration, Measured(20.0, 0.5), Measured(20.4, 0.5), Measured(30.0, 0.5)
+    )
+    ratios: dict[str, list[float]] = {"anew": [], "other": []}
+    widths = []
+    for frame in frames:
+        one, two, three = (session.estimate(frame) for session in (same, anew, other))
+        if one.valid and two.valid and three.valid and one.torque_nm > 1e-3 * LAW.gain(20.0):
+            ratios["anew"].append(two.torque_nm / one.torque_nm)
+            ratios["other"].append(three.torque_nm / one.torque_nm)
+            widths.append((three.torque_high_nm / three.torque_nm, one.torque_high_nm / one.torque_nm))
+    assert len(widths) > 5
+    assert np.allclose(ratios["anew"], 20.0 / 20.4)
+    assert np.allclose(ratios["other"], 20.0 / 30.0)
+    assert all(wide > narrow for wide, narrow in widths), "another diameter is less certain"
+
+
+def test_a_gain_without_a_known_diameter_is_not_corrected(motion_calibration):
+    (unknown,), _ = adapted_sessions(motion_calibration, None)
+    with pytest.raises(CalibrationError, match="without the tool's diameter"):
+        unknown.adapt(np.ones(len(unknown.grip_t_s)))
 
 
 def test_single_lost_frames_cost_little_and_are_not_invented_in_numbers(motion_calibration):
@@ -300,26 +350,26 @@ def test_channels_at_a_rail_are_found_and_done_without(motion_calibration):
     assert judged(found, clipped).rmse < 0.02 * 0.06
     # One side is clipped, the other is not.
     frame, usable = np.array([clipped.channels[100, 0], whole.channels[100, 0]]), np.ones((2, 896), dtype=np.bool_)
-    left = mask_saturated(frame, usable)
+    left = mask_unmeasured(frame, usable)
     np.testing.assert_array_equal(left[0], frame[0] < rail)
     assert (~left[0]).mean() == pytest.approx(0.1, abs=0.05)
     assert left[1].all()
     # A channel that is dead already hides nothing by what it reads.
     frame[0, 3], usable[0, 3] = 5.0, False
-    np.testing.assert_array_equal(mask_saturated(frame, usable), left & usable)
-    assert not mask_saturated(frame, np.zeros_like(usable)).any()
+    np.testing.assert_array_equal(mask_unmeasured(frame, usable), left & usable)
+    assert not mask_unmeasured(frame, np.zeros_like(usable)).any()
 
 
 def test_an_ordinary_frame_is_at_no_rail():
     frame = np.floor(twisting(seed=34).channels[50] / STEP_V) * STEP_V
-    assert mask_saturated(frame, np.ones(frame.shape, dtype=np.bool_)).all()
+    assert mask_unmeasured(frame, np.ones(frame.shape, dtype=np.bool_)).all()
 
 
 def test_of_as_many_as_are_at_a_rail_one_less_is_chance():
     frame = np.linspace(0.1, 0.2, 896)[None]
     for count in range(1, 20):
         frame[0, :count] = 0.7
-        left = mask_saturated(frame, np.ones((1, 896), dtype=np.bool_))
+        left = mask_unmeasured(frame, np.ones((1, 896), dtype=np.bool_))
         assert np.count_nonzero(left) == (896 if count < 9 else 896 - count)
 
 

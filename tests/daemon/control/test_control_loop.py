@@ -68,6 +68,22 @@ def test_loop_state_has_the_filtered_torque_and_its_standard_deviation():
     assert 0.0 < state.filtered_torque_std_nm < 0.002
 
 
+def test_two_holds_that_differ_only_in_their_limit_have_each_its_own():
+    hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 5}
+    limits = [0.3, 0.2, 0.4]
+    holds = [{**hold, "limits": {"torque_nm": limit}} for limit in limits]
+    rig = started(
+        Rig(new_loop()), GRIP, {"do": "identify"}, *holds, torque_source="load_cell", limits={"torque_nm": 0.5}
+    )
+    found = {}
+    while phase(rig) is ExperimentPhase.RUNNING:
+        rig.run(0.5)
+        if (controller := rig.control_loop.wrist.controller) is not None:
+            found[rig.control_loop.experiment.step_number] = controller.settings.torque_limit_nm
+    assert phase(rig) is ExperimentPhase.DONE
+    assert [found[number] for number in (3, 4, 5)] == limits
+
+
 @pytest.mark.parametrize(
     ("adapted", "drive", "refused"), [(None, "right", True), ("right", "right", True), ("right", "load_cell", False)]
 )

@@ -33,7 +33,10 @@ STEPS = st.one_of(
         st.floats(0, 1),
     ),
     st.builds(
-        lambda t, a, v: {"do": "tighten", "until_torque_nm": t, "until_angle_rad": a, "speed_rad_per_s": v},
+        lambda to, t, a, v: {
+            "do": "tighten", "direction": to, "until_torque_nm": t, "until_angle_rad": a, "speed_rad_per_s": v
+        },
+        st.sampled_from(["clockwise", "counterclockwise"]),
         st.floats(0.01, 2),
         st.floats(0.01, 6),
         SPEEDS,

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -251,3 +252,23 @@ def test_a_chunk_that_would_fill_the_memory_is_not_unpacked(packed, tmp_path):
     assert summarise(path).damaged_chunks == 1
     assert tracemalloc.get_traced_memory()[1] < 16e6
     tracemalloc.stop()
+
+
+@pytest.mark.parametrize("packed", CompressionType)
+@pytest.mark.parametrize("stated", [True, False])
+def test_chunks_of_other_writers_are_read_however_they_are_packed(packed, stated, tmp_path, monkeypatch):
+    if not stated:
+        # As a streaming writer packs, which does not know the size when it begins.
+        compress = lz4.frame.compress
+        monkeypatch.setattr("lz4.frame.compress", lambda data: compress(data, store_size=False))
+    path = recorded(tmp_path / "x.mcap", FRAME, TORQUE, compression=packed)
+    found = read_recording(path)
+    assert (len(found.sides["right"].lines), found.torque_nm.tolist()) == (1, [0.1])
+    assert summarise(path).damaged_chunks == 0
+
+
+def test_an_unknown_packing_is_named(tmp_path):
+    path = recorded(tmp_path / "x.mcap", TORQUE, compression=CompressionType.LZ4, enable_crcs=False)
+    path.write_bytes(path.read_bytes().replace(b"\x03\0\0\0lz4", b"\x03\0\0\0xyz"))
+    with pytest.raises(UserError, match="packed by 'xyz', which is neither zstd nor lz4"):
+        read_recording(path)

@@ -8,18 +8,19 @@ import pytest
 
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur import messages
+from shearloop.drivers.ur import settings as ur
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, UrSettings, Workspace
+from shearloop.drivers.ur.settings import JointRange, UrLimits, UrSettings, Workspace
 
 LIMITS = UrLimits(
     joints=JointRange((-6.0, -6.0, -3.0, -6.0, -6.0, -2.0), (6.0, 6.0, 3.0, 6.0, 6.0, 2.0), 0.1),
     workspace=Workspace((-0.8, -0.8, 0.0), (0.8, 0.8, 0.9), 0.02),
-    wrist_speed_rad_per_s=Bound(0.8, 1.0),
-    wrist_acceleration_rad_per_s2=Bound(4.0, 8.0),
-    linear_speed_m_per_s=Bound(0.1, 0.15),
-    linear_acceleration_m_per_s2=Bound(0.5, 1.0),
-    force_n=Bound(40.0, 60.0),
-    torque_nm=Bound(4.0, 6.0),
+    wrist_speed_rad_per_s=ur.WristSpeedBound(0.8, 1.0),
+    wrist_acceleration_rad_per_s2=ur.WristAccelerationBound(4.0, 8.0),
+    linear_speed_m_per_s=ur.SpeedBound(0.1, 0.15),
+    linear_acceleration_m_per_s2=ur.AccelerationBound(0.5, 1.0),
+    force_n=ur.ForceBound(40.0, 60.0),
+    torque_nm=ur.TorqueBound(4.0, 6.0),
 )
 SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS, command_timeout_s=0.3, silence_timeout_s=0.3)
 AT_REST = messages.RtdeSample(

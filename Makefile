@@ -52,12 +52,12 @@ test: install-dev
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \
-	$(addprefix tests/bank/estimation/test_,archive.py regressors.py values.py) \
+	$(addprefix tests/estimation/test_,archive.py regressors.py values.py) \
 	$(wildcard tests/drivers/test_*.py) tests/drivers/shear_skin \
 	$(addprefix tests/drivers/ur/test_,limits.py messages.py settings.py) tests/daemon/messaging \
-	$(addprefix tests/daemon/recording/test_,replay.py schemas.py tools.py) \
-	tests/daemon/cli/test_start.py \
-	$(addprefix tests/daemon/test_cli.py::test_,bash_completes_commands_and_options every_shell_has_its_script) \
+	$(addprefix tests/tools/recordings/test_,replay.py schemas.py tools.py) \
+	tests/cli/test_start.py \
+	$(addprefix tests/cli/test_cli.py::test_,bash_completes_commands_and_options every_shell_has_its_script) \
 	$(addprefix tests/daemon/test_,config_file.py docgen.py process.py settings.py)
 test-fast: install-dev
 	$(PYTEST) -n 3 --dist loadfile -m 'not real_time' $(PYTEST_ARGS) $(FAST)
@@ -74,7 +74,7 @@ format: install-dev
 
 # The generated pages.
 docs: $(VENV)/.installed
-	$(BIN)/python -m shearloop.daemon.docgen
+	$(BIN)/python -m shearloop.cli.docgen
 
 # The pages as a site in build/site; every warning is an error. The variable silences an advertisement.
 docs-site: install-dev

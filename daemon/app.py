@@ -20,7 +20,7 @@ from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
-from shearloop.daemon.recording.recorder import Recorder, daemon_identity
+from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, build_rig
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED

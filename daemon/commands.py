@@ -7,7 +7,7 @@ from pathlib import Path
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_runner import loop_state
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig, Sensors
 from shearloop.daemon.supervisor import HealthReporter

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from shearloop.bank.defaults import BASELINE_FRAMES
-from shearloop.bank.estimator_names import EstimatorName
+from shearloop.estimation.defaults import BASELINE_FRAMES
+from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging import addresses

@@ -13,11 +13,11 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, Tareable, wrench_source
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.recording.recorder import AttachedFile, Recorder
-from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
+from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import (
     COMBINED,

@@ -25,7 +25,7 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.stop_timeline import StopTimeline
-from shearloop.daemon.errors import ActionError
+from shearloop.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH

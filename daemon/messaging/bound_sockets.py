@@ -16,7 +16,7 @@ from typing import Any
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, is_local, network_refusal, probe
 from shearloop.daemon.messaging.keys import ZAP_DOMAIN, KeyPair
 from shearloop.daemon.messaging.refusals import Refusals

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, has_valid_port, needs_keys
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode

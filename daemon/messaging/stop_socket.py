@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.daemon.messaging.command_server import Handler, Reply, RequestExecutor
 from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.refusals import Refusals

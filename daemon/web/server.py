@@ -24,8 +24,8 @@ import zmq
 import zmq.asyncio
 from aiohttp import WSCloseCode, web
 
-from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.daemon.errors import UserError
+from shearloop.bank.fingertip import Fingertip
+from shearloop.errors import UserError
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.client import ask, connect

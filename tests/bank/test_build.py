@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
-from shearloop.bank.eit.build import build_bank, solve_row
-from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import conductivity
+from shearloop.bank.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
+from shearloop.bank.build import build_bank, solve_row
+from shearloop.bank.mesh import Mesh
+from shearloop.bank.models import conductivity
 from shearloop.bank.errors import BankFileError, ConductivityError, ModelError
 
 MODEL = "gaussian_derivative"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
+from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 
 SINK, SOURCE, POSITIVE, NEGATIVE = PAPER_TABLE.electrodes.T
 # What is dead, its number of channels, and its names.

@@ -10,8 +10,8 @@ import yaml
 from scipy.io import loadmat
 from scipy.stats import spearmanr
 
-from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.eit.design import (
+from shearloop.bank.channels import PAPER_TABLE
+from shearloop.bank.design import (
     ALLOWED,
     DesignChoice,
     DesignStep,
@@ -27,12 +27,12 @@ from shearloop.bank.eit.design import (
     simulated_frames,
     simulated_signals,
 )
-from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
-from shearloop.bank.eit.mesh import load_mesh
-from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.bank.fingertip import Fingertip
+from shearloop.bank.forward import BatchForwardModel, ForwardModel
+from shearloop.bank.mesh import load_mesh
+from shearloop.bank.models import MODELS, conductivity
 from shearloop.bank.errors import CalibrationError, MatchingError
-from shearloop.daemon.bank_config import FingertipGeometryConfig
+from shearloop.tools.bank_config import FingertipGeometryConfig
 from shearloop.daemon.config_file import load_yaml_model
 
 FINGERTIP = Path(__file__).parents[2] / "config" / "fingertips" / "paper.yaml"

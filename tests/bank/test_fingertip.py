@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.channels import ChannelTable
-from shearloop.bank.eit.fingertip import ElectrodePlace, RectangularFingertip, RoundFingertip
-from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.mesh import boundary_edges, doubled_areas
-from shearloop.bank.eit.models import conductivity
+from shearloop.bank.channels import ChannelTable
+from shearloop.bank.fingertip import ElectrodePlace, RectangularFingertip, RoundFingertip
+from shearloop.bank.forward import ForwardModel
+from shearloop.bank.mesh import boundary_edges, doubled_areas
+from shearloop.bank.models import conductivity
 from shearloop.bank.errors import GeometryError
 
 CENTRES = 0.1 + 0.4 * np.arange(8)

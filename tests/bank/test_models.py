@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.models import MODELS, averaging_points, conductivity
+from shearloop.bank.models import MODELS, averaging_points, conductivity
 from shearloop.bank.errors import ModelError
 
 

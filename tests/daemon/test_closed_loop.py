@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import yaml
 
-from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.bank_file import Bank
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.run_summary import RunSummary
-from tests.daemon.conftest import ask, robot_at, running_daemon, shearloop
+from tests.fixtures.daemons import ask, robot_at, running_daemon, shearloop
 from tests.emulator_process import own_address
 from tests.paper_curve import paper_curve
 

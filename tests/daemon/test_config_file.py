@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.yaml_files import read_yaml
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from shearloop.daemon.cli.terminal import message_line
+from shearloop.cli.terminal import message_line
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
 from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, ZERO_TIMEOUT_S, LoadCellTask

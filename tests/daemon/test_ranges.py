@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.config_schema import MODELS, schema_of
+from shearloop.cli.config_schema import MODELS, schema_of
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.settings import read_settings
 

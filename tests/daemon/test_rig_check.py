@@ -10,7 +10,7 @@ import yaml
 
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.daemon.rig import check_experiment
 
 SERIAL = {"device": {"path": "port"}}

@@ -8,7 +8,7 @@ import pytest
 
 from shearloop.drivers import connection
 from shearloop.drivers.connection import LinkMonitor, SerialLink, SerialPort, TcpPort, find_port
-from shearloop.drivers.emulators.ports import PtyPort
+from shearloop.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
 from tests.running import DEADLINE_S, LinkEvents, read_exactly
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.channels import PAPER_TABLE
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
 from shearloop.drivers.connection import LinkEvent, LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame, FrameErrorKind
-from shearloop.drivers.emulators.boards import EitKitBoard, format_line
+from shearloop.emulators.boards import EitKitBoard, format_line
 from tests.running import DEADLINE_S, LinkEvents, running, take
 
 PERIOD_S = 0.003

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from shearloop.bank.eit.channels import PAPER_TABLE
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
 from shearloop.drivers.eit_kit import ADC_STEP_V, FULL_SCALE_SINE_RMS_V, Frame, FrameErrorKind, FrameParser
-from shearloop.drivers.emulators.boards import format_line
+from shearloop.emulators.boards import format_line
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.slices import slices
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from shearloop.bank.eit.channels import PAPER_TABLE
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers.connection import Link, LinkEvent, LinkMonitor, Port, Received
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell

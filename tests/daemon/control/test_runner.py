@@ -13,7 +13,7 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, along_tool
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.daemon.errors import ActionError
+from shearloop.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed

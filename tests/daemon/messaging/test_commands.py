@@ -12,10 +12,10 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.cli.command import COMMANDS
+from shearloop.cli.command import COMMANDS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, CommandServer, RequestExecutor
 from shearloop.daemon.messaging.messages import decode, encode

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.channels import PAPER_TABLE
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Estimate
+from shearloop.estimation import Estimate
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.errors import ActionError
+from shearloop.errors import ActionError
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, DeadElectrodes, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import COMBINED

@@ -14,8 +14,8 @@ from unittest.mock import patch
 import pytest
 
 from shearloop.drivers.connection import LinkMonitor
-from shearloop.drivers.emulators.gripper import Gripper, ModbusSlave, UrcapSession
-from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
+from shearloop.emulators.gripper import Gripper, ModbusSlave, UrcapSession
+from shearloop.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient

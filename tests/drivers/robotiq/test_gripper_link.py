@@ -5,7 +5,7 @@ import contextlib
 
 import pytest
 
-from shearloop.drivers.emulators.gripper import ModbusSlave
+from shearloop.emulators.gripper import ModbusSlave
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand
 from tests.drivers.robotiq.gripper_rig import WAYS, a_rig

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.connection import Link, LinkMonitor, SerialLink, TcpLink
-from shearloop.drivers.emulators.ports import SocketServer
-from shearloop.drivers.emulators.skin import (
+from shearloop.emulators.ports import SocketServer
+from shearloop.emulators.skin import (
     DAQ_PERIOD_S,
     Circuit,
     EmulatedKeithley6430,

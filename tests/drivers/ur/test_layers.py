@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from shearloop.drivers.emulators.ur_robot import PLAYING, Robot
+from shearloop.emulators.ur_robot import PLAYING, Robot
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, NO_MOTION_S
 from tests.drivers.ur import robots

@@ -55,10 +55,10 @@ FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.
 	$(addprefix tests/estimation/test_,archive.py regressors.py values.py) \
 	$(wildcard tests/drivers/test_*.py) tests/drivers/shear_skin \
 	$(addprefix tests/drivers/ur/test_,limits.py messages.py settings.py) tests/daemon/messaging \
-	$(addprefix tests/tools/recordings/test_,replay.py schemas.py tools.py) \
+	$(addprefix tests/tools/recordings/test_,replay.py tools.py) tests/daemon/recorder/test_schemas.py tests/cli/test_docgen.py \
 	tests/cli/test_start.py \
 	$(addprefix tests/cli/test_cli.py::test_,bash_completes_commands_and_options every_shell_has_its_script) \
-	$(addprefix tests/daemon/test_,config_file.py docgen.py process.py settings.py)
+	$(addprefix tests/daemon/test_,config_file.py process.py settings.py)
 test-fast: install-dev
 	$(PYTEST) -n 3 --dist loadfile -m 'not real_time' $(PYTEST_ARGS) $(FAST)
 

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray
 from shearloop.bank.channels import PAPER_TABLE, STIMULATION_CURRENT, ChannelTable
-from shearloop.bank.models import MODELS, model_named
 from shearloop.bank.errors import BankFileError, ModelError
+from shearloop.bank.models import MODELS, model_named
 from shearloop.files import open_file, refusing_damage, replace_file
 
 FORMAT_VERSION = 1

@@ -9,10 +9,10 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray
 from shearloop.bank.bank_file import MIN_SIGNAL_NORM, BankDefinition, write_bank
+from shearloop.bank.errors import BankFileError, ModelError
 from shearloop.bank.forward import BatchForwardModel
 from shearloop.bank.mesh import Mesh
 from shearloop.bank.models import conductivity
-from shearloop.bank.errors import BankFileError, ModelError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

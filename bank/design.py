@@ -23,11 +23,11 @@ from scipy.stats import rankdata
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.channels import ChannelTable
+from shearloop.bank.errors import CalibrationError, MatchingError
 from shearloop.bank.fingertip import Fingertip
 from shearloop.bank.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.matching import ReferenceMatcher
 from shearloop.bank.models import MODELS, conductivity
-from shearloop.bank.errors import CalibrationError, MatchingError
 
 # The share of the noise that each choice may add.
 ALLOWED = 1.0 / 3.0

@@ -16,8 +16,8 @@ from scipy.spatial import Delaunay
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.channels import INJECTION, ChannelTable, Injection
-from shearloop.bank.mesh import Mesh, joined_edges
 from shearloop.bank.errors import GeometryError
+from shearloop.bank.mesh import Mesh, joined_edges
 
 Side = Literal["left", "top", "right", "bottom"]
 SIDES: tuple[Side, ...] = ("left", "top", "right", "bottom")

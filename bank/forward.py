@@ -17,8 +17,8 @@ from skfem.helpers import dot, grad
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.channels import PAPER_TABLE, STIMULATION_CURRENT, ChannelTable
-from shearloop.bank.mesh import Mesh, Terms, rows_of_edges
 from shearloop.bank.errors import ConductivityError, GeometryError
+from shearloop.bank.mesh import Mesh, Terms, rows_of_edges
 
 # Symmetric positive definite matrices need no pivoting.
 _LITTLE_FILL: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}

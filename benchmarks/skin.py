@@ -23,15 +23,6 @@ import numpy as np
 from benchmarks.common import parser_of, table_head, table_row
 from shearloop.bank.arrays import FloatArray
 from shearloop.estimation.skin.calibration import CalibrationTable, fit_calibration
-from shearloop.studies.skin.characterisation import (
-    PAPER_MEASURED_SENSITIVITY,
-    fit_line,
-    loading,
-    loop,
-    origin_slope,
-    responses,
-)
-from shearloop.studies.skin.finite_strain import FiniteStrainSkin
 from shearloop.estimation.skin.membrane import (
     GAUGE_FACTOR,
     PAPER_SECTION,
@@ -53,6 +44,15 @@ from shearloop.estimation.skin.plane_strain import (
     states_along,
     unloaded,
 )
+from shearloop.studies.skin.characterisation import (
+    PAPER_MEASURED_SENSITIVITY,
+    fit_line,
+    loading,
+    loop,
+    origin_slope,
+    responses,
+)
+from shearloop.studies.skin.finite_strain import FiniteStrainSkin
 from shearloop.studies.skin.sheet import PLATE_MM, SheetSkin
 
 NORMAL_N, AMPLITUDE_N = 1.0, 1.0

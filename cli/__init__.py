@@ -17,8 +17,8 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from shearloop.daemon.errors import USER_ERRORS
-from shearloop.errors import UserError
 from shearloop.daemon.process import interrupt_status, raise_ending_signals
+from shearloop.errors import UserError
 
 # Our products are small: a BLAS with one thread is faster. Must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -26,7 +26,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Ctrl-C is their usual end, and nothing is left undone.
 _ENDED_BY_INTERRUPT = ("shearloop listen", "shearloop view", "shearloop emulate")
-# The module of each command below `shearloop.daemon`, and its summary for the overview.
+# The module of each command below `shearloop`, and its summary for the overview.
 COMMANDS = {
     "demo": ("cli.demo", "run the whole rig, emulated, in closed loop"),
     "init": ("cli.init", "write a commented configuration and experiments to start from"),
@@ -46,7 +46,7 @@ COMMANDS = {
     "emulate": ("cli.emulate", "emulate a device, byte for byte, on a port of its own"),
     "bank": ("cli.bank", "solve, build, design and inspect banks of simulated signals"),
     "doctor": ("cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
-    "ports": ("serial_ports", "list the serial ports with their serial numbers"),
+    "ports": ("tools.serial_ports", "list the serial ports with their serial numbers"),
     "keys": ("cli.keys", "make the keys for daemon and clients on a network"),
     "completion": ("cli.completion", "print the completion script for bash, zsh or tcsh"),
     "install": ("cli.install", "install the daemon as a service of this computer"),
@@ -111,7 +111,7 @@ class Parser(argparse.ArgumentParser):
 
 def command_module(name: str) -> ModuleType:
     """Import and return the module of a command."""
-    return importlib.import_module(f"shearloop.daemon.{COMMANDS[name][0]}")
+    return importlib.import_module(f"shearloop.{COMMANDS[name][0]}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -3,15 +3,7 @@
 import argparse
 from pathlib import Path
 
-from shearloop.cli.options import (
-    DELAY_S,
-    TOOL_MM,
-    add_json,
-    add_option,
-    check_overwrite,
-    load_calibration,
-    time_range,
-)
+from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, check_overwrite, load_calibration, time_range
 from shearloop.cli.terminal import print_result
 
 

@@ -146,11 +146,11 @@ def _text(value: object) -> str:
 def _solve(args: argparse.Namespace) -> int:
     import numpy as np
 
+    from shearloop.bank.errors import ConductivityError
     from shearloop.bank.forward import ForwardModel
     from shearloop.bank.models import conductivity
-    from shearloop.bank.errors import ConductivityError
-    from shearloop.tools.bank_config import load_geometry
     from shearloop.files import replace_file
+    from shearloop.tools.bank_config import load_geometry
 
     check_overwrite(args.out, "an array of NumPy", np.lib.format.MAGIC_PREFIX)
     mesh, table = load_geometry(args.mesh)

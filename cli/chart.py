@@ -39,9 +39,9 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.bank_file import Bank
     from shearloop.studies.charts import scene, simulated_loop, speed_accuracy, stability
     from shearloop.studies.charts.chart_data import GRID, MESH_SIZE_CM, own_fingertip, splits
-    from shearloop.tools.drawing import chart_folder
-    from shearloop.tools.banks import cached_bank
     from shearloop.tools.bank_config import load_geometry
+    from shearloop.tools.banks import cached_bank
+    from shearloop.tools.drawing import chart_folder
     from shearloop.tools.parallel import open_executor
 
     with chart_folder(args.out), TemporaryFile(dir=args.out):

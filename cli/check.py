@@ -152,9 +152,9 @@ def _clients(curve: "CurveConfig") -> str:
 
 
 def _skin(config: "SkinConfig") -> str:
-    from shearloop.estimation.skin.calibration import load_calibration
     from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE
     from shearloop.daemon.sensing.skin_task import check_circuit
+    from shearloop.estimation.skin.calibration import load_calibration
 
     calibration = load_calibration(config.calibration)
     check_circuit(config, calibration)

@@ -14,8 +14,8 @@ from shearloop.cli import bank, init
 from shearloop.cli import run as run_command
 from shearloop.cli.emulator_processes import SHEARLOOP, running
 from shearloop.cli.options import add_option, writing
-from shearloop.errors import missing
 from shearloop.daemon.process import interrupt_status
+from shearloop.errors import missing
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
@@ -71,8 +71,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:
     """Make the bank and, if `calibrated`, the calibrations, where they are missing or outdated."""
-    from shearloop.tools.banks import is_built
     from shearloop.tools.bank_config import load_bank_plan
+    from shearloop.tools.banks import is_built
 
     with writing(data, "the folder"):
         data.mkdir(exist_ok=True)

@@ -26,8 +26,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print all findings; return 1 if something is wrong."""
 
-    from shearloop.tools.doctor import examine
     from shearloop.daemon.logs import logging_to_stderr
+    from shearloop.tools.doctor import examine
 
     findings = []
     with logging_to_stderr(level=logging.ERROR):

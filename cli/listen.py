@@ -4,8 +4,8 @@ import argparse
 import sys
 
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, positive
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.errors import UserError
 
 EPILOG = """
 examples:

@@ -10,13 +10,13 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.addresses import needs_keys
+from shearloop.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.bank.fingertip import Fingertip
-    from shearloop.estimation import Calibration, FrameSeries
     from shearloop.daemon.messaging.keys import ClientKeys
+    from shearloop.estimation import Calibration, FrameSeries
 
 PAPERS_RECORDINGS = (
     "The paper's recordings: https://github.com/DhruvTrehan03/Soft-Tactile-Sensing-For-Robotic-Manipulation "
@@ -125,8 +125,8 @@ def add_fingertip(parser: argparse.ArgumentParser) -> None:
 
 def load_fingertip(path: Path | None) -> "Fingertip":
     """Return the fingertip of a file, or the paper's; raises UserError for a file that cannot be used."""
-    from shearloop.tools.bank_config import FingertipGeometryConfig
     from shearloop.daemon.config_file import load_yaml_model
+    from shearloop.tools.bank_config import FingertipGeometryConfig
 
     with resources.as_file(resources.files("shearloop.daemon.web") / "assets" / "fingertip.yaml") as paper:
         return load_yaml_model(path or paper, FingertipGeometryConfig).fingertip()

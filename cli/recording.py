@@ -128,8 +128,8 @@ def _lost_text(lost: Mapping[str, int]) -> str:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from shearloop.tools.recordings.export import export
     from shearloop.daemon.recorder.schema import INPUT
+    from shearloop.tools.recordings.export import export
     from shearloop.tools.recordings.tables import RecordedTopics
 
     path, form = args.recording, args.format

@@ -35,8 +35,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replay to the end and print the comparison with the recorded estimates."""
     from shearloop.daemon.config import load_daemon_config
-    from shearloop.tools.recordings.replay import RecordedRun
     from shearloop.daemon.recorder.schema import code_digest
+    from shearloop.tools.recordings.replay import RecordedRun
 
     run = RecordedRun(args.recording)
     with nullcontext(load_daemon_config(args.config)) if args.config else run.configuration() as config:

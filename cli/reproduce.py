@@ -53,9 +53,9 @@ def _reproduce(args: argparse.Namespace, jobs: int) -> "Reproduction":
 
     from shearloop.bank.channels import smoothed_along_channels
     from shearloop.studies.reproduce import analysis
-    from shearloop.tools.banks import GRIDS, cached_bank, choose_mesh
     from shearloop.studies.reproduce.dataset import read_twists, regress_on_channels
     from shearloop.studies.reproduce.report import Reproduction
+    from shearloop.tools.banks import GRIDS, cached_bank, choose_mesh
 
     inputs = analysis.read_inputs(args.recordings)
     mesh, origin = choose_mesh(args.recordings, args.mesh)

@@ -58,10 +58,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[[], None], *, terminal: bool) -> int:
-    from shearloop.daemon.app import run_daemon
     from shearloop.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.cli.emulator_processes import EmulatedDevices
     from shearloop.cli.terminal import StatusLine, print_estimate
+    from shearloop.daemon.app import run_daemon
     from shearloop.daemon.messaging.refusals import Refusals
     from shearloop.daemon.messaging.stop_socket import StopSocket
     from shearloop.daemon.process import lock_memory, raise_descriptor_limit, raise_priority

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from shearloop.cli.options import PORT, add_connection, add_fingertip, add_option, client_keys, load_fingertip
 from shearloop.cli.terminal import print_result
-from shearloop.errors import require
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
+from shearloop.errors import require
 
 PAGE_PORT = 7760
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_runner import loop_state
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig, Sensors
 from shearloop.daemon.supervisor import HealthReporter
+from shearloop.errors import UserError
 
 STOP_DELAY_S = 0.05
 # What `status` shows of `loop.state`.

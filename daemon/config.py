@@ -6,8 +6,6 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from shearloop.estimation.defaults import BASELINE_FRAMES
-from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging import addresses
@@ -25,6 +23,8 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
     URCAP_PORT,
 )
+from shearloop.estimation.defaults import BASELINE_FRAMES
+from shearloop.estimation.estimator_names import EstimatorName
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {

@@ -10,14 +10,13 @@ from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig,
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control import experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, Tareable, wrench_source
-from shearloop.errors import UserError
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
-from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import (
     COMBINED,
@@ -39,6 +38,7 @@ from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
+from shearloop.errors import UserError
 from shearloop.yaml_files import located, read_yaml
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import ChannelTable
-from shearloop.errors import UserError
 from shearloop.drivers.eit_kit import ADC_STEP_V
+from shearloop.errors import UserError
 
 # Mean and frame-to-frame standard deviation of the recorded frames.
 MEAN_V = 0.13

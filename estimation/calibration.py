@@ -24,11 +24,11 @@ from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.bank_match import BankMatcher
 from shearloop.estimation.estimator import Estimator, OutputModel, PaperEstimator, Quantity
+from shearloop.estimation.estimator_names import estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator
+from shearloop.estimation.gain import GainCorrection, ToolLaw
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.values import INLINE, Kind, Measured
-from shearloop.estimation.estimator_names import estimator_class
-from shearloop.estimation.gain import GainCorrection, ToolLaw
 from shearloop.files import open_file, refusing_damage, replace_file
 from shearloop.yaml_files import parse_yaml, shown
 

@@ -23,15 +23,15 @@ from shearloop.estimation.estimator import (
     Quantity,
     Reading,
 )
+from shearloop.estimation.estimator_names import EstimatorName, estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator, segment_grip
+from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, gains_of_recordings
 from shearloop.estimation.interval_regressor import CensoredRidge, IntervalRegressor, fit_interval_regressor
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.novelty import NoveltyDetector
 from shearloop.estimation.regressors import ChannelImputer, later_origins
 from shearloop.estimation.session_state import ProcessedFrame, SessionState
 from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
-from shearloop.estimation.estimator_names import EstimatorName, estimator_class
-from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, gains_of_recordings
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75

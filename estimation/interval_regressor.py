@@ -19,11 +19,11 @@ import numpy as np
 from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
+from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
 from shearloop.estimation.regressors import InverseCalibration, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.values import INLINE
-from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
 from shearloop.words import counted
 
 # Readings below this share of the largest torque mean that the lever does not touch.

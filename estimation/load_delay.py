@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.fingertip_validator import channel_noise, segment_grip
 from shearloop.estimation.regressors import left_out_blocks
 from shearloop.estimation.values import FrameSeries, check_finite

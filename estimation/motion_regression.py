@@ -13,10 +13,10 @@ from typing import ClassVar, Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.bank.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import TWO_SIDED_95
+from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator import (
     LEAST_LEFT,
     Bounds,

@@ -12,9 +12,9 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.estimation.confidence import LEVEL
 from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import LEVEL
 from shearloop.estimation.fingertip_validator import LARGEST_UNUSABLE_SHARE
 from shearloop.estimation.regressors import later_origins, left_out_blocks
 

@@ -9,17 +9,17 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation.defaults import BASELINE_FRAMES, MAX_GAP_S
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.bank_match import BankMatch, BankMatcher
 from shearloop.estimation.calibration import Calibration
+from shearloop.estimation.confidence import TWO_SIDED_95
+from shearloop.estimation.defaults import BASELINE_FRAMES, MAX_GAP_S
 from shearloop.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading
 from shearloop.estimation.fingertip_validator import FingertipValidator
+from shearloop.estimation.gain import GainCorrection, find_twists
 from shearloop.estimation.session_state import PaperState, ProcessedFrame, SessionState, SliceState
 from shearloop.estimation.values import Estimate, Measured, TactileFrame
-from shearloop.estimation.gain import GainCorrection, find_twists
 from shearloop.words import counted
 
 REPEATED_FRAME = ("the board sent the same frame again",)

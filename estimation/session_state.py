@@ -14,8 +14,8 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.bank.matching import signal_above_noise
+from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.fingertip_validator import (
     LARGEST_JUMPING_SHARE,
     LEAST_NOISE_V,

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.words import counted
 
 # "raw": volts as the board sends them. "difference": slices, |frame − idle frame| smoothed over time.

@@ -16,22 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.build import build_bank
-from shearloop.estimation import Calibration, FrameSeries, fit, measure_timing
-from shearloop.tools.evaluate import estimate_series, figures_of
-from shearloop.tools.frame_series import series_of
-from shearloop.tools.banks import is_built
-from shearloop.tools.bank_config import load_bank_plan
 from shearloop.cli.options import processors, writing
 from shearloop.cli.terminal import progress_bar
-from shearloop.tools.recordings.reader import read_recording
 from shearloop.daemon.recorder.schema import DIAMETER_NOTE
 from shearloop.daemon.recorder.writer import McapFile, new_recording
-from shearloop.emulators.synthetic_frames import RigFrames
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.emulators.boards import LOAD_PERIOD_S
 from shearloop.emulators.emulated_rig import NOISE_NM, SIDES
 from shearloop.emulators.gripper import Gripper, GripperRegisters
 from shearloop.emulators.scene import Scene
+from shearloop.emulators.synthetic_frames import RigFrames
+from shearloop.estimation import Calibration, FrameSeries, fit, measure_timing
+from shearloop.tools.bank_config import load_bank_plan
+from shearloop.tools.banks import is_built
+from shearloop.tools.evaluate import estimate_series, figures_of
+from shearloop.tools.frame_series import series_of
+from shearloop.tools.recordings.reader import read_recording
 
 # Three diameters are enough to interpolate; five halve the interval.
 DIAMETERS_MM = (10.0, 17.5, 25.0, 32.5, 40.0)

@@ -14,7 +14,7 @@ import yaml
 import shearloop
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("bank", "daemon", "drivers")
+FOLDERS = ("bank", "cli", "daemon", "drivers", "emulators", "estimation", "studies", "tools")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 

@@ -1,1 +1,1 @@
-"""Analysis of recordings: calibrate, evaluate, reproduce, charts."""
+"""What a person runs at the desk: recordings, calibrations, evaluation, checks."""

@@ -10,10 +10,10 @@ from pydantic import Field, model_validator
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.bank_file import BankDefinition
 from shearloop.bank.channels import INJECTION, ChannelTable, Injection
+from shearloop.bank.errors import GeometryError
 from shearloop.bank.fingertip import ElectrodePlace, Fingertip, RectangularFingertip, RoundFingertip, Side
 from shearloop.bank.mesh import Mesh, load_mesh
 from shearloop.bank.models import MODELS
-from shearloop.bank.errors import GeometryError
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 
 if TYPE_CHECKING:

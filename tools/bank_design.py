@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.design import ALLOWED, Design, MeasuredFrames, design_bank
+from shearloop.errors import UserError
 from shearloop.estimation.fingertip_validator import channel_noise, segment_grip
 from shearloop.estimation.values import FrameSeries
-from shearloop.tools.frame_series import read_series
-from shearloop.tools.banks import OWN_FINGERTIP
 from shearloop.tools.bank_config import load_fingertip
-from shearloop.errors import UserError
+from shearloop.tools.banks import OWN_FINGERTIP
+from shearloop.tools.frame_series import read_series
 
 # The principal directions of one contact's frames; the rest is noise.
 _N_DIRECTIONS = 4

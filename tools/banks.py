@@ -11,10 +11,10 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.bank_file import Bank, BankDefinition
 from shearloop.bank.build import build_bank
-from shearloop.bank.mesh import Mesh
 from shearloop.bank.errors import BankFileError
-from shearloop.tools.bank_config import load_geometry
+from shearloop.bank.mesh import Mesh
 from shearloop.errors import UserError
+from shearloop.tools.bank_config import load_geometry
 
 MODEL = "gaussian_derivative"
 # The paper's own mesh, next to a folder of recordings.

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from shearloop.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
-from shearloop.estimation.interval_regressor import IntervalRegressor
-from shearloop.estimation.values import Measured, distinct
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.gain import GainCorrection
+from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.values import Measured, distinct
 from shearloop.tools.frame_series import check_no_copies, check_paths_differ, part_of, read_series, series_of
 from shearloop.tools.recordings.reader import read_recording
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.tools.evaluate import EstimateTrack, values_of
 from shearloop.daemon.control.loop_inputs import Creep
 from shearloop.errors import UserError
+from shearloop.tools.evaluate import EstimateTrack, values_of
 
 # A longer time without a torque ends a grip; single invalid frames do not.
 LONGEST_GAP_S = 5.0

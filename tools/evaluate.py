@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.estimation.defaults import LOADED_NM
 from shearloop.bank.bank_file import Bank
 from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
+from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.values import winkler_scores
 
 if TYPE_CHECKING:

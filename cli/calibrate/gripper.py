@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option, check_calibration_file
 from shearloop.cli.terminal import Operator, print_result
-from shearloop.errors import UserError
 from shearloop.drivers.defaults import URCAP_PORT
+from shearloop.errors import UserError
 from shearloop.words import counted
 
 if TYPE_CHECKING:

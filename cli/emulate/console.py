@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 from shearloop.cli.options import add_option, positive
 from shearloop.cli.terminal import stdin_lines
-from shearloop.errors import UserError
 from shearloop.daemon.process import ending_signals
+from shearloop.errors import UserError
 
 
 class Device(NamedTuple):

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.emulate import console
 from shearloop.cli.options import PORT, add_option, number, positive
-from shearloop.errors import UserError
 from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.emulators import number_between
+from shearloop.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -104,9 +104,9 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
 
 
 def _play_hx711(args: argparse.Namespace) -> Playing:
-    from shearloop.emulators.boards import LOAD_PERIOD_S, PAPER_SKETCH, Hx711Board, Sketch
     from shearloop.drivers.load_cell import LEVER_ARM_M
     from shearloop.drivers.load_cell_calibration import STANDARD_GRAVITY
+    from shearloop.emulators.boards import LOAD_PERIOD_S, PAPER_SKETCH, Hx711Board, Sketch
 
     held_nm = args.torque_nm
     sketch, period_s = PAPER_SKETCH if args.paper_sketch else Sketch(), LOAD_PERIOD_S / args.speed

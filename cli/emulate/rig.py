@@ -16,10 +16,10 @@ from shearloop.cli.options import PORT, TOOL_MM, add_option, positive
 from shearloop.emulators import number_between
 
 if TYPE_CHECKING:
-    from shearloop.emulators.synthetic_skin import SyntheticSkin
     from shearloop.emulators.emulated_rig import EmulatedRig
     from shearloop.emulators.scene import Truth
     from shearloop.emulators.skin import Address
+    from shearloop.emulators.synthetic_skin import SyntheticSkin
 
 TRUTH_PERIOD_S = 0.1
 # The gauges' drift advances in steps of this.
@@ -96,10 +96,10 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
 
 
 def _play_rig(args: argparse.Namespace) -> Playing:
-    from shearloop.emulators.synthetic_frames import RigFrames
     from shearloop.emulators.boards import PAPER_SKETCH
     from shearloop.emulators.emulated_rig import NOISE_NM, EmulatedRig
     from shearloop.emulators.scene import TwinSettings
+    from shearloop.emulators.synthetic_frames import RigFrames
 
     make = robot_make(args)
     args.run_dir.mkdir(parents=True, exist_ok=True)
@@ -166,8 +166,8 @@ def _configure_skin(parser: argparse.ArgumentParser) -> None:
 
 
 def _play_skin(args: argparse.Namespace) -> Playing:
-    from shearloop.emulators.synthetic_skin import SyntheticSkin
     from shearloop.emulators.skin import SkinInstruments
+    from shearloop.emulators.synthetic_skin import SyntheticSkin
     from shearloop.emulators.ur_controller import Controller
     from shearloop.emulators.ur_robot import Robot
 

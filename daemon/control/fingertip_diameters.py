@@ -1,7 +1,7 @@
 """Diameter of the tool from the fingertips. No I/O; times are passed in."""
 
-from shearloop.estimation import Estimate, Measured, combine
 from shearloop.daemon.messaging.messages import stale_after_s
+from shearloop.estimation import Estimate, Measured, combine
 
 STALE_AFTER_NS = round(stale_after_s("eit.estimate") * 1e9)
 

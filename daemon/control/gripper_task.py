@@ -5,19 +5,19 @@ import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
-from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation import Measured, combine
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.loop_inputs import GripperStatus
-from shearloop.errors import ActionError
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
+from shearloop.errors import ActionError
+from shearloop.estimation import Measured, combine
+from shearloop.estimation.confidence import TWO_SIDED_95
 
 OPENING = opening(140.0, 100.0)
 # The fingers' own stop may lie this far before the widest target.

@@ -25,7 +25,6 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.stop_timeline import StopTimeline
-from shearloop.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
@@ -45,6 +44,7 @@ from shearloop.drivers.ur.messages import (
     tool_axis,
 )
 from shearloop.drivers.ur.settings import Six
+from shearloop.errors import ActionError
 
 WRENCH = "wrench"
 # Without a new state the loop decides after this time, half of the time after which the arm's state is stale.

@@ -1,1 +1,1 @@
-"""Recordings: write, import, read, replay, repair and export MCAP files of JSON messages."""
+"""The writer of recordings: MCAP files of JSON messages, and their schemas."""

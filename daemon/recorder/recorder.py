@@ -26,12 +26,12 @@ from pydantic_core import PydanticSerializationError
 from shearloop.bank.bank_file import Bank
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.messages import LoopState, Scalar
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL, McapFile
 from shearloop.daemon.sensing.frame_estimator import channel_table
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
+from shearloop.errors import UserError
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.
 FLUSH_S = 0.5

@@ -86,7 +86,7 @@ def code_digest() -> str:
     """Return a hash of shearloop's own sources; equal code must give equal replays."""
     root = Path(__file__).resolve().parents[2]
     digest = hashlib.sha256()
-    for package in ("bank", "drivers", "daemon"):
+    for package in ("bank", "estimation", "drivers", "daemon", "tools"):
         for path in sorted((root / package).rglob("*.py")):
             digest.update(f"{path.relative_to(root)}\0".encode())
             digest.update(path.read_bytes())

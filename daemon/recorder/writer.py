@@ -17,8 +17,8 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
-from shearloop.errors import UserError
 from shearloop.daemon.recorder import schema
+from shearloop.errors import UserError
 from shearloop.files import sync_directory
 
 PARTIAL = ".partial"

@@ -13,19 +13,19 @@ import structlog
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import Adaptation, Estimate, Measured, torque_at
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.errors import ActionError
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
+from shearloop.errors import ActionError
+from shearloop.estimation import Adaptation, Estimate, Measured, torque_at
 from shearloop.words import counted
 
 # Largest distance in time of a pair of frames, as a share of the frame period.

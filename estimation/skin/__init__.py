@@ -1,1 +1,1 @@
-"""The resistive shear skin: measurement model, membrane, two-dimensional reference, calibration and statistics."""
+"""What the resistive shear skin needs at run time: measurement model, membrane, calibration."""

@@ -30,26 +30,19 @@ Follow a running daemon, with `for` or `async for`:
             print(message["torque_nm"])
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from shearloop.faces import importer
 
 if TYPE_CHECKING:
     from shearloop.bank.bank_file import Bank
     from shearloop.bank.pruned_matching import PrunedMatcher as Matcher
-    from shearloop.estimation import (
-        Calibration,
-        Estimate,
-        EstimatorSession,
-        FrameSeries,
-        Physics,
-        TactileFrame,
-        fit,
-    )
-    from shearloop.tools.evaluate import estimate_series, figures_by_load
-    from shearloop.tools.frame_series import read_series
-    from shearloop.studies.emulated_calibration import emulate_recordings
     from shearloop.daemon.messaging.client import Subscriber
     from shearloop.daemon.messaging.keys import ClientKeys
+    from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
+    from shearloop.studies.emulated_calibration import emulate_recordings
+    from shearloop.tools.evaluate import estimate_series, figures_by_load
+    from shearloop.tools.frame_series import read_series
     from shearloop.tools.recordings.tables import read
 
 __all__ = [
@@ -71,7 +64,6 @@ __all__ = [
     "read_series",
 ]
 
-# Imported on first use: the command line answers at once.
 _HOMES = {
     "Bank": "shearloop.bank.bank_file:Bank",
     "Calibration": "shearloop.estimation:Calibration",
@@ -90,13 +82,4 @@ _HOMES = {
     "read": "shearloop.tools.recordings.tables:read",
     "read_series": "shearloop.tools.frame_series:read_series",
 }
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'shearloop' has no attribute {name!r}")
-    module, _, attribute = _HOMES[name].partition(":")
-    value = getattr(importlib.import_module(module), attribute)
-    globals()[name] = value
-    return value
+__getattr__ = importer(__name__, globals(), _HOMES)

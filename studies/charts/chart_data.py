@@ -9,15 +9,15 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.bank.fingertip import Fingertip
 from shearloop.bank.errors import BankError
+from shearloop.bank.fingertip import Fingertip
+from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.emulators.synthetic_frames import LARGEST_TORQUE_NM, Synthesiser, TwistProgramme
 from shearloop.estimation import Calibration, FrameSeries, Physics, fit, measure_timing
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.tools.frame_series import part_of, read_series
-from shearloop.tools.banks import OWN_FINGERTIP, Grid, cached_bank
 from shearloop.tools.bank_config import load_fingertip
-from shearloop.emulators.synthetic_frames import LARGEST_TORQUE_NM, Synthesiser, TwistProgramme
-from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.tools.banks import OWN_FINGERTIP, Grid, cached_bank
+from shearloop.tools.frame_series import part_of, read_series
 
 # Frames before the judged part of a stream that fill an estimator's memory.
 WARM_UP_FRAMES = 15

@@ -11,17 +11,17 @@ from matplotlib.figure import Figure
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE
+from shearloop.drivers.eit_kit import ADC_STEP_V
+from shearloop.emulators.synthetic_frames import MEAN_V
 from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame
 from shearloop.estimation.bank_match import ElectrodeNumbering
-from shearloop.estimation.fingertip_validator import channel_noise
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.tools.bank_design import residual_noise
+from shearloop.estimation.fingertip_validator import channel_noise
 from shearloop.studies.charts.chart_data import Split, fitted
+from shearloop.tools.bank_design import residual_noise
 from shearloop.tools.drawing import figure, look
 from shearloop.tools.evaluate import values_of
 from shearloop.tools.parallel import Executor
-from shearloop.emulators.synthetic_frames import MEAN_V
-from shearloop.drivers.eit_kit import ADC_STEP_V
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from shearloop.bank.design import ALLOWED, Design, DesignChoice, design_bank, simulated_frames
-from shearloop.tools.bank_design import doubts, scene_of
 from shearloop.studies.charts.chart_data import Split, own_fingertip
-from shearloop.tools.drawing import SHADES, figure, save, slug
-from shearloop.tools.banks import OWN_FINGERTIP
 from shearloop.tools.bank_config import load_fingertip
+from shearloop.tools.bank_design import doubts, scene_of
+from shearloop.tools.banks import OWN_FINGERTIP
+from shearloop.tools.drawing import SHADES, figure, save, slug
 from shearloop.tools.parallel import Executor
 
 _MESH_SIZE_CM = 0.07

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.studies.skin.characterisation import PAPER_LINEAR_N, WARM_K, Characterisation, ResponseCurve
 from shearloop.estimation.skin.membrane import PAPER_SECTION, warming_change
+from shearloop.studies.skin.characterisation import PAPER_LINEAR_N, WARM_K, Characterisation, ResponseCurve
 from shearloop.tools.drawing import figure
 
 ONE_D, TWO_D, GREY = "#c44e52", "#1f4e79", "#888888"

@@ -16,17 +16,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
-from shearloop.tools.drawing import figure, look, save
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, LoopConfig, TorqueSample, TorqueSource
-from shearloop.tools.parallel import Executor
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
-from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.drivers.shear_skin.skin import SkinSample
+from shearloop.emulators.synthetic_skin import SyntheticSkin
+from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
+from shearloop.tools.drawing import figure, look, save
+from shearloop.tools.parallel import Executor
 
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
 # From the middle of a conversion to the controller; and from a speed command to the wrist.

@@ -12,22 +12,22 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from shearloop.bank.arrays import Float32Array, FloatArray, IntArray
-from shearloop.estimation.defaults import LOADED_NM
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
 from shearloop.bank.mesh import Mesh
 from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.estimation import Calibration, FrameSeries, Physics
 from shearloop.estimation.bank_match import NOT_TURNED, BankMatcher, RefinedMatcher
+from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator import PaperEstimator
+from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.interval_regressor import IntervalRegressor, Ridge, fit_interval_regressor
 from shearloop.estimation.regressors import ranked_channels
-from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.tools import drawing
 from shearloop.studies.charts.chart_data import Split, fitted
-from shearloop.tools.drawing import LINES, MARKS, SHADES
 from shearloop.studies.charts.forward_methods import CELLS, SolvedForward, forward_methods
 from shearloop.studies.charts.simulated_loop import GAIN, LOOPS, TrackingError, tracking_errors
+from shearloop.tools import drawing
+from shearloop.tools.drawing import LINES, MARKS, SHADES
 from shearloop.tools.evaluate import estimate_series, values_of
 
 _ESTIMATORS: tuple[EstimatorName, ...] = ("bank", "regression", "reconstruction", "motion_regression")

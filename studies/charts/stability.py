@@ -13,14 +13,14 @@ from matplotlib.figure import Figure
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.bank_file import Bank
-from shearloop.bank.mesh import Mesh
 from shearloop.bank.errors import BankError
+from shearloop.bank.mesh import Mesh
+from shearloop.errors import UserError
 from shearloop.estimation import Calibration, EstimatorSession, FrameSeries, Physics, TactileFrame, bank_match, fit
 from shearloop.estimation.bank_match import NOT_TURNED
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.studies.charts import skin_loop
 from shearloop.studies.charts.chart_data import Split, SyntheticSlices, fitted, played_bank, splits, torque_of
-from shearloop.tools.drawing import figure, look, save, slug
 from shearloop.studies.charts.fault_sweeps import (
     BROKEN_SHARE,
     FaultCurve,
@@ -35,9 +35,9 @@ from shearloop.studies.charts.fault_sweeps import (
     sweeps_figure,
 )
 from shearloop.studies.charts.speed_accuracy import matched_sigma, parabola
-from shearloop.tools.evaluate import values_of
 from shearloop.tools.banks import Grid
-from shearloop.errors import UserError
+from shearloop.tools.drawing import figure, look, save, slug
+from shearloop.tools.evaluate import values_of
 from shearloop.tools.parallel import Executor
 
 STEPS = 25

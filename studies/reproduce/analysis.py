@@ -20,11 +20,11 @@ from shearloop.bank.design import (
     searched_settings,
     simulated_signals,
 )
+from shearloop.bank.errors import MatchingError
 from shearloop.bank.forward import BatchForwardModel
 from shearloop.bank.matching import Match, ReferenceMatcher, best_match
 from shearloop.bank.mesh import Mesh
 from shearloop.bank.models import MODELS
-from shearloop.bank.errors import MatchingError
 from shearloop.errors import UserError
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.matlab_import import (

@@ -20,15 +20,9 @@ from shearloop.bank.matching import Match
 from shearloop.bank.mesh import Mesh
 from shearloop.bank.models import MODELS
 from shearloop.studies.charts.bank_figures import evenly_spread, models_figure, signal_figure
-from shearloop.tools.drawing import figure, lay_out
 from shearloop.studies.reproduce.analysis import DiameterResult, Matches, ModelScores, TorqueResult
-from shearloop.studies.reproduce.dataset import (
-    PAPER_CHANNELS,
-    PAPER_SHARE,
-    ChannelRegression,
-    Twists,
-    dataset_figure,
-)
+from shearloop.studies.reproduce.dataset import PAPER_CHANNELS, PAPER_SHARE, ChannelRegression, Twists, dataset_figure
+from shearloop.tools.drawing import figure, lay_out
 from shearloop.words import counted
 
 PAPER = "Trehan, Hardman and Iida 2025, Sensors 25, 5159"

@@ -12,7 +12,6 @@ from scipy.stats import linregress
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.estimation.confidence import LEVEL
-from shearloop.studies.skin.finite_strain import FiniteStrainSkin
 from shearloop.estimation.skin.membrane import (
     EXCITATION_A,
     GAUGE_RESISTANCE_OHM,
@@ -33,6 +32,7 @@ from shearloop.estimation.skin.plane_strain import (
     states_along,
     unloaded,
 )
+from shearloop.studies.skin.finite_strain import FiniteStrainSkin
 
 # The paper's response is straight up to here.
 PAPER_LINEAR_N = 1.2

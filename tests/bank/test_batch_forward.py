@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from shearloop.bank.elimination import LANES
+from shearloop.bank.errors import ConductivityError
 from shearloop.bank.forward import MAX_LEAK, BatchForwardModel, rounding_leaks
 from shearloop.bank.models import MODELS, conductivity
-from shearloop.bank.errors import ConductivityError
 from tests.fixtures.physics import relative
 
 

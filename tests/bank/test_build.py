@@ -7,9 +7,9 @@ import pytest
 
 from shearloop.bank.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
 from shearloop.bank.build import build_bank, solve_row
+from shearloop.bank.errors import BankFileError, ConductivityError, ModelError
 from shearloop.bank.mesh import Mesh
 from shearloop.bank.models import conductivity
-from shearloop.bank.errors import BankFileError, ConductivityError, ModelError
 
 MODEL = "gaussian_derivative"
 K, SIGMA = np.linspace(0.4, 9.0, 5), np.linspace(0.3, 1.2, 4)

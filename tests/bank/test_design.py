@@ -27,13 +27,13 @@ from shearloop.bank.design import (
     simulated_frames,
     simulated_signals,
 )
+from shearloop.bank.errors import CalibrationError, MatchingError
 from shearloop.bank.fingertip import Fingertip
 from shearloop.bank.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.mesh import load_mesh
 from shearloop.bank.models import MODELS, conductivity
-from shearloop.bank.errors import CalibrationError, MatchingError
-from shearloop.tools.bank_config import FingertipGeometryConfig
 from shearloop.daemon.config_file import load_yaml_model
+from shearloop.tools.bank_config import FingertipGeometryConfig
 
 FINGERTIP = Path(__file__).parents[2] / "config" / "fingertips" / "paper.yaml"
 PLACES = [Setting(3.1 + 0.02 * i, 1.3 + 0.04 * i) for i in range(10)]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from shearloop.bank.channels import PAPER_TABLE, smoothed_along_channels
+from shearloop.bank.errors import ConductivityError
 from shearloop.bank.forward import ForwardModel, assemble, electrode_potentials
 from shearloop.bank.mesh import Mesh
 from shearloop.bank.models import MODELS, conductivity
-from shearloop.bank.errors import ConductivityError
 from tests.fixtures.physics import rectangle, relative
 
 

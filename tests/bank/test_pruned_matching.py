@@ -12,6 +12,7 @@ from scipy.io import loadmat
 
 from shearloop.bank import pruned_matching
 from shearloop.bank.channels import PAPER_TABLE
+from shearloop.bank.errors import MatchingError
 from shearloop.bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher, unit_magnitudes
 from shearloop.bank.pruned_matching import (
     COARSE_RANK,
@@ -21,7 +22,6 @@ from shearloop.bank.pruned_matching import (
     PrunedZeroLagMatcher,
     columns,
 )
-from shearloop.bank.errors import MatchingError
 
 SHAPE = (22, 20)
 

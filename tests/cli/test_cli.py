@@ -20,11 +20,11 @@ import pytest
 import zmq.asyncio
 
 from shearloop.bank.models import MODELS
-from shearloop.daemon.app import Daemon
 from shearloop.cli import COMMANDS, command_module, main
 from shearloop.cli.bank import MODEL_NAMES
 from shearloop.cli.completion import full_parser
 from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table, task_row
+from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.loop_runner import WRENCH
 from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
@@ -33,8 +33,8 @@ from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
-from tests.sample_messages import sample
 from tests.paper_curve import paper_curve
+from tests.sample_messages import sample
 
 
 def test_a_file_that_is_not_there_hides_no_other_mistake(config, tmp_path, mistake):

@@ -9,10 +9,10 @@ import sys
 import pytest
 import zmq
 
-from shearloop.daemon.clock import Clock
 from shearloop.cli.config_schema import MODELS, schema_of
-from shearloop.daemon.control.safety import TABLE
 from shearloop.cli.docgen import DOCS, pages
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.safety import TABLE
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame
 from shearloop.daemon.messaging.publisher import Publisher

@@ -13,16 +13,17 @@ import yaml
 
 import shearloop
 from shearloop.bank.models import MODELS
-from shearloop.estimation.estimator_names import ESTIMATORS
-from shearloop.tools.bank_config import load_bank_plan
 from shearloop.cli import COMMANDS, command_module
 from shearloop.cli.completion import full_parser
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import STEP_KINDS
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.rig import check_experiment
+from shearloop.estimation.estimator_names import ESTIMATORS
+from shearloop.tools.bank_config import load_bank_plan
 
 ROOT = Path(__file__).resolve().parents[2]
+ROOMS = ("bank", "estimation", "drivers", "emulators", "daemon", "tools", "studies", "cli")
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
@@ -137,7 +138,7 @@ def test_pages_list_every_command_step_estimator_and_basis_model():
 
 @pytest.mark.parametrize("page", ["architecture", "where-to-add", "another-robot", "calibrations"])
 def test_files_classes_and_functions_that_a_page_names_exist(page):
-    folders = ("bank", "drivers", "daemon", "src", "config", "tests", "benchmarks")
+    folders = (*ROOMS, "src", "config", "tests", "benchmarks")
     files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
     code = [path for path in files if path.suffix == ".py" and "tests" not in path.parts]
     words = {word for path in code for word in re.findall(r"\w+", path.read_text())}
@@ -167,7 +168,7 @@ def program_texts() -> list[str]:
 
     return [
         text(node)
-        for folder in ("bank", "drivers", "daemon", "src")
+        for folder in (*ROOMS, "src")
         for path in (ROOT / folder).rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))

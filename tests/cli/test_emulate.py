@@ -12,16 +12,16 @@ from scipy.io import loadmat
 
 from shearloop.bank.bank_file import BankDefinition, write_bank
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.estimation.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
 from shearloop.cli import main
-from shearloop.emulators.synthetic_skin import NORMAL_N, SLACK_RATIO
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.eit_kit import EitKit, Frame
-from shearloop.emulators.boards import EitKitBoard
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
-from tests.fixtures.daemons import DEADLINE_S, recording, shearloop
+from shearloop.emulators.boards import EitKitBoard
+from shearloop.emulators.synthetic_skin import NORMAL_N, SLACK_RATIO
+from shearloop.estimation.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
 from tests.cli.emulate_rig.rig import write_rig_bank
+from tests.fixtures.daemons import DEADLINE_S, recording, shearloop
 from tests.running import pass_on, running, take
 
 PERIOD_S = 0.5408

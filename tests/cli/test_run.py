@@ -18,10 +18,11 @@ import zmq.asyncio
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment, CrashMarker
 from shearloop.daemon.control.experiment import ExperimentPhase
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator
+from shearloop.errors import UserError
+from tests.emulator_process import own_address
 from tests.fixtures.daemons import (
     DEADLINE_S,
     ask,
@@ -33,7 +34,6 @@ from tests.fixtures.daemons import (
     running_daemon,
     shearloop,
 )
-from tests.emulator_process import own_address
 
 
 def next_message(socket: "zmq.Socket[bytes]") -> dict[str, Any]:

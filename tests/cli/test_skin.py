@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.estimation.skin.calibration import load_calibration
-from shearloop.studies.skin.characterisation import FigureOfMerit, loop, responses
-from shearloop.estimation.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
 from shearloop.cli.skin import _table
+from shearloop.estimation.skin.calibration import load_calibration
+from shearloop.estimation.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
+from shearloop.studies.skin.characterisation import FigureOfMerit, loop, responses
 
 
 @pytest.mark.usefixtures("fonts")

@@ -11,13 +11,13 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
-from shearloop.estimation.skin.calibration import load_calibration
 from shearloop.cli import demo
+from shearloop.cli.config_schema import MODELS
 from shearloop.cli.emulator_processes import running
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.cli.config_schema import MODELS
 from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.estimation.skin.calibration import load_calibration
 
 CONFIG = Path(__file__).parents[2] / "config"
 # A calibration is written by a command, not by people.

@@ -15,8 +15,8 @@ import yaml
 from shearloop.bank.bank_file import Bank
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.run_summary import RunSummary
-from tests.fixtures.daemons import ask, robot_at, running_daemon, shearloop
 from tests.emulator_process import own_address
+from tests.fixtures.daemons import ask, robot_at, running_daemon, shearloop
 from tests.paper_curve import paper_curve
 
 pytestmark = pytest.mark.real_time

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.daemon.config import load_daemon_config
-from shearloop.tools.doctor.devices import check_daemon, check_devices, check_task
-from shearloop.tools.doctor.findings import Finding
 from shearloop.drivers.calibration_files import save_calibration
 from shearloop.drivers.eit_kit import ADC_STEP_V, FrameParser
-from shearloop.emulators.boards import EitKitBoard, EmulatedBoard, Hx711Board, Sketch, format_line
 from shearloop.drivers.load_cell import LoadCalibration
+from shearloop.emulators.boards import EitKitBoard, EmulatedBoard, Hx711Board, Sketch, format_line
+from shearloop.tools.doctor.devices import check_daemon, check_devices, check_task
+from shearloop.tools.doctor.findings import Finding
 from tests.running import running
 
 PERIOD_S = 0.02

@@ -9,14 +9,14 @@ import yaml
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.build import build_bank
-from shearloop.estimation import fit
-from shearloop.estimation.estimator import Physics
-from shearloop.tools.frame_series import read_series
-from shearloop.tools.bank_config import load_bank_plan
-from shearloop.studies.emulated_calibration import write_recordings
-from shearloop.tools.recordings.reader import read_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.emulators.boards import EitKitBoard, format_line
+from shearloop.estimation import fit
+from shearloop.estimation.estimator import Physics
+from shearloop.studies.emulated_calibration import write_recordings
+from shearloop.tools.bank_config import load_bank_plan
+from shearloop.tools.frame_series import read_series
+from shearloop.tools.recordings.reader import read_recording
 from tests.fixtures.daemons import collector, running_daemon
 from tests.running import running
 

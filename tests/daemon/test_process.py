@@ -12,8 +12,8 @@ from functools import partial
 
 import pytest
 
-from shearloop.daemon import app, process
 from shearloop.cli import emulator_processes, main
+from shearloop.daemon import app, process
 from shearloop.daemon.process import NICENESS, ending_signals, raise_priority, without_long_collections
 from tests.fixtures.daemons import DEADLINE_S
 

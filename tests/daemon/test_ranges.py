@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import yaml
 
-from shearloop.daemon.config_file import load_yaml_model
 from shearloop.cli.config_schema import MODELS, schema_of
+from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.errors import UserError
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.settings import read_settings
+from shearloop.errors import UserError
 
 ROBOT = Path(__file__).parents[2] / "config" / "ur.yaml"
 # The designs of banks and fingertips move nothing; their meshes have no largest size that we know.

@@ -10,8 +10,8 @@ import yaml
 
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.errors import UserError
 from shearloop.daemon.rig import check_experiment
+from shearloop.errors import UserError
 
 SERIAL = {"device": {"path": "port"}}
 STEPS = [{"do": "tare"}, {"do": "wait", "wait_s": 1}]

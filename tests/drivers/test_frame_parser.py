@@ -10,8 +10,8 @@ from scipy.io import loadmat
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
 from shearloop.drivers.eit_kit import ADC_STEP_V, FULL_SCALE_SINE_RMS_V, Frame, FrameErrorKind, FrameParser
-from shearloop.emulators.boards import format_line
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.emulators.boards import format_line
 from tests.slices import slices
 
 PERIOD_NS = eit_kit.NOMINAL_PERIOD_NS

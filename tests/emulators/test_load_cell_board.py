@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.connection import LinkMonitor, SerialLink
-from shearloop.emulators.boards import PAPER_SKETCH, Hx711Board, Sketch
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
+from shearloop.emulators.boards import PAPER_SKETCH, Hx711Board, Sketch
 from tests.running import LinkEvents, pass_on, running
 
 SKETCH = Sketch()

@@ -9,11 +9,11 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.forward import ForwardModel
 from shearloop.bank.mesh import load_mesh
 from shearloop.bank.models import conductivity
-from shearloop.errors import UserError
-from shearloop.tools.recordings.matlab_import import read_torque_slices
-from shearloop.emulators.synthetic_frames import Synthesiser, TwistProgramme
 from shearloop.drivers.eit_kit import FrameParser
 from shearloop.emulators.boards import format_line
+from shearloop.emulators.synthetic_frames import Synthesiser, TwistProgramme
+from shearloop.errors import UserError
+from shearloop.tools.recordings.matlab_import import read_torque_slices
 
 ADC_STEP_V = 2.2 / 1024
 

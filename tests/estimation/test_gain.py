@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.interval_regressor import CensoredRidge, Ridge, fit_interval_regressor
 from shearloop.estimation.gain import PRIOR_SPREAD, GainSpread, ToolLaw, find_twists, gains_of_recordings, loaded_gain
+from shearloop.estimation.interval_regressor import CensoredRidge, Ridge, fit_interval_regressor
 
 TWISTS = np.tile([0.0, 0.0, 0.0, 0.03, 0.05, 0.04, 0.0, 0.0], 10)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.bank.forward import ForwardModel
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.forward import ForwardModel
 from shearloop.estimation import EstimatorSession, Physics, TactileFrame, fit
 from shearloop.estimation.bank_match import (
     NOT_TURNED,

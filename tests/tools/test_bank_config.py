@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from shearloop.bank.bank_file import Bank
+from shearloop.bank.errors import GeometryError
 from shearloop.bank.forward import ForwardModel
 from shearloop.bank.mesh import load_mesh
 from shearloop.bank.models import MODELS, conductivity
-from shearloop.bank.errors import GeometryError
-from shearloop.tools.bank_config import ModelName, load_bank_plan, load_geometry
 from shearloop.cli import main
 from shearloop.errors import UserError
+from shearloop.tools.bank_config import ModelName, load_bank_plan, load_geometry
 
 CONFIG = Path(__file__).parents[2] / "config"
 

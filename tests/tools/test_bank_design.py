@@ -10,16 +10,16 @@ from shearloop.bank.bank_file import Bank
 from shearloop.bank.build import build_bank
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.design import MeasuredFrames, Setting, design_bank, simulated_signals
-from shearloop.bank.forward import BatchForwardModel
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.bank_match import NOT_TURNED, RefinedMatcher
-from shearloop.estimation.values import FrameSeries
-from shearloop.tools.bank_design import design_yaml, designed_for, scene_of
-from shearloop.tools.banks import OWN_FINGERTIP
-from shearloop.tools.bank_config import FingertipGeometryConfig, load_bank_plan, load_geometry
+from shearloop.bank.forward import BatchForwardModel
 from shearloop.cli import main
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.recorder.writer import new_recording
+from shearloop.estimation.bank_match import NOT_TURNED, RefinedMatcher
+from shearloop.estimation.values import FrameSeries
+from shearloop.tools.bank_config import FingertipGeometryConfig, load_bank_plan, load_geometry
+from shearloop.tools.bank_design import design_yaml, designed_for, scene_of
+from shearloop.tools.banks import OWN_FINGERTIP
 
 
 @pytest.fixture(scope="session")

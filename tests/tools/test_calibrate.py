@@ -13,10 +13,10 @@ from shearloop.cli.calibrate import load
 from shearloop.cli.terminal import Operator
 from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import SerialPort
-from shearloop.emulators.boards import Hx711Board
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import WidthCalibration
+from shearloop.emulators.boards import Hx711Board
 from tests.running import running
 
 SHEARLOOP = (sys.executable, "-m", "shearloop")

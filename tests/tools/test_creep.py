@@ -5,13 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from shearloop.daemon.config import CreepConfig
+from shearloop.daemon.control.loop_inputs import Creep
+from shearloop.emulators.scene import Twin, TwinSettings
+from shearloop.errors import UserError
 from shearloop.estimation import Estimate, FrameSeries
 from shearloop.tools.creep import Stretch, fit_creep, grips_of
 from shearloop.tools.evaluate import EstimateTrack
-from shearloop.daemon.config import CreepConfig
-from shearloop.daemon.control.loop_inputs import Creep
-from shearloop.errors import UserError
-from shearloop.emulators.scene import Twin, TwinSettings
 
 PERIOD_S = 0.5412
 

@@ -13,11 +13,11 @@ from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.cli.check import check_parts
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
+from shearloop.drivers.ur.client import missing_library
+from shearloop.errors import UserError
 from shearloop.tools.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
 from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, trouble
-from shearloop.errors import UserError
 from shearloop.tools.serial_ports import list_serial_ports
-from shearloop.drivers.ur.client import missing_library
 
 __all__ = ["Finding", "examine"]
 

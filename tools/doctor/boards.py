@@ -11,11 +11,9 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.channels import ChannelTable
 from shearloop.daemon.config import AdcConfig, FingertipConfig, LoadCellConfig, SerialDevice
-from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
 from shearloop.daemon.rig import load_cell_calibration
 from shearloop.daemon.sensing.frame_estimator import fingertip_table
 from shearloop.daemon.sensing.load_cell_task import COUNTS_REASON
-from shearloop.tools.serial_ports import access_error
 from shearloop.drivers.connection import SerialPort, find_port
 from shearloop.drivers.eit_kit import START, Frame, FrameParser
 from shearloop.drivers.errors import DriverError
@@ -23,6 +21,8 @@ from shearloop.drivers.load_cell import LoadCalibration, LoadParser, LoadSample
 from shearloop.drivers.refused_lines import shown
 from shearloop.drivers.serial_sensor import InputKind, Parser, RawEvent
 from shearloop.drivers.shear_skin.instruments import PairParser
+from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
+from shearloop.tools.serial_ports import access_error
 from shearloop.words import counted
 
 # A larger relative difference between measured and configured rate is reported.

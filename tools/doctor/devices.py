@@ -12,6 +12,15 @@ import numpy as np
 
 from shearloop.cli.terminal import task_row
 from shearloop.daemon.config import DaemonConfig, GripperConfig, SerialDevice
+from shearloop.daemon.messaging.client import receive_messages, send_command
+from shearloop.daemon.messaging.stop_client import send_to_stop_socket
+from shearloop.daemon.rig import make_gripper_client
+from shearloop.daemon.sensing.frame_estimator import fingertip_table
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.robotiq.messages import ActivationStatus
+from shearloop.drivers.ur.control_box import query_controller, untested_sentence
+from shearloop.drivers.ur.settings import read_settings
+from shearloop.errors import UserError
 from shearloop.tools.doctor.boards import (
     check_adc,
     check_channels,
@@ -21,15 +30,6 @@ from shearloop.tools.doctor.boards import (
     check_rate,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
-from shearloop.errors import UserError
-from shearloop.daemon.messaging.client import receive_messages, send_command
-from shearloop.daemon.messaging.stop_client import send_to_stop_socket
-from shearloop.daemon.rig import make_gripper_client
-from shearloop.daemon.sensing.frame_estimator import fingertip_table
-from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.messages import ActivationStatus
-from shearloop.drivers.ur.control_box import query_controller, untested_sentence
-from shearloop.drivers.ur.settings import read_settings
 
 ROBOT_TIMEOUT_S = 2.0
 DAEMON_TIMEOUT_S = 1.0

@@ -10,8 +10,8 @@ import numpy as np
 from pydantic_core import to_json
 from scipy.io import savemat
 
-from shearloop.errors import UserError, require
 from shearloop.daemon.recorder import schema
+from shearloop.errors import UserError, require
 from shearloop.tools.recordings.columns import columns
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import read_messages

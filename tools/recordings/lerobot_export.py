@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.channels import ChannelTable
-from shearloop.errors import UserError, require
 from shearloop.daemon.messaging.messages import (
     EitEstimate,
     EitFrame,
@@ -24,6 +23,7 @@ from shearloop.daemon.messaging.messages import (
     SkinShear,
 )
 from shearloop.daemon.recorder import schema
+from shearloop.errors import UserError, require
 from shearloop.tools.recordings.columns import ContentError, check_length
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content

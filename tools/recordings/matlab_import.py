@@ -10,15 +10,15 @@ from scipy.ndimage import minimum_filter1d
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.estimation import FrameSeries
-from shearloop.estimation.load_delay import measured_delay
-from shearloop.estimation.values import LARGEST_TORQUE_NM
 from shearloop.bank.matlab_file import MatFileError, Variable, read_variables
-from shearloop.errors import UserError
 from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT, LOAD_DOUBT_NOTE, SIDES
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import slope_below
+from shearloop.errors import UserError
+from shearloop.estimation import FrameSeries
+from shearloop.estimation.load_delay import measured_delay
+from shearloop.estimation.values import LARGEST_TORQUE_NM
 from shearloop.files import open_file
 from shearloop.words import counted
 

@@ -23,9 +23,13 @@ from numpy.typing import NDArray
 from pydantic_core import from_json
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
-from shearloop.estimation import Measured
-from shearloop.errors import UserError
+from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
 from shearloop.daemon.recorder import schema
+from shearloop.daemon.recorder.writer import PARTIAL, new_writer
+from shearloop.drivers.serial_sensor import InputKind
+from shearloop.errors import UserError
+from shearloop.estimation import Measured
+from shearloop.files import open_file, replace_file
 from shearloop.tools.recordings.columns import ContentError, OtherKeysError, check_time, read_content
 from shearloop.tools.recordings.intact_records import (
     LARGEST_RECORD_BYTES,
@@ -34,10 +38,6 @@ from shearloop.tools.recordings.intact_records import (
     check_magic,
     check_size,
 )
-from shearloop.daemon.recorder.writer import PARTIAL, new_writer
-from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
-from shearloop.drivers.serial_sensor import InputKind
-from shearloop.files import open_file, replace_file
 
 _NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
 _OTHER_PROGRAM = "another program made or changed this recording: record or import it again"

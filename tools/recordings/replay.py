@@ -21,14 +21,11 @@ import structlog
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
-from shearloop.errors import UserError
+from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder import schema
-from shearloop.tools.recordings.columns import ContentError
-from shearloop.tools.recordings.reader import open_recording, reading
 from shearloop.daemon.rig import load_cell_calibration
-from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
 from shearloop.daemon.sensing.fingertip_task import (
     FramePairing,
     adapted_message,
@@ -42,6 +39,9 @@ from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.errors import UserError
+from shearloop.tools.recordings.columns import ContentError
+from shearloop.tools.recordings.reader import open_recording, reading
 from shearloop.yaml_files import validated
 
 # Topics that a replay computes. All others are sent as they were recorded.

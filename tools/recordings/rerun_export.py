@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.fingertip import Fingertip
-from shearloop.errors import require
 from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage, units
 from shearloop.daemon.recorder import schema
+from shearloop.daemon.web.message_store import conductivity_profile
+from shearloop.errors import require
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import read_messages
-from shearloop.daemon.web.message_store import conductivity_profile
 
 TIMELINE = "time"
 # Values of an entity that are sent at once, and images.

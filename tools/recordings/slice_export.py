@@ -17,14 +17,14 @@ from scipy.io import savemat
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.channels import ChannelTable
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.messages import EitFrame, GripperStateMessage, LoadTorque, LoopState
 from shearloop.daemon.recorder import schema
+from shearloop.errors import UserError
+from shearloop.files import replace_file
 from shearloop.tools.recordings.columns import ContentError, check_length
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.matlab_import import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
-from shearloop.files import replace_file
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.
 WINDOW_FRAMES, STD_FRAMES = 9, 9 / 5

@@ -18,11 +18,11 @@ import pytest
 import yaml
 
 from shearloop.bank.build import build_bank
-from shearloop.tools.bank_config import load_bank_plan
-from shearloop.studies.emulated_calibration import SEED, calibrate, record
 from shearloop.emulators.emulated_rig import SIDES
-from tests.fixtures.daemons import DEADLINE_S
+from shearloop.studies.emulated_calibration import SEED, calibrate, record
+from shearloop.tools.bank_config import load_bank_plan
 from tests.emulator_process import own_address
+from tests.fixtures.daemons import DEADLINE_S
 
 REPOSITORY = Path(__file__).parents[3]
 PROGRAM = ".venv/bin/shearloop"

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from tests.fixtures.daemons import DEADLINE_S
 from tests.cli.newcomer.conftest import PROGRAM, readme_commands
+from tests.fixtures.daemons import DEADLINE_S
 
 # On a busy computer the commands take several times as long.
 pytestmark = pytest.mark.timeout(240)

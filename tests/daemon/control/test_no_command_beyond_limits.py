@@ -13,8 +13,8 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSample
 from shearloop.daemon.control.safety import Response
-from shearloop.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
+from shearloop.emulators.scene import Twin, TwinSettings
 from tests.daemon.control.cell import GRIP, Cell, Gripper, driven
 from tests.daemon.control.loop_rig import EIT, new_loop
 from tests.drivers.ur.flight import CYCLE_NS, LIMITS, FakeArm

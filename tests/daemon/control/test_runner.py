@@ -13,10 +13,10 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, along_tool
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
+from shearloop.errors import ActionError
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment, no_tick
 from tests.drivers.ur.flight import SETTINGS
 

@@ -17,7 +17,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.cli import main
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.bound_sockets import MAX_CONNECTIONS, RESERVED_DESCRIPTORS, most_connections
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.command_server import (
@@ -33,6 +32,7 @@ from shearloop.daemon.messaging.stop_client import send_to_stop_socket, stop_nam
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from shearloop.daemon.supervisor import resident_memory_mb
+from shearloop.errors import UserError
 from tests.fixtures.daemons import DEADLINE_S, free_port, running_daemon
 from tests.running import running
 

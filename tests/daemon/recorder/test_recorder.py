@@ -24,14 +24,14 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import load_daemon_config
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, LoopState, wire_map
 from shearloop.daemon.recorder import recorder as recorder_module
-from shearloop.tools.recordings.reader import read_recording, repair, summarise
 from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recorder.schema import basic_identity
-from shearloop.tools.recordings.tables import RecordedTopics
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.errors import UserError
+from shearloop.tools.recordings.reader import read_recording, repair, summarise
+from shearloop.tools.recordings.tables import RecordedTopics
 from tests.sample_messages import sample
 
 IDENTITY = Identity(basic_identity("a test"), (AttachedFile("configuration.json", "application/json", b"{}"),))

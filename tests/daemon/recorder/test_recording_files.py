@@ -12,17 +12,17 @@ from scipy.io import loadmat, savemat
 
 import shearloop
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.tools.frame_series import part_of, read_series, series_of
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
-from shearloop.errors import UserError
 from shearloop.daemon.recorder import schema
+from shearloop.daemon.recorder.recorder import daemon_identity
+from shearloop.daemon.recorder.schema import LOAD_DOUBT_NOTE
+from shearloop.daemon.recorder.writer import new_recording
+from shearloop.errors import UserError
+from shearloop.tools.frame_series import part_of, read_series, series_of
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.reader import read_messages, read_recording
-from shearloop.daemon.recorder.recorder import daemon_identity
 from shearloop.tools.recordings.replay import RecordedRun
-from shearloop.daemon.recorder.schema import LOAD_DOUBT_NOTE
 from shearloop.tools.recordings.tables import RecordedTopics, arrays
-from shearloop.daemon.recorder.writer import new_recording
 from tests.fixtures.recordings import START_DATENUM
 
 LINES = PAPER_TABLE.line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))

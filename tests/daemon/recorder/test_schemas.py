@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from typing_extensions import TypeAliasType
 
 from shearloop.daemon.messaging.messages import TOPICS, EitFrame, Message, wire_map
-from shearloop.tools.recordings.columns import read_content
 from shearloop.daemon.recorder.schema import (
     INPUT,
     as_json,
@@ -26,6 +25,7 @@ from shearloop.daemon.recorder.schema import (
     schemas,
 )
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.tools.recordings.columns import read_content
 from tests.sample_messages import sample
 
 PLAIN = {"boolean", "string", "number", "integer"}

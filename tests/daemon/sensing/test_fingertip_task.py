@@ -10,17 +10,17 @@ import pytest
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import Estimate
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.errors import ActionError
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, DeadElectrodes, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.errors import ActionError
+from shearloop.estimation import Estimate
 from tests.running import running
 
 MS = 1_000_000

@@ -11,9 +11,9 @@ import yaml
 
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.control.loop_runner import tare_all
-from shearloop.errors import ActionError
-from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.emulators.skin import SkinInstruments
+from shearloop.emulators.synthetic_skin import SyntheticSkin
+from shearloop.errors import ActionError
 from tests.fixtures.daemons import ask, collector, running_daemon
 from tests.running import running
 

@@ -22,10 +22,8 @@ from aiohttp import web
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.tools.bank_config import FingertipGeometryConfig
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
 from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
@@ -49,6 +47,8 @@ from shearloop.daemon.web.server import (
     serve,
     token_valid,
 )
+from shearloop.errors import UserError
+from shearloop.tools.bank_config import FingertipGeometryConfig
 from tests.fixtures.daemons import DEADLINE_S, free_port, running_daemon, shearloop
 from tests.sample_messages import sample
 

@@ -22,8 +22,16 @@ from shearloop.estimation.skin.calibration import (
     save_calibration,
     turned_rad,
 )
+from shearloop.estimation.skin.membrane import (
+    PAPER_SECTION,
+    THICK_SECTION,
+    UNSTRETCHED,
+    Belt,
+    BeltState,
+    Direction,
+    Membrane,
+)
 from shearloop.studies.skin.characterisation import loading, loop, responses
-from shearloop.estimation.skin.membrane import PAPER_SECTION, THICK_SECTION, UNSTRETCHED, Belt, BeltState, Direction, Membrane
 
 BELT = Belt(0.04, PAPER_SECTION.gauge_angle_rad)
 R1, R2 = 24.6, 25.3

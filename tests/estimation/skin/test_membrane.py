@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from shearloop.studies.skin.characterisation import loading, origin_slope, responses
 from shearloop.estimation.skin.membrane import (
     EXCITATION_A,
     GAUGE_RESISTANCE_OHM,
@@ -23,6 +22,7 @@ from shearloop.estimation.skin.membrane import (
     sensitivity_per_n,
     stretch,
 )
+from shearloop.studies.skin.characterisation import loading, origin_slope, responses
 
 MEMBRANE = Membrane(THICK_SECTION)
 BELT = MEMBRANE.belt

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from benchmarks.skin import random_states
 from shearloop.bank.arrays import FloatArray
 from shearloop.estimation.skin import membrane as membrane_model
-from shearloop.studies.skin.characterisation import fit_line, loading, origin_slope
 from shearloop.estimation.skin.membrane import PAPER_SECTION as SECTION
 from shearloop.estimation.skin.plane_strain import (
     MESH_112,
@@ -31,6 +30,7 @@ from shearloop.estimation.skin.plane_strain import (
     states_along,
     unloaded,
 )
+from shearloop.studies.skin.characterisation import fit_line, loading, origin_slope
 
 ELEMENT = skfem.ElementVector(skfem.ElementQuad2())
 # A ring under pressure: any A, B satisfy equilibrium (Lamé).

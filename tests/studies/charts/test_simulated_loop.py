@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.studies.charts.simulated_loop import (
     LOAD_CELL,
     PERIOD_S,
@@ -16,7 +17,6 @@ from shearloop.studies.charts.simulated_loop import (
     nanoseconds,
     run,
 )
-from shearloop.daemon.control.torque_controller import WristCommand
 
 
 class FixedSpeed:

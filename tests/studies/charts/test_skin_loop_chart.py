@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
-from shearloop.studies.charts import skin_loop
-from shearloop.studies.charts.skin_loop import CALIBRATION, SkinLoop, SkinLoopCase, judge
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, HoldTorqueStep
+from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
+from shearloop.studies.charts import skin_loop
+from shearloop.studies.charts.skin_loop import CALIBRATION, SkinLoop, SkinLoopCase, judge
 from shearloop.tools.parallel import SerialExecutor
 
 CONFIG = Path(__file__).parents[3] / "config"

@@ -10,10 +10,10 @@ import pytest
 from matplotlib.text import Annotation, Text
 
 from shearloop.bank.channels import PAPER_TABLE
+from shearloop.cli.chart import NAMES
 from shearloop.estimation import FrameSeries
 from shearloop.studies.charts import scene
 from shearloop.studies.charts.chart_data import Split, own_fingertip, splits, synthetic_stream
-from shearloop.tools.drawing import figure, frontier, lay_out, plain_log, write_names
 from shearloop.studies.charts.forward_methods import converged, direct, error_of, forward_methods
 from shearloop.studies.charts.simulated_loop import tracking_errors
 from shearloop.studies.charts.speed_accuracy import (
@@ -27,7 +27,7 @@ from shearloop.studies.charts.speed_accuracy import (
     often_valid,
     write,
 )
-from shearloop.cli.chart import NAMES
+from shearloop.tools.drawing import figure, frontier, lay_out, plain_log, write_names
 from shearloop.tools.parallel import SerialExecutor
 
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shearloop.errors import UserError
 from shearloop.estimation import Estimate, EstimatorSession, Physics, fit
 from shearloop.studies.charts import fault_sweeps, stability
 from shearloop.studies.charts.chart_data import Split, fitted
 from shearloop.tools.evaluate import estimate_series, figures_of
-from shearloop.errors import UserError
 from shearloop.tools.parallel import SerialExecutor
 
 

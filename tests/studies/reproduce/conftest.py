@@ -12,8 +12,8 @@ from shearloop.bank.bank_file import BankDefinition
 from shearloop.bank.build import RowSolver
 from shearloop.bank.mesh import Mesh
 from shearloop.tools import banks
-from shearloop.tools.banks import Grid
 from shearloop.tools.bank_config import load_geometry
+from shearloop.tools.banks import Grid
 
 K, SIGMA = np.linspace(2.6, 3.6, 7), np.linspace(1.0, 2.0, 8)
 

@@ -22,8 +22,8 @@ from shearloop.studies.reproduce.analysis import (
     place_in_series,
     score_models,
 )
-from shearloop.tools.banks import Grid, cached_bank
 from shearloop.studies.reproduce.report import Reproduction, table
+from shearloop.tools.banks import Grid, cached_bank
 from shearloop.tools.recordings.matlab_import import Slices, read_torque_slices
 from tests.studies.reproduce.conftest import SIGMA, K
 

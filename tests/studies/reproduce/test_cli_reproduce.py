@@ -7,9 +7,9 @@ from matplotlib.figure import Figure
 from scipy.io import savemat
 
 from shearloop.studies.charts import bank_figures
-from shearloop.tools import banks
 from shearloop.studies.reproduce import report
 from shearloop.studies.reproduce.report import PAPER_MODEL_SCORES
+from shearloop.tools import banks
 
 pytestmark = pytest.mark.usefixtures("small_grids")
 
@@ -59,9 +59,7 @@ def test_numbers_and_figures_are_made(make_recordings, coarse_fingertip, tmp_pat
     before = focused.stat().st_mtime_ns
     (wide,) = (out / "banks").glob("wide-*.bank")
     wide.write_bytes(wide.read_bytes()[:-100])
-    monkeypatch.setattr(
-        "shearloop.studies.reproduce.report.draw_all", lambda *_: []
-    )  # they take most of the time
+    monkeypatch.setattr("shearloop.studies.reproduce.report.draw_all", lambda *_: [])  # they take most of the time
     said = ran(*command)
     assert focused.stat().st_mtime_ns == before
     assert "truncated" in said.err

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from shearloop.studies.skin.characterisation import fit_line, loading, loop, responses
 from shearloop.estimation.skin.membrane import THICK_SECTION, Membrane
+from shearloop.studies.skin.characterisation import fit_line, loading, loop, responses
 
 
 def test_a_line_by_hand():

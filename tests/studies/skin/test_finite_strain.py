@@ -8,11 +8,11 @@ import skfem
 from scipy.optimize import brentq
 
 from shearloop.bank.arrays import FloatArray
+from shearloop.estimation.skin.membrane import PAPER_SECTION, THICK_SECTION, Membrane
+from shearloop.estimation.skin.plane_strain import MESH_112, MeshSize, condense, gauge_responses, states_along
 from shearloop.studies.skin import characterisation
 from shearloop.studies.skin.characterisation import fit_line, loading, origin_slope
 from shearloop.studies.skin.finite_strain import FiniteStrainSkin, internal_force, tangent
-from shearloop.estimation.skin.membrane import PAPER_SECTION, THICK_SECTION, Membrane
-from shearloop.estimation.skin.plane_strain import MESH_112, MeshSize, condense, gauge_responses, states_along
 
 YOUNG, NU = PAPER_SECTION.young_mpa, PAPER_SECTION.poisson_ratio
 SHEAR = YOUNG / (2 * (1 + NU))

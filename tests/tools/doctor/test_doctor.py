@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 
-from shearloop.tools import doctor
 from shearloop.cli import main
 from shearloop.daemon.config import CurveConfig, SerialDevice, load_daemon_config
+from shearloop.daemon.messaging.client import receive_messages
+from shearloop.daemon.messaging.keys import make_key_pair
+from shearloop.tools import doctor
 from shearloop.tools.doctor.boards import check_port
 from shearloop.tools.doctor.devices import check_task
 from shearloop.tools.doctor.findings import from_error
-from shearloop.daemon.messaging.client import receive_messages
-from shearloop.daemon.messaging.keys import make_key_pair
 from shearloop.tools.serial_ports import SerialPortInfo
-from tests.fixtures.daemons import DEADLINE_S, robot_at, shearloop
 from tests.emulator_process import own_address
+from tests.fixtures.daemons import DEADLINE_S, robot_at, shearloop
 
 HOST = own_address(5)
 SPEED = 8

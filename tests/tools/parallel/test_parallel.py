@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from shearloop.cli import main
+from shearloop.daemon.process import raise_ending_signals
 from shearloop.errors import UserError
 from shearloop.tools.parallel import LOCAL, ProcessExecutor, SerialExecutor, open_executor
-from shearloop.daemon.process import raise_ending_signals
 from tests.tools.parallel.conftest import dask
 from tests.tools.test_bank_config import write_bank_config
 

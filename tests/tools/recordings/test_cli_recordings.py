@@ -7,17 +7,17 @@ import pytest
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import Calibration, Estimate, FrameSeries, fit
-from shearloop.estimation.estimator import Estimator, OutputModel, Reading, Regression
-from shearloop.estimation.interval_regressor import Ridge, fit_interval_regressor
-from shearloop.estimation.load_delay import LoadDelay, LoadTiming
-from shearloop.estimation.values import Measured
-from shearloop.estimation.estimator_names import ESTIMATORS
-from shearloop.tools.calibrate import CalibrationResult
-from shearloop.tools.evaluate import EstimateTrack, InvalidReason, draw_tracks, figures_of, invalid_reasons
 from shearloop.cli import main
 from shearloop.cli.calibrate.recording import sentences_of
 from shearloop.cli.evaluate import _lines
+from shearloop.estimation import Calibration, Estimate, FrameSeries, fit
+from shearloop.estimation.estimator import Estimator, OutputModel, Reading, Regression
+from shearloop.estimation.estimator_names import ESTIMATORS
+from shearloop.estimation.interval_regressor import Ridge, fit_interval_regressor
+from shearloop.estimation.load_delay import LoadDelay, LoadTiming
+from shearloop.estimation.values import Measured
+from shearloop.tools.calibrate import CalibrationResult
+from shearloop.tools.evaluate import EstimateTrack, InvalidReason, draw_tracks, figures_of, invalid_reasons
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
 KEYS |= {"latency_ms_p50", "latency_ms_p99", "winkler_nm", "zero_rmse_nm", "loaded", "unloaded"}

@@ -19,15 +19,15 @@ from mcap.writer import CompressionType, Writer
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.cli import main
 from shearloop.daemon.clock import Clock
-from shearloop.errors import UserError
 from shearloop.daemon.recorder import schema
+from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
+from shearloop.daemon.recorder.schema import basic_identity
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.errors import UserError
 from shearloop.tools.recordings.export import export
 from shearloop.tools.recordings.reader import read_recording, repair, summarise
-from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
 from shearloop.tools.recordings.replay import RecordedRun
-from shearloop.daemon.recorder.schema import basic_identity
 from shearloop.tools.recordings.tables import RecordedTopics
-from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.recorder.test_recorder import frame, torque
 
 CONFIGURATION = {"fingertips": {"right": {"device": {"path": "eit-right"}}}}

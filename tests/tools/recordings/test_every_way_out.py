@@ -19,6 +19,8 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.cli.terminal import message_json, message_line
 from shearloop.daemon.messaging.messages import TOPICS, decode, encode
 from shearloop.daemon.web.message_store import MessageStore
+from tests.daemon.test_closed_loop import experiment, rig_config, running_rig, started
+from tests.emulator_process import own_address
 from tests.fixtures.daemons import free_port, robot_at, running_daemon
 from tests.tools.recordings import test_skin_replay
 from tests.tools.recordings.every_message import (
@@ -33,8 +35,6 @@ from tests.tools.recordings.every_message import (
     value_of,
 )
 from tests.tools.recordings.test_replay import replayed
-from tests.daemon.test_closed_loop import experiment, rig_config, running_rig, started
-from tests.emulator_process import own_address
 
 __all__ = ["rig_config"]
 pytestmark = pytest.mark.usefixtures("rerun_runtime")

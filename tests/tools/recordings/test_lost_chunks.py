@@ -17,10 +17,10 @@ from mcap.writer import Writer
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoopState, wire_map
-from shearloop.tools.recordings.reader import read_messages, repair, summarise
 from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recorder.schema import CONFIGURATION, basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.tools.recordings.reader import read_messages, repair, summarise
 from tests.daemon.recorder.test_recorder import frame, torque
 from tests.sample_messages import sample
 

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.messages import TOPICS, wire_map
 from shearloop.daemon.recorder import schema
+from shearloop.daemon.recorder.writer import McapFile
+from shearloop.errors import UserError
 from shearloop.tools.recordings.matlab_import import read_diameter_slices, read_line, read_torque_slices
 from shearloop.tools.recordings.slice_export import export_slices
 from shearloop.tools.recordings.tables import RecordedTopics
-from shearloop.daemon.recorder.writer import McapFile
 from tests.sample_messages import sample
 
 S = 1_000_000_000

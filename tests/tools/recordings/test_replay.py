@@ -14,19 +14,19 @@ import pytest
 import yaml
 import zmq.asyncio
 
-from shearloop.estimation import EstimatorSession, Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.messaging.messages import EitEstimate, wire_map, with_packed_arrays
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.recorder.schema import message_json, recorded_topic
+from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
+from shearloop.drivers.serial_sensor import InputKind
+from shearloop.estimation import EstimatorSession, Measured
 from shearloop.tools.recordings.columns import read_content
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
-from shearloop.daemon.recorder.schema import message_json, recorded_topic
-from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
-from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
-from shearloop.drivers.serial_sensor import InputKind
 from tests.fixtures.daemons import ask, emulated_kit, running_daemon
 from tests.sample_messages import sample
 

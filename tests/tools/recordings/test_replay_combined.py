@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.estimation import FrameSeries, Measured, fit
 from shearloop.drivers.connection import Received, SerialLink
 from shearloop.drivers.eit_kit import ADC_STEP_V, START
+from shearloop.estimation import FrameSeries, Measured, fit
 from tests.fixtures.daemons import DEADLINE_S, running_daemon
 from tests.tools.recordings.test_replay import Gripper, Messages, measured, replayed
 

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from shearloop.tools.recordings.tables import RecordedTopics
-from tests.tools.recordings.test_replay import measured, replayed
 from tests.daemon.skin.test_skin_run import played
+from tests.tools.recordings.test_replay import measured, replayed
 
 
 async def recorded(

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.estimation import Measured
-from shearloop.tools.frame_series import read_series, series_of
 from shearloop.daemon.clock import Clock
-from shearloop.errors import UserError
+from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
-from shearloop.tools.recordings.reader import read_recording, summarise
 from shearloop.daemon.recorder.recorder import Identity, Recorder
 from shearloop.daemon.recorder.schema import basic_identity
-from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.errors import UserError
+from shearloop.estimation import Measured
+from shearloop.tools.frame_series import read_series, series_of
+from shearloop.tools.recordings.reader import read_recording, summarise
 from tests.sample_messages import sample
 
 PERIOD_NS = 540_000_000

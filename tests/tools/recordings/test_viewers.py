@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.cli import main
-from shearloop.errors import UserError
 from shearloop.daemon.messaging.messages import TOPICS, decode, encode, wire_map
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import McapFile
+from shearloop.errors import UserError
 from tests.sample_messages import sample
 
 CONFIG = Path(__file__).parents[3] / "config"
@@ -171,7 +171,7 @@ def test_absent_topics_are_left_out_of_a_dataset_and_none_is_refused(tmp_path, r
 @pytest.mark.parametrize(("form", "extra"), [("rrd", "rerun"), ("lerobot", "export"), ("parquet", "export")])
 def test_a_missing_extra_is_named(form, extra, tmp_path, mistake, monkeypatch):
     recording = write(tmp_path / "a.mcap", ("eit.frame",))
-    monkeypatch.setattr("shearloop.daemon.errors.find_spec", lambda _: None)
+    monkeypatch.setattr("shearloop.errors.find_spec", lambda _: None)
     assert f"pip install 'shearloop[{extra}]'" in mistake("recording", "export", recording, "--format", form)
     assert "pip install 'shearloop[foxglove]'" in mistake("view", "--foxglove", "0")
 

@@ -26,33 +26,33 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Ctrl-C is their usual end, and nothing is left undone.
 _ENDED_BY_INTERRUPT = ("shearloop listen", "shearloop view", "shearloop emulate")
-# The module of each command below `shearloop`, and its summary for the overview.
+# The module of each command in this package, and its summary for the overview.
 COMMANDS = {
-    "demo": ("cli.demo", "run the whole rig, emulated, in closed loop"),
-    "init": ("cli.init", "write a commented configuration and experiments to start from"),
-    "run": ("cli.run", "run the daemon that a configuration describes"),
-    "import": ("cli.recording", "convert the paper's MATLAB streams into a recording"),
-    "recording": ("cli.recording", "inspect recordings, repair them, and export them as tables"),
-    "replay": ("cli.replay", "send a recording through the same estimators again, as if live"),
-    "evaluate": ("cli.evaluate", "judge a calibrated estimator on recordings or slices"),
-    "adapt": ("cli.adapt", "correct a calibration's gain by one or a few twists of known torque"),
-    "chart": ("cli.chart", "chart speed against accuracy, stability, and how much model is needed"),
-    "check": ("cli.check", "check a configuration and the files it names"),
-    "schema": ("cli.schema", "print the JSON Schema of a configuration, an experiment or another file"),
-    "listen": ("cli.listen", "print what a running daemon publishes"),
-    "command": ("cli.command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),
-    "view": ("cli.view", "show a running daemon as a page in the browser, with a stop button"),
-    "calibrate": ("cli.calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"),
-    "emulate": ("cli.emulate", "emulate a device, byte for byte, on a port of its own"),
-    "bank": ("cli.bank", "solve, build, design and inspect banks of simulated signals"),
-    "doctor": ("cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
-    "ports": ("tools.serial_ports", "list the serial ports with their serial numbers"),
-    "keys": ("cli.keys", "make the keys for daemon and clients on a network"),
-    "completion": ("cli.completion", "print the completion script for bash, zsh or tcsh"),
-    "install": ("cli.install", "install the daemon as a service of this computer"),
-    "uninstall": ("cli.install", "remove the service"),
-    "skin": ("cli.skin", "compare the shear skin's models with its paper, and calibrate a skin"),
-    "reproduce": ("cli.reproduce", "compute the paper's numbers and figures from recorded slices"),
+    "demo": ("demo", "run the whole rig, emulated, in closed loop"),
+    "init": ("init", "write a commented configuration and experiments to start from"),
+    "run": ("run", "run the daemon that a configuration describes"),
+    "import": ("recording", "convert the paper's MATLAB streams into a recording"),
+    "recording": ("recording", "inspect recordings, repair them, and export them as tables"),
+    "replay": ("replay", "send a recording through the same estimators again, as if live"),
+    "evaluate": ("evaluate", "judge a calibrated estimator on recordings or slices"),
+    "adapt": ("adapt", "correct a calibration's gain by one or a few twists of known torque"),
+    "chart": ("chart", "chart speed against accuracy, stability, and how much model is needed"),
+    "check": ("check", "check a configuration and the files it names"),
+    "schema": ("schema", "print the JSON Schema of a configuration, an experiment or another file"),
+    "listen": ("listen", "print what a running daemon publishes"),
+    "command": ("command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),
+    "view": ("view", "show a running daemon as a page in the browser, with a stop button"),
+    "calibrate": ("calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"),
+    "emulate": ("emulate", "emulate a device, byte for byte, on a port of its own"),
+    "bank": ("bank", "solve, build, design and inspect banks of simulated signals"),
+    "doctor": ("doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
+    "ports": ("ports", "list the serial ports with their serial numbers"),
+    "keys": ("keys", "make the keys for daemon and clients on a network"),
+    "completion": ("completion", "print the completion script for bash, zsh or tcsh"),
+    "install": ("install", "install the daemon as a service of this computer"),
+    "uninstall": ("install", "remove the service"),
+    "skin": ("skin", "compare the shear skin's models with its paper, and calibrate a skin"),
+    "reproduce": ("reproduce", "compute the paper's numbers and figures from recorded slices"),
 }
 
 EXIT_OK, EXIT_USAGE = 0, 2
@@ -111,7 +111,7 @@ class Parser(argparse.ArgumentParser):
 
 def command_module(name: str) -> ModuleType:
     """Import and return the module of a command."""
-    return importlib.import_module(f"shearloop.{COMMANDS[name][0]}")
+    return importlib.import_module(f"shearloop.cli.{COMMANDS[name][0]}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -3,8 +3,9 @@
 import argparse
 from pathlib import Path
 
-from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, check_overwrite, load_calibration, time_range
+from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, load_calibration, time_range
 from shearloop.cli.terminal import print_result
+from shearloop.tools.outputs import check_overwrite
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

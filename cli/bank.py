@@ -5,19 +5,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shearloop.cli.options import (
-    add_action,
-    add_cluster,
-    add_json,
-    add_option,
-    check_overwrite,
-    positive,
-    processors,
-    run_action,
-    writing,
-)
-from shearloop.cli.terminal import print_result, progress_bar
+from shearloop.cli.options import add_action, add_cluster, add_json, add_option, positive, run_action
+from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
+from shearloop.tools.outputs import check_overwrite, progress_bar, writing
+from shearloop.tools.parallel import processors
 
 if TYPE_CHECKING:
     from shearloop.bank.bank_file import Bank

@@ -80,13 +80,31 @@ def run(args: argparse.Namespace) -> int:
         print(*_lines(args.name, reply), sep="\n")
     else:
         print(f"shearloop command: {args.name} was refused: {reply.get('reason')}", file=sys.stderr)
+        if reply.get("invalid") and args.experiment is not None:
+            print(_mistakes(args.experiment), file=sys.stderr, end="")
     return 0 if accepted else 1
+
+
+def _mistakes(experiment: Path) -> str:
+    """Return the mistakes of an experiment, as lines, which the daemon does not tell.
+
+    It may read files that this user may not. Empty if the file is on the daemon's computer only.
+    """
+    from shearloop.daemon.experiment_files import read_experiment
+    from shearloop.errors import UserError
+
+    try:
+        read_experiment(experiment)
+    except UserError as error:
+        return f"{error}\n"
+    return ""
 
 
 def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
     """Return an accepted reply as text: of `status` the experiment, and the tasks as a table."""
     if name == "status":
-        from shearloop.cli.terminal import loop_line, table, task_row
+        from shearloop.cli.terminal import loop_line, table
+        from shearloop.tools.task_row import task_row
 
         rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
         loop = [loop_line(reply["loop"]), ""] if "loop" in reply else []

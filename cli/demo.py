@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 from shearloop.cli import bank, init
 from shearloop.cli import run as run_command
 from shearloop.cli.emulator_processes import SHEARLOOP, running
-from shearloop.cli.options import add_option, writing
+from shearloop.cli.options import add_option
 from shearloop.daemon.process import interrupt_status
 from shearloop.errors import missing
+from shearloop.tools.outputs import writing
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig

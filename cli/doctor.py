@@ -26,12 +26,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print all findings; return 1 if something is wrong."""
 
+    from shearloop.cli.emulator_processes import check_emulators
     from shearloop.daemon.logs import logging_to_stderr
     from shearloop.tools.doctor import examine
 
     findings = []
     with logging_to_stderr(level=logging.ERROR):
-        for finding in examine(args.config, args.seconds, args.geometry):
+        for finding in examine(args.config, args.seconds, check_emulators, args.geometry):
             findings.append(finding)
             if args.json:
                 continue

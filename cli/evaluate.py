@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import add_cluster, add_json, add_option, number, time_range, writing
+from shearloop.cli.options import add_cluster, add_json, add_option, number, time_range
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError, missing
 from shearloop.estimation.defaults import LOADED_NM
+from shearloop.tools.outputs import writing
 from shearloop.words import counted
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and draw on request."""
     from shearloop.bank.bank_file import Bank
-    from shearloop.cli.options import check_overwrite, read_judged
+    from shearloop.cli.options import read_judged
     from shearloop.estimation.load_delay import load_delay_warning
     from shearloop.tools.evaluate import (
         estimate_in_worker,
@@ -70,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
         write_estimates,
     )
     from shearloop.tools.frame_series import check_no_copies, part_of
+    from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
 
     if args.out is not None and args.out.suffix not in _FIGURES:

@@ -4,8 +4,9 @@ import argparse
 from importlib import resources
 from pathlib import Path
 
-from shearloop.cli.options import add_option, writing
+from shearloop.cli.options import add_option
 from shearloop.errors import UserError
+from shearloop.tools.outputs import writing
 
 # Files and folders of the package's `config`.
 STARTERS = ("rig.yaml", "ur.yaml", "experiments", "banks", "fingertips", "schemas", "foxglove.json")

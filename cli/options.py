@@ -1,17 +1,17 @@
 """Options that several commands share, and their checks."""
 
 import argparse
-import codecs
 import contextlib
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.daemon.messaging.addresses import needs_keys
 from shearloop.errors import UserError
+from shearloop.tools.outputs import check_overwrite
 
 if TYPE_CHECKING:
     from shearloop.bank.fingertip import Fingertip
@@ -22,8 +22,6 @@ PAPERS_RECORDINGS = (
     "The paper's recordings: https://github.com/DhruvTrehan03/Soft-Tactile-Sensing-For-Robotic-Manipulation "
     "(see docs/recording.md)"
 )
-# Longer than the 124 characters of text at the start of a MATLAB file.
-_HEAD_BYTES = 512
 
 
 def number(low: float, high: float, kind: Callable[[str], float] = float) -> Callable[[str], float]:
@@ -158,26 +156,11 @@ def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
     return ClientKeys.load(key, server_key)
 
 
-def processors() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
 def check_calibration_file(out: Path) -> None:
     """Raise UserError, before anything is measured, unless `out` can become a calibration file."""
     if not out.parent.is_dir():
         raise UserError(f"--out {out} cannot be written: the folder {out.parent} does not exist")
     check_overwrite(out, "a calibration file")
-
-
-@contextlib.contextmanager
-def writing(out: Path, what: str) -> Iterator[None]:
-    """Raise UserError where writing `out` raises OSError."""
-    try:
-        yield
-    except OSError as error:
-        file, reason = error.filename or out, error.strerror or error
-        raise UserError(f"{file}: {what} cannot be written: {reason}; choose another path") from error
 
 
 def load_calibration(path: Path) -> "Calibration":
@@ -208,29 +191,3 @@ def read_judged(path: Path, recordings: "Sequence[Path]") -> "tuple[Calibration,
             "calibrate on recordings of the same kind"
         )
     return calibration, named
-
-
-def check_overwrite(out: Path, kind: str, begins: bytes | None = None) -> None:
-    """Raise UserError if `out` is a file of another kind: one that does not begin with `begins`, or is no text.
-
-    A missing word in `calibrate --out recordings/*.mcap` would otherwise overwrite a recording. Errors of reading are
-    left to the code that writes the file.
-    """
-    if not out.is_file():
-        return
-    try:
-        with out.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except OSError:
-        return
-    if head and not (_is_text(head) if begins is None else head.startswith(begins)):
-        raise UserError(f"{out} exists and is not {kind}: it was not changed; choose another --out")
-
-
-def _is_text(head: bytes) -> bool:
-    try:
-        # The incremental decoder accepts a character that is cut off at the end.
-        codecs.getincrementaldecoder("utf-8")().decode(head)
-    except UnicodeDecodeError:
-        return False
-    return b"\0" not in head

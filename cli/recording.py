@@ -15,13 +15,12 @@ from shearloop.cli.options import (
     add_fingertip,
     add_json,
     add_option,
-    check_overwrite,
     load_fingertip,
     run_action,
-    writing,
 )
-from shearloop.cli.terminal import print_result, progress_bar
+from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
+from shearloop.tools.outputs import check_overwrite, progress_bar, writing
 from shearloop.words import counted
 
 if TYPE_CHECKING:

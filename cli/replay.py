@@ -61,8 +61,9 @@ def _speed(text: str) -> float:
 async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Namespace) -> "ReplayComparison":
     import zmq.asyncio
 
-    from shearloop.cli.terminal import print_estimate, progress_bar
+    from shearloop.cli.terminal import print_estimate
     from shearloop.daemon.messaging.publisher import Publisher
+    from shearloop.tools.outputs import progress_bar
     from shearloop.tools.recordings.replay import Replay, ReplayClock
 
     clock = ReplayClock()

@@ -5,9 +5,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import PAPERS_RECORDINGS, add_json, add_option, positive, processors, writing
-from shearloop.cli.terminal import progress_bar
+from shearloop.cli.options import PAPERS_RECORDINGS, add_json, add_option, positive
 from shearloop.errors import missing
+from shearloop.tools.outputs import progress_bar, writing
+from shearloop.tools.parallel import processors
 
 if TYPE_CHECKING:
     from shearloop.bank.arrays import FloatArray

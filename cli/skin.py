@@ -6,9 +6,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import add_action, add_json, add_option, check_overwrite, number, run_action, writing
+from shearloop.cli.options import add_action, add_json, add_option, number, run_action
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError, require
+from shearloop.tools.outputs import check_overwrite, writing
 
 if TYPE_CHECKING:
     from shearloop.studies.skin.characterisation import FigureOfMerit

@@ -12,14 +12,12 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from shearloop.errors import UserError
-from shearloop.words import times
+from shearloop.tools.task_row import task_row
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
 
 STDIN = 0
-# Errors of a device's connection, which connects again by itself.
-LINK_ERRORS = ("unreachable", "silent", "lost")
 READ_BYTES = 4096
 
 
@@ -30,21 +28,6 @@ def print_result(result: object, sentences: Iterable[str], *, as_json: bool) -> 
     else:
         print(*sentences, sep="\n", flush=True)
     return 0
-
-
-@contextmanager
-def progress_bar(name: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar if stderr is a terminal; the yielded function takes the amount done so far."""
-    from tqdm import tqdm
-
-    # tqdm would start a monitoring thread that outlives the bars.
-    tqdm.monitor_interval = 0
-    with tqdm(total=total, unit=unit, desc=name, disable=None, leave=False, unit_scale=unit == "B") as bar:
-
-        def show(done: int) -> None:
-            bar.update(done - bar.n)
-
-        yield show
 
 
 def print_estimate(out: "TextIO | NonBlockingWriter", topic: str, content: Mapping[str, Any]) -> None:
@@ -234,28 +217,6 @@ def _health(content: Mapping[str, Any]) -> str:
     rows = [task_row(name, facts) for name, facts in content["tasks"].items()]
     tasks = (f"{name} {', '.join(filter(None, cells))}" for name, *cells in rows)
     return f"{content['memory_mb']:.0f} MB  {content['cpu_percent']:.1f} % CPU  " + "; ".join(tasks)
-
-
-def task_row(name: str, facts: Mapping[str, Any]) -> tuple[str, str, str, str]:
-    """Return the name of a task of `health`, its state, its rate, and its notes: restarts, errors, the latest error."""
-    down = facts.get("connected") is False
-    state = "DEAD" if facts.get("alive") is False else "not connected" if down else "alive"
-    state = "done" if facts.get("done") else state
-    notes = [f"restarted {times(facts['restarts'])}"] if facts.get("restarts") else []
-    errors = dict(facts.get("errors") or {})
-    lost = sum(errors.pop(kind, 0) for kind in LINK_ERRORS) or (facts.get("connections") or 1) - 1
-    if lost and not down:
-        notes.append(f"reconnected {times(lost)}")
-    notes += [f"{kind} {times(count)}" for kind, count in errors.items()]
-    if error := facts.get("error") or facts.get("last_error") or (down and facts.get("last_loss")):
-        notes.append(error)
-    return name, state, _rate(facts.get("rate_hz"), facts.get("expected_hz")), ", ".join(notes)
-
-
-def _rate(rate_hz: float | None, expected_hz: float | None) -> str:
-    if rate_hz is None:
-        return ""
-    return f"{rate_hz:.2f} Hz" if expected_hz is None else f"{rate_hz:.2f} of {expected_hz:.2f} Hz"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_runner import loop_state
+from shearloop.daemon.experiment_files import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig, Sensors
 from shearloop.daemon.supervisor import HealthReporter
@@ -50,6 +51,8 @@ class Commands:
             raise CommandRefusedError("no experiment is given: name its file, or one in the configuration")
         try:
             _refuse_if(await required_rig(self.rig).start(Path(path)))
+        except InvalidExperimentError as error:
+            raise CommandRefusedError(str(error), invalid=True) from error
         except UserError as error:
             raise CommandRefusedError(str(error)) from error
         if self.experiment is not None:

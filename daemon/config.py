@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.control.loop_inputs import LoopConfig
@@ -23,6 +23,7 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
     URCAP_PORT,
 )
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
 
@@ -186,9 +187,10 @@ class GripperSocket(ConfigModel):
 class GripperConfig(ConfigModel):
     """The gripper, on a socket or on Modbus."""
 
+    model: ModelName = Field(DEFAULT_MODEL, description="sets stroke, speeds, forces and counts")
     socket: GripperSocket | None = Field(None, description="through the robot's URCap; else `modbus`")
     modbus: SerialDevice | None = Field(None, description="Modbus RTU by USB; else `socket`")
-    calibration: Path | None = Field(None, description="default: the maker's data")
+    calibration: Path | None = Field(None, description="of `shearloop calibrate gripper`; default: the maker's data")
 
     _one_way_in = either("socket", "modbus")
 
@@ -236,10 +238,26 @@ class DaemonConfig(ConfigModel):
     gripper: GripperConfig | None = Field(None, description="the gripper; needs `robot`")
     loop: LoopConfig = Field(LoopConfig(), description="settings of the closed loop")
     experiment: Path | None = Field(None, description="started once all devices are connected")
+    experiments: tuple[Path, ...] = Field(
+        (), validate_default=True, description="folders of the experiments that `start` may name; default: this file's"
+    )
     stop_when_done: bool = Field(False, description="the daemon ends with that experiment: status 0 if done, else 3")
     recording: RecordingConfig | None = Field(None, description="default: no recording")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
     emulators: tuple[EmulatorConfig, ...] = Field((), description="devices to emulate, for demonstrations")
+
+    @field_validator("experiments")
+    @classmethod
+    def _own_folder(cls, folders: tuple[Path, ...], info: ValidationInfo) -> tuple[Path, ...]:
+        if not info.context:
+            return folders
+        own: Path = info.context["folder"]
+        return tuple(Path(os.path.normpath(own / folder)) for folder in folders) or (own,)
+
+    @property
+    def experiment_folders(self) -> tuple[Path, ...]:
+        """The folders of the experiments that a request may name: the configured ones, and that of `experiment`."""
+        return (*self.experiments, *((self.experiment.parent,) if self.experiment is not None else ()))
 
     @model_validator(mode="after")
     def _loop_is_whole(self) -> "DaemonConfig":

@@ -1,10 +1,11 @@
-"""An emulated Robotiq 2F-140: its mechanics, the URCap's socket and Modbus RTU, and a player that moves it in time.
+"""An emulated Robotiq gripper: its mechanics, the URCap's socket and Modbus RTU, and a player that moves it in time.
 
 Modbus: application protocol 1.1b3 and serial line 1.02; registers: the gripper's manual, chapter 4. `Gripper`,
 `UrcapSession` and `ModbusSlave` have no I/O; `step` passes the time.
 """
 
 import asyncio
+import math
 import struct
 import time
 from dataclasses import dataclass, field, replace
@@ -12,17 +13,14 @@ from typing import Any
 
 from pymodbus.framer import FramerRTU
 
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel
 from shearloop.emulators import number_between
 from shearloop.emulators.ports import Server
 
 COUNTS_MAX = 255
 FIRST_MAJOR_FAULT = 10
 ACTIVATION_NOT_FINISHED, NOT_ACTIVATED, OVER_TEMPERATURE = 5, 7, 8
-SPEED_MM_S, FORCE_N = (30.0, 250.0), (10.0, 125.0)
 ACTIVATION_SPEED_MM_S = 150.0
-# The ends of the fingers' range.
-OPEN_COUNTS, CLOSED_COUNTS = 3.0, 230.0
-MM_PER_COUNT = 140.0 / (CLOSED_COUNTS - OPEN_COUNTS)
 
 _COMMANDS = {"ACT": "act", "GTO": "gto", "POS": "pos", "SPE": "spe", "FOR": "force"}
 
@@ -46,6 +44,37 @@ class GripperRegisters:
     force: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class Fingers:
+    """The true width over the counts: from the model's stroke at `open_counts` to 0 at `closed_counts`.
+
+    Half-way it is wider than a straight line by `bow_mm`.
+    """
+
+    model: GripperModel = MODELS[DEFAULT_MODEL]
+    open_counts: float = 3.0
+    closed_counts: float = 230.0
+    bow_mm: float = 0.0
+
+    def width_mm(self, counts: float) -> float:
+        """Return the width at a position."""
+        closed = (counts - self.open_counts) / (self.closed_counts - self.open_counts)
+        return self.model.stroke_mm * (1 - closed) + 4 * self.bow_mm * closed * (1 - closed)
+
+    def counts(self, width_mm: float) -> float:
+        """Return the position of a width."""
+        stroke_mm, bow_mm = self.model.stroke_mm, self.bow_mm
+        straight = stroke_mm - 4 * bow_mm
+        # The root of a quadratic equation, in the form that a bow of 0 does not divide by.
+        root = math.sqrt(straight**2 + 16 * bow_mm * (stroke_mm - width_mm))
+        return self.open_counts + (self.closed_counts - self.open_counts) * 2 * (stroke_mm - width_mm) / (
+            straight + root
+        )
+
+
+_BARE_2F_140 = Fingers()
+
+
 class Gripper:
     """One gripper: `write` sets the command registers, `step` moves the fingers.
 
@@ -53,9 +82,10 @@ class Gripper:
     belongs to the motion before, as on the real gripper.
     """
 
-    def __init__(self, object_mm: float | None = None) -> None:
+    def __init__(self, object_mm: float | None = None, fingers: Fingers = _BARE_2F_140) -> None:
         """Start as after power-on: reset, half open."""
         self.object_mm = object_mm
+        self.fingers = fingers
         self.widest_mm: float | None = None
         self.powered = True
         self.command = GripperRegisters()
@@ -80,12 +110,12 @@ class Gripper:
     @property
     def width_mm(self) -> float:
         """The true width between the fingers, mm."""
-        return (CLOSED_COUNTS - self._position) * MM_PER_COUNT
+        return self.fingers.width_mm(self._position)
 
     @property
     def grip_force_n(self) -> float:
         """The force on the object between the fingers, N; 0 without one."""
-        low, high = FORCE_N
+        low, high = self.fingers.model.force_n
         return low + (high - low) * self.taken.force / COUNTS_MAX if self.obj == 2 else 0.0
 
     def write(self, registers: GripperRegisters) -> None:
@@ -112,7 +142,7 @@ class Gripper:
                 if not self._to_reach:
                     self.flt, self.obj = 0, 3
         elif self.sta == 3 and self.taken.gto and self.flt != OVER_TEMPERATURE:
-            low, high = SPEED_MM_S
+            low, high = self.fingers.model.speed_mm_s
             self._approach(float(self.taken.pos), low + (high - low) * self.taken.spe / COUNTS_MAX, dt_s)
 
     def _take_up(self) -> None:
@@ -125,18 +155,21 @@ class Gripper:
             if wanted.gto and not before.gto:
                 self.flt = NOT_ACTIVATED
         elif not before.act:
-            self._to_reach, self.flt = [OPEN_COUNTS, CLOSED_COUNTS, OPEN_COUNTS], ACTIVATION_NOT_FINISHED
+            opened, closed = self.fingers.open_counts, self.fingers.closed_counts
+            self._to_reach, self.flt = [opened, closed, opened], ACTIVATION_NOT_FINISHED
 
     def _approach(self, target: float, speed_mm_s: float, dt_s: float) -> bool:
         """Move towards a position; return whether the fingers have stopped, there or at an object."""
-        travel = speed_mm_s * dt_s / MM_PER_COUNT
+        fingers = self.fingers
+        # The makers' speed is that of the whole stroke.
+        travel = speed_mm_s * dt_s * (fingers.closed_counts - fingers.open_counts) / fingers.model.stroke_mm
         closing = target > self._position
         # The fingers' own stops count as the target: a real gripper that closes on air reports no object.
-        stop = target = min(max(target, OPEN_COUNTS), CLOSED_COUNTS)
+        stop = target = min(max(target, fingers.open_counts), fingers.closed_counts)
         if closing and self.object_mm is not None:
-            stop = min(target, CLOSED_COUNTS - self.object_mm / MM_PER_COUNT)
+            stop = min(target, fingers.counts(self.object_mm))
         elif not closing and self.widest_mm is not None:
-            stop = max(target, CLOSED_COUNTS - self.widest_mm / MM_PER_COUNT)
+            stop = max(target, fingers.counts(self.widest_mm))
         # An object wider than the opening pushes the fingers apart.
         self._position = min(self._position + travel, stop) if closing else max(self._position - travel, stop)
         if self._position != stop:
@@ -255,7 +288,10 @@ class GripperPlayer:
             case ["object", "none"] | ["drop"]:
                 self._gripper.object_mm = None
             case ["object", width]:
-                self._gripper.object_mm = number_between(width, 0.0, 140.0, "not a width in mm from 0 to 140")
+                stroke_mm = self._gripper.fingers.model.stroke_mm
+                self._gripper.object_mm = number_between(
+                    width, 0.0, stroke_mm, f"not a width in mm from 0 to {stroke_mm:g}"
+                )
             case ["fault", code]:
                 self._gripper.fail(int(number_between(code, 0, 15, "not a fault code from 0 to 15")))
             case _:

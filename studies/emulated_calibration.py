@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.build import build_bank
-from shearloop.cli.options import processors, writing
-from shearloop.cli.terminal import progress_bar
 from shearloop.daemon.recorder.schema import DIAMETER_NOTE
 from shearloop.daemon.recorder.writer import McapFile, new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
@@ -31,6 +29,8 @@ from shearloop.tools.bank_config import load_bank_plan
 from shearloop.tools.banks import is_built
 from shearloop.tools.evaluate import estimate_series, figures_of
 from shearloop.tools.frame_series import series_of
+from shearloop.tools.outputs import progress_bar, writing
+from shearloop.tools.parallel import processors
 from shearloop.tools.recordings.reader import read_recording
 
 # Three diameters are enough to interpolate; five halve the interval.

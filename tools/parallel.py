@@ -171,3 +171,8 @@ def _check_scheduler(address: str) -> None:
         ) from error
     except (OSError, TypeError, ValueError) as error:
         raise UserError(f"no Dask scheduler answers at {address}: {error}; start one with `dask scheduler`") from error
+
+
+def processors() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0))

@@ -1,11 +1,8 @@
-"""`shearloop ports`: the serial ports, their USB serial numbers, and whether the user may open them."""
+"""The serial ports, their USB serial numbers, and whether the user may open them."""
 
-import argparse
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-
-from shearloop.cli.terminal import print_result
 
 # USB vendor numbers, as in systemd/60-shearloop.rules.
 BOARDS = {
@@ -36,24 +33,6 @@ class SerialPortInfo:
         if self.serial_number:
             return f'{{serial_number: "{self.serial_number}"}}'
         return f"{{path: {self.stable_name or self.path}}}"
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `ports`."""
-    parser.add_argument("--json", action="store_true", help="print them as JSON")
-    parser.epilog = "Shows for each port the `device` for the configuration, which is found in any socket."
-
-
-def run(args: argparse.Namespace) -> int:
-    """List the ports without opening them."""
-    ports = list_serial_ports()
-    sentences = [] if ports else ["there is no serial port: plug a board in, then look at `sudo dmesg | tail`"]
-    for port in ports:
-        sentences += [f"{port.path}  {port.usb}  {port.likely or port.description}", f"    device: {port.named_by}"]
-        sentences += [] if port.serial_number else ["    it has no serial number: leave it in the same socket"]
-        sentences += [f"    {port.error}"] if port.error else []
-    result = [{**asdict(port), "named_by": port.named_by} for port in ports]
-    return print_result(result, sentences, as_json=args.json)
 
 
 def list_serial_ports() -> list[SerialPortInfo]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option, check_calibration_file
 from shearloop.cli.terminal import Operator, print_result
 from shearloop.drivers.defaults import URCAP_PORT
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
 from shearloop.errors import UserError
 from shearloop.words import counted
 
@@ -28,7 +29,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--serial-number", metavar="NUMBER", help="the USB adapter's serial number, for Modbus RTU")
     way.add_argument("--port", metavar="PATH", help="the USB adapter's port, for Modbus RTU")
     add_option(parser, "--socket-port", PORT, "PORT", "the URCap's (default: %(default)s)", default=URCAP_PORT)
-    text = "an object's diameter; give it once per object, of at least two"
+    names = ", ".join(MODELS)
+    text = f"{names}; as `gripper.model` in the configuration (default: %(default)s)"
+    parser.add_argument("--model", choices=tuple(MODELS), metavar="MODEL", default=DEFAULT_MODEL, help=text)
+    text = "an object's diameter; give it once per object, of at least two; four over half of the stroke show its bow"
     add_option(parser, "--diameter-mm", TOOL_MM, "MM", text, action="append", required=True)
     add_option(parser, "--out", Path, "FILE", "the calibration file to write", required=True)
     add_json(parser)
@@ -49,10 +53,10 @@ def run(args: argparse.Namespace) -> int:
         client = SocketClient(args.host, args.socket_port)
     else:
         client = ModbusClient(serial_number=args.serial_number, path=args.port)
-    gripper = RobotiqGripper(client, WidthCalibration.nominal())
+    gripper = RobotiqGripper(client, WidthCalibration.nominal(args.model))
     operator = Operator(stdout_is_for_json=args.json)
     gauges = asyncio.run(_grip(gripper, args.diameter_mm, operator))
-    calibration = WidthCalibration.of_gauges(gauges)
+    calibration = WidthCalibration.of_gauges(gauges, args.model)
     save_calibration(args.out, calibration)
     report = {
         "path": str(args.out),
@@ -62,7 +66,8 @@ def run(args: argparse.Namespace) -> int:
         "gauges": [{"counts": counts, "diameter_mm": diameter_mm} for counts, diameter_mm in gauges],
     }
     sentences = [
-        f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm.",
+        f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm."
+        + (f" The width bows by {calibration.bow_mm:+.1f} mm half-way." if calibration.bow_mm else ""),
         f"Written to {args.out}.",
     ]
     return print_result(report, sentences, as_json=args.json)
@@ -92,10 +97,10 @@ async def _grip(gripper: "RobotiqGripper", diameters_mm: list[float], operator: 
 
 async def _contact(gripper: "RobotiqGripper") -> int | None:
     """Close and open; return the position of the contact, or None without one."""
-    from shearloop.drivers.robotiq.gripper import STROKE_MM
-    from shearloop.drivers.robotiq.messages import SPEED_MIN_MM_S, GripperCommand, ObjectStatus
+    from shearloop.drivers.robotiq.messages import GripperCommand, ObjectStatus
 
+    stroke_mm, slowest_mm_s = gripper.model.stroke_mm, gripper.model.speed_mm_s[0]
     # Beyond the fingers' stop: reaching the target is never a contact.
-    closed = await gripper.finish(await gripper.move(GripperCommand(-STROKE_MM, SPEED_MIN_MM_S)))
-    await gripper.finish(await gripper.move(GripperCommand(STROKE_MM)))
+    closed = await gripper.finish(await gripper.move(GripperCommand(-stroke_mm, slowest_mm_s)))
+    await gripper.finish(await gripper.move(GripperCommand(stroke_mm)))
     return closed.position_counts if closed.object is ObjectStatus.CONTACT_CLOSING else None

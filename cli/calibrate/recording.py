@@ -5,10 +5,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, check_overwrite, time_range
+from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, time_range
 from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
 from shearloop.estimation.estimator_names import DEFAULT, ESTIMATORS
+from shearloop.tools.outputs import check_overwrite
 
 if TYPE_CHECKING:
     from shearloop.estimation import Calibration

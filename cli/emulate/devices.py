@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from shearloop.cli.emulate import console
 from shearloop.cli.options import PORT, add_option, number, positive
 from shearloop.drivers.defaults import URCAP_PORT
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
 from shearloop.emulators import number_between
 from shearloop.errors import UserError
 
@@ -183,6 +184,12 @@ def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
         "10."
     )
     add_option(parser, "--speed", positive(), "N", "times the gripper's own pace", default=1.0)
+    text = f"{', '.join(MODELS)} (default: %(default)s)"
+    parser.add_argument("--model", choices=tuple(MODELS), metavar="MODEL", default=DEFAULT_MODEL, help=text)
+    text = "position of the open fingers (default: %(default)s)"
+    add_option(parser, "--open-counts", number(0, 20), "N", text, default=3.0)
+    text = "how much wider than a straight line over the counts they are half-way (default: %(default)s)"
+    add_option(parser, "--bow-mm", number(-5, 5), "MM", text, default=0.0)
 
 
 def _configure_gripper_socket(parser: argparse.ArgumentParser) -> None:
@@ -197,10 +204,10 @@ def _configure_gripper_modbus(parser: argparse.ArgumentParser) -> None:
 
 
 def _play_gripper(args: argparse.Namespace) -> Playing:
-    from shearloop.emulators.gripper import Gripper, GripperPlayer, ModbusSlave, UrcapSession
+    from shearloop.emulators.gripper import Fingers, Gripper, GripperPlayer, ModbusSlave, UrcapSession
     from shearloop.emulators.ports import PtyServer, SocketServer
 
-    gripper = Gripper()
+    gripper = Gripper(fingers=Fingers(MODELS[args.model], args.open_counts, bow_mm=args.bow_mm))
     server: SocketServer | PtyServer
     if args.device == "gripper-modbus":
         server = PtyServer(ModbusSlave(gripper), console.checked_link(args.link))
@@ -214,6 +221,6 @@ DEVICES = {
     "eit-kit": console.Device("the EIT board of a fingertip, on a pseudo-terminal", _configure_eit_kit, _play_eit_kit),
     "hx711": console.Device("the load cell's board, on a pseudo-terminal", _configure_hx711, _play_hx711),
     "ur": console.Device("a UR robot's controller, on an address of this machine", _configure_ur, _play_ur),
-    "gripper-socket": console.Device("a 2F-140 behind the URCap's socket", _configure_gripper_socket, _play_gripper),
-    "gripper-modbus": console.Device("a 2F-140 on Modbus RTU, on a port", _configure_gripper_modbus, _play_gripper),
+    "gripper-socket": console.Device("a gripper behind the URCap's socket", _configure_gripper_socket, _play_gripper),
+    "gripper-modbus": console.Device("a gripper on Modbus RTU, on a port", _configure_gripper_modbus, _play_gripper),
 }

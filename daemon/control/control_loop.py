@@ -179,15 +179,21 @@ class ControlLoop:
         """Take the end of the release after a stop, and why the gripper did not open, if it did not."""
         self._gripped.release_error = error
 
-    def start(self, file: ExperimentFile, t_ns: int) -> str | None:
-        """Begin an experiment; return None, or why it cannot begin."""
+    def start_refusal(self) -> str | None:
+        """Return why no experiment can begin, whichever it is, or None."""
         if (running := self.running) is not None:
             return f"the experiment {running.file.name!r} is still running; stop it first"
+        if self.safety.stopped:
+            return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
+        return None
+
+    def start(self, file: ExperimentFile, t_ns: int) -> str | None:
+        """Begin an experiment; return None, or why it cannot begin."""
+        if (reason := self.start_refusal()) is not None:
+            return reason
         if file.torque_source not in self._wrists:
             known = ", ".join(self._wrists)
             return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
-        if self.safety.stopped:
-            return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
         driving = self._sources[file.torque_source]
         watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
         faults = detect_faults(self.inputs, watched, self.config, t_ns)

@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJ
 from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
+from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S
 from shearloop.yaml_files import shown
 
 MOST_ANGLES = 1000
@@ -53,6 +54,12 @@ Angles = Annotated[
 ]
 
 
+# What some gripper has; the configured model's own ranges are checked with its configuration.
+FingerWidth = Annotated[float, Field(ge=0, le=LARGEST_STROKE_MM)]
+FingerSpeed = Annotated[float, Field(ge=SPEEDS_MM_S[0], le=SPEEDS_MM_S[1])]
+FingerForce = Annotated[float, Field(ge=FORCES_N[0], le=FORCES_N[1])]
+
+
 class ExperimentLimits(ConfigModel):
     """Limits of all steps; a step's limits can only be tighter."""
 
@@ -86,15 +93,16 @@ class GripStep(_Step):
     """Close to a width, or onto an object in between."""
 
     do: Literal["grip"]
-    width_mm: float = Field(0.0, ge=0, le=140, description="width to close to")
-    speed_mm_per_s: float = Field(60.0, ge=30, le=250, description="speed of the fingers")
-    force_n: float = Field(20.0, ge=10, le=125, description="largest force of the fingers")
+    width_mm: FingerWidth = Field(0.0, description="width to close to")
+    speed_mm_per_s: FingerSpeed = Field(60.0, description="speed of the fingers")
+    force_n: FingerForce = Field(20.0, description="largest force of the fingers")
     expect_object: bool = Field(True, description="closing on nothing is an error")
 
 
 def opening(width_mm: float, speed_mm_per_s: float) -> GripStep:
     """Return the step that opens the gripper, with its least force."""
-    content = {"width_mm": width_mm, "speed_mm_per_s": speed_mm_per_s, "force_n": 10.0, "expect_object": False}
+    least_n = FORCES_N[0]
+    content = {"width_mm": width_mm, "speed_mm_per_s": speed_mm_per_s, "force_n": least_n, "expect_object": False}
     return GripStep.model_validate({"do": "grip", **content})
 
 
@@ -185,7 +193,7 @@ class ReleaseStep(_Step):
     """Open the gripper."""
 
     do: Literal["release"]
-    width_mm: float = Field(140.0, ge=0, le=140, description="width to open to")
+    width_mm: FingerWidth = Field(LARGEST_STROKE_MM, description="width to open to; a smaller gripper opens fully")
 
 
 class WaitStep(_Step):
@@ -214,7 +222,7 @@ class ExperimentFile(ConfigModel):
         "right", description="torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
     )
     limits: ExperimentLimits = Field(ExperimentLimits(), description="limits of all steps")
-    tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
+    tool_mm: float | None = Field(None, gt=0, lt=LARGEST_STROKE_MM, description="diameter of the tool, for recordings")
     slices: Literal["torque", "diameter"] | None = Field(
         None,
         description="kind of slice that `recording export --format slices` makes of each held angle; none by default",

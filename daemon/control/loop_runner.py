@@ -68,6 +68,8 @@ LONGEST_TARE_S = 30.0
 # A tare gives up this much before its step is overdue, so that the sensors' reasons are reported.
 GIVES_UP_BEFORE_S = 0.1
 ENDING = "the daemon ends; start it again"
+STOPPED_AT_START = "it was stopped during its start"
+UNLOCKING = "robot and gripper are being unlocked; wait for the end"
 # The columns of `robot.state` that the robot's state has under the same name.
 _SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s"}
 
@@ -181,11 +183,29 @@ class ControlLoopRunner:
         except Exception:  # noqa: BLE001 - the robot's process stops the arm as it ends
             structlog.get_logger().exception("the loop crashed at its last decision")
 
-    async def start(self, file: ExperimentFile) -> str | None:
-        """Begin an experiment; return None, or why it cannot begin."""
+    @property
+    def stop_count(self) -> int:
+        """The number of stops so far: one that comes while an experiment is read or starts ends its start."""
+        return self._stop_count
+
+    def start_refusal(self) -> str | None:
+        """Return why no experiment can begin, whichever it is, or None."""
         if self._closed:
             return ENDING
-        stops_before = self._stop_count
+        if self._actions.unlocking:
+            return UNLOCKING
+        return self._control_loop.start_refusal()
+
+    async def start(self, file: ExperimentFile, stops_before: int | None = None) -> str | None:
+        """Begin an experiment; return None, or why it cannot begin.
+
+        `stops_before` is the `stop_count` at the request, if the file was read since.
+        """
+        if self._closed:
+            return ENDING
+        stops_before = self._stop_count if stops_before is None else stops_before
+        if self._stop_count != stops_before:
+            return STOPPED_AT_START
         # While an experiment runs the control loop refuses; a stopped arm must not be enabled on the way.
         if self._control_loop.running is None:
             reply = await self._robot.send(Enable())
@@ -197,9 +217,9 @@ class ControlLoopRunner:
                         pass
                     self._take_state(state)
         if self._stop_count != stops_before:
-            return "it was stopped during its start"
+            return STOPPED_AT_START
         if self._actions.unlocking:
-            return "robot and gripper are being unlocked; wait for the end"
+            return UNLOCKING
         return self._control_loop.start(file, self._clock.now_ns())
 
     async def experiment_ended(self) -> Experiment:

@@ -23,7 +23,7 @@ from shearloop.bank.models import MODELS
 from shearloop.cli import COMMANDS, command_module, main
 from shearloop.cli.bank import MODEL_NAMES
 from shearloop.cli.completion import full_parser
-from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table, task_row
+from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.loop_runner import WRENCH
@@ -33,6 +33,7 @@ from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
+from shearloop.tools.task_row import task_row
 from tests.paper_curve import paper_curve
 from tests.sample_messages import sample
 

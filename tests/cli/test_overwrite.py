@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from shearloop.cli.options import check_overwrite
 from shearloop.errors import UserError
+from shearloop.tools.outputs import check_overwrite
 
 MCAP = b"\x89MCAP0\r\n and what cannot be recorded again"
 

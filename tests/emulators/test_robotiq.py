@@ -4,15 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.emulators.gripper import (
-    CLOSED_COUNTS,
-    MM_PER_COUNT,
-    Gripper,
-    GripperRegisters,
-    ModbusSlave,
-    UrcapSession,
-    crc16,
-)
+from shearloop.drivers.robotiq.models import MODELS
+from shearloop.emulators.gripper import Fingers, Gripper, GripperRegisters, ModbusSlave, UrcapSession, crc16
 from tests.slices import slices
 
 READ_STATUS = bytes.fromhex("09 03 07D0 0003")
@@ -114,7 +107,7 @@ def test_frames_are_the_manuals_byte_for_byte():
     gripper = active_gripper()
     face = ModbusSlave(gripper)
     assert face.feed(bytes.fromhex("0910 03E8 0003 06 0900 00FF FFFF 4229")) == framed(bytes.fromhex("0910 03E8 0003"))
-    gripper.object_mm = (CLOSED_COUNTS - 189) * MM_PER_COUNT
+    gripper.object_mm = Fingers().width_mm(189)
     steps(gripper, 1.0)
     reply = face.feed(framed(READ_STATUS))
     assert reply[:7] == bytes.fromhex("0903 06 B900 00FF")
@@ -141,3 +134,11 @@ def test_the_socket_answers_as_the_urcap_does():
     assert face.feed(b"GET FLT\n") == b"FLT 14\n"
     gripper.powered = False
     assert face.feed(b"GET POS\n") == b"POS ?\n"
+
+
+@given(st.sampled_from(sorted(MODELS)), st.floats(3, 13), st.floats(-0.05, 0.05), st.floats(0, 1))
+def test_the_position_of_a_width_is_the_one_where_the_fingers_have_it(model, opened, bow, part):
+    own = MODELS[model]
+    fingers = Fingers(own, open_counts=opened, bow_mm=bow * own.stroke_mm)
+    assert fingers.width_mm(fingers.counts(part * own.stroke_mm)) == pytest.approx(part * own.stroke_mm, abs=1e-9)
+    assert fingers.counts(own.stroke_mm) == pytest.approx(opened)

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
-from shearloop.cli.check import check_parts
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
 from shearloop.drivers.ur.client import missing_library
 from shearloop.errors import UserError
+from shearloop.tools.check import CheckEmulators, check_parts
 from shearloop.tools.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
 from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, trouble
 from shearloop.tools.serial_ports import list_serial_ports
@@ -29,7 +29,9 @@ FIRST_SANE_UNIX_S = 1_704_067_200
 _TIME_ERROR = 5
 
 
-def examine(config_path: Path | None, seconds: float, geometry: Path | None = None) -> Iterator[Finding]:
+def examine(
+    config_path: Path | None, seconds: float, check_emulators: CheckEmulators, geometry: Path | None = None
+) -> Iterator[Finding]:
     """Yield one finding after another; listen to all devices at once for `seconds`."""
     yield from check_computer()
     yield check_ports()
@@ -44,7 +46,7 @@ def examine(config_path: Path | None, seconds: float, geometry: Path | None = No
         return
     yield good("configuration", f"{config_path} is in order")
     yield check_disk(Path() if config.recording is None else config.recording.folder)
-    yield from check_files(config, config_path, geometry)
+    yield from check_files(config, config_path, check_emulators, geometry)
     tasks = daemon_tasks(config.commands)
     if tasks is not None:
         yield good("daemon", f"answers at {config.commands}; it holds the devices and reports on them")
@@ -119,11 +121,13 @@ def check_ports() -> Finding:
     return good("USB serial ports", shown)
 
 
-def check_files(config: DaemonConfig, path: Path, geometry: Path | None) -> Iterator[Finding]:
+def check_files(
+    config: DaemonConfig, path: Path, check_emulators: CheckEmulators, geometry: Path | None
+) -> Iterator[Finding]:
     """Check every file of the configuration in `path`; `geometry` is the fingertip that its bank must match."""
     banks = [check_bank(name, fingertip, geometry) for name, fingertip in config.fingertips.items()]
     yield from banks
-    parts = check_parts(config, path)
+    parts = check_parts(config, path, check_emulators)
     for name, text in parts.texts.items():
         if name != "keys":
             yield good(f"files of {name}", text)

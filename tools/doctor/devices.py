@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from shearloop.cli.terminal import task_row
 from shearloop.daemon.config import DaemonConfig, GripperConfig, SerialDevice
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
@@ -30,6 +29,7 @@ from shearloop.tools.doctor.boards import (
     check_rate,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
+from shearloop.tools.task_row import task_row
 
 ROBOT_TIMEOUT_S = 2.0
 DAEMON_TIMEOUT_S = 1.0

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from shearloop.cli import main
+from shearloop.cli.emulator_processes import check_emulators
 from shearloop.daemon.config import CurveConfig, SerialDevice, load_daemon_config
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
@@ -37,7 +38,7 @@ def rig_config(config, tiny_bank, tmp_path) -> Path:
 
 
 async def examined(path: Path, seconds: float) -> dict[str, doctor.Finding]:
-    findings = await asyncio.to_thread(lambda: list(doctor.examine(path, seconds)))
+    findings = await asyncio.to_thread(lambda: list(doctor.examine(path, seconds, check_emulators)))
     for finding in findings:
         assert finding.found
         assert bool(finding.means) == bool(finding.next_step) == (finding.state != "good"), finding
@@ -129,7 +130,7 @@ def test_a_bank_of_another_geometry_is_reported(config):
 
 def test_a_missing_bank_is_reported_once_for_each_fingertip(config, tmp_path):
     path = config(fingertips={"right": {"device": {"path": "eit"}, "bank": "no.bank"}})
-    findings = list(doctor.check_files(load_daemon_config(path), path, None))
+    findings = list(doctor.check_files(load_daemon_config(path), path, check_emulators, None))
     (wrong,) = (one for one in findings if one.state == "trouble")
     assert wrong.subject == "bank of right"
     assert wrong.next_step.endswith(f"--out {tmp_path}/no.bank`, from a FILE such as banks/paper.yaml")
@@ -139,7 +140,7 @@ def test_an_experiment_that_check_refuses_is_wrong(config, tmp_path):
     steps = "[{do: hold_torque, torque_nm: 0.1}, {do: grip}]"
     (tmp_path / "one.yaml").write_text(f"name: one\nsteps: {steps}\n")
     path = config(robot="ur.yaml", experiment="one.yaml")
-    findings = doctor.check_files(load_daemon_config(path), path, None)
+    findings = doctor.check_files(load_daemon_config(path), path, check_emulators, None)
     (found,) = (one for one in findings if one.subject == "files of experiment")
     first, second = found.found.splitlines()
     assert "hold_torque needs an identified tool" in first

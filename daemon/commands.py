@@ -95,11 +95,12 @@ class Commands:
         return {"tasks": tasks, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
 
     async def _stop(self, request: Request) -> Reply:
-        stopped = self.rig.runner.stop() if self.rig is not None else None
+        spare_daemon = bool(request.get("spare_daemon"))
+        stopped = self.rig.runner.stop(also_idle=spare_daemon) if self.rig is not None else None
         waiting = self.experiment.call_off() if self.experiment is not None else None
         if stopped is not None:
             return {"stopped": stopped}
-        if request.get("spare_daemon"):
+        if spare_daemon:
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
         # Nothing moves, so the daemon itself stops, once the reply is sent.

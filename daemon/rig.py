@@ -15,6 +15,7 @@ from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, Tareable, wrench_source
 from shearloop.daemon.experiment_files import ExperimentFiles, read_document, without_mistakes
 from shearloop.daemon.logs import LinkReporter
+from shearloop.daemon.messaging.addresses import is_loopback_host
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
@@ -38,6 +39,7 @@ from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
+from shearloop.errors import UserError
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -78,6 +80,22 @@ def robot_settings(path: Path) -> UrSettings:
     settings = read_settings(path)
     if reason := missing_library():
         raise DriverError(f"{path}: {reason}")
+    return settings
+
+
+def open_settings(config: DaemonConfig) -> UrSettings | None:
+    """Return the settings of the configured robot, None without one; raises DriverError as `robot_settings` does.
+
+    Raises UserError for a robot elsewhere in a rig that is said to be emulated.
+    """
+    if config.robot is None:
+        return None
+    settings = robot_settings(config.robot)
+    if config.emulated and not is_loopback_host(settings.host):
+        raise UserError(
+            f"{config.robot}: `host: {settings.host}` is not this computer, and the configuration says "
+            "`emulated: true`: take that out for a real robot, or give 127.0.0.1 for an emulated one"
+        )
     return settings
 
 
@@ -206,9 +224,9 @@ def build_rig(
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     sources = torque_sources(config, estimators, combined)
     check_experiment(config, sources)
-    if config.robot is None:
+    settings = open_settings(config)
+    if settings is None:
         return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
-    settings = robot_settings(config.robot)
     loop = make_loop(config, settings, sources, supervisor.dead)
     gripper = make_gripper(config.gripper, loop, publisher) if config.gripper is not None else None
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)

@@ -89,7 +89,7 @@ def _torque(estimator: "FrameEstimator") -> str:
 
 
 def _check_rig(config: "DaemonConfig", parts: Parts) -> None:
-    from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, robot_settings
+    from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, open_settings
 
     if (cell := config.load_cell) is not None:
         with parts.of("load_cell"):
@@ -101,9 +101,8 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> None:
             gripper_calibration(hand)
             own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
             parts.texts["gripper"] = own
-    if config.robot is not None:
-        with parts.of("robot"):
-            settings = robot_settings(config.robot)
+    with parts.of("robot"):
+        if (settings := open_settings(config)) is not None:
             text = f"{settings.host}, limits of {config.robot}"
             parts.texts["robot"] = f"{text}. {settings.warning}" if settings.warning else text
 

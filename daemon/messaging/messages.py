@@ -247,6 +247,7 @@ class Health(Message):
     tasks: Mapping[str, Mapping[str, Scalar | Mapping[str, int]]] = column(
         "", "per task: alive, done, restarts, rate_hz, expected_hz, errors by kind, and the latest error in a sentence"
     )
+    emulated: bool = column("", "whether every device is emulated, by `emulated: true` in the configuration")
     loop_lag_s: float = column("s", "how late the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")
     cpu_percent: float = column("%", "of one core since the message before")

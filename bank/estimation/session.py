@@ -19,7 +19,7 @@ from shearloop.bank.estimation.estimator import NO_ERRORS, OutputModel, Quantity
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.session_state import PaperState, ProcessedFrame, SessionState, SliceState
 from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
-from shearloop.bank.gain import GainCorrection, find_twists
+from shearloop.bank.gain import GainCorrection, find_twists, first_twists
 from shearloop.words import counted
 
 REPEATED_FRAME = ("the board sent the same frame again",)
@@ -144,17 +144,24 @@ class EstimatorSession:
     def adapt(self, torque_nm: FloatArray) -> Adaptation:
         """Correct the gain until the next grip or tare, by torques (n,) measured at `grip_t_s`, NaN where unknown.
 
-        Always starts from the calibration's gain. Raises CalibrationError as `Calibration.correct_gain` does.
+        The first twist after the grip settles the gel and is left out. Always starts from the calibration's gain.
+        Raises CalibrationError as `Calibration.correct_gain` does, and without a second twist.
         """
         calibration, grip, known = self._calibration, self._grip, np.isfinite(torque_nm)
         width = len(calibration.gain_regressor().mean_feature)
-        features = np.array([row for _, row in grip.frames]).reshape(-1, width)[known]
-        adapted, correction = calibration.correct_gain(features, torque_nm[known])
+        features, truth = np.array([row for _, row in grip.frames]).reshape(-1, width)[known], torque_nm[known]
+        settling = first_twists(truth, np.zeros(len(truth), dtype=np.int64))
+        features, truth = features[~settling], truth[~settling]
+        if settling.any() and len(find_twists(truth, float(np.abs(torque_nm[known]).max()))) == 0:
+            raise CalibrationError(
+                "the first twist after a grip settles the gel and shows another gain than the later ones; twist again, "
+                "then adapt"
+            )
+        adapted, correction = calibration.correct_gain(features, truth)
         before, after = (calibration.outputs | grip.adapted)["torque"], adapted.outputs["torque"]
         grip.adapted["torque"] = after
-        rows = np.concatenate(find_twists(torque_nm[known]))
-        truth = torque_nm[known][rows]
-        return Adaptation(correction, *(LoadedFit.of(one, features[rows], truth) for one in (before, after)))
+        rows = np.concatenate(find_twists(truth))
+        return Adaptation(correction, *(LoadedFit.of(one, features[rows], truth[rows]) for one in (before, after)))
 
     def estimate(self, frame: TactileFrame) -> Estimate:
         """Return the estimate of a frame of the calibration's sides.

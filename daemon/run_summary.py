@@ -182,7 +182,7 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
         step.set_point_nm = content["set_point_nm"]
         if content["hold"] and step.held_from_ns is None:
             step.held_from_ns = now_ns
-    if content["stiffness_nm_per_rad"] is not None:
+    if all(content[key] is not None for key in ("stiffness_nm_per_rad", "delay_s", "noise_nm")):
         text = "   stiffness {stiffness_nm_per_rad:.3f} N·m/rad, delay {delay_s:.2f} s, "
         text += "noise of one torque {noise_nm:.4f} N·m"
         run.identified = text.format_map(content)

@@ -102,13 +102,15 @@ class HealthReporter:
     publisher: Publisher
     supervisor: Supervisor
     clock: Clock
+    # Every device is emulated.
+    emulated: bool = False
     reporters: dict[str, Reporter] = field(default_factory=dict)
 
     def tasks(self) -> dict[str, TaskFacts]:
         """Return the present state of each task."""
         gathered: dict[str, TaskFacts] = {name: asdict(record) for name, record in self.supervisor.records.items()}
         for name, reporter in self.reporters.items():
-            gathered[name] = {**gathered.get(name, {}), **reporter.diagnostics()}
+            gathered[name] = {**gathered.get(name, {}), **_facts(reporter)}
         return gathered
 
     def publish_end(self, *, finished: bool, summary: str) -> None:
@@ -140,11 +142,21 @@ class HealthReporter:
                 source="daemon",
                 t_mono_ns=self.clock.now_ns(),
                 tasks=self.tasks(),
+                emulated=self.emulated,
                 loop_lag_s=lag_s,
                 memory_mb=resident_memory_mb(),
                 cpu_percent=100.0 * used_s / passed_s,
             )
             self.publisher.publish(health)
+
+
+def _facts(reporter: Reporter) -> TaskFacts:
+    """Return the values of one part; an error in one hides no other, and the service stays alive."""
+    try:
+        return reporter.diagnostics()
+    except Exception as error:  # noqa: BLE001 - the service stays alive
+        structlog.get_logger().exception("a part of the daemon could not report its state")
+        return {"error": f"its state is unknown: {type(error).__name__}: {error}"[:MAX_ERROR_LENGTH]}
 
 
 def resident_memory_mb() -> float:

@@ -1,12 +1,16 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 import math
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema, model_validator
 
 from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
+from shearloop.drivers import ranges
+from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
+from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S
 from shearloop.yaml_files import shown
 
 MOST_ANGLES = 1000
@@ -32,11 +36,9 @@ def _angles(given: object) -> object:
     return tuple(np.linspace(start, stop, steps).tolist())
 
 
-LARGEST_ANGLE_RAD = 6.28
-Angle = Annotated[float, Field(ge=-LARGEST_ANGLE_RAD, le=LARGEST_ANGLE_RAD)]
-_ANGLE = {"type": "number", "minimum": -LARGEST_ANGLE_RAD, "maximum": LARGEST_ANGLE_RAD}
+_ANGLE = {"type": "number", "minimum": -LARGEST_ANGLE_RAD, "maximum": LARGEST_ANGLE_RAD, "unit": "rad"}
 Angles = Annotated[
-    tuple[Angle, ...],
+    tuple[ranges.Angle, ...],
     Field(min_length=1),
     BeforeValidator(_angles),
     WithJsonSchema(
@@ -50,22 +52,23 @@ Angles = Annotated[
         }
     ),
 ]
-Seconds = Annotated[float, Field(ge=0, le=24 * 3600)]
-TorqueNm = Annotated[float, Field(ge=-5, le=5)]
-PositiveTorqueNm = Annotated[float, Field(gt=0, le=5)]
-WristSpeed = Annotated[float, Field(gt=0, le=3.14, description="speed of the wrist")]
-Pose = tuple[float, float, float, float, float, float]
+
+
+# What some gripper has; the configured model's own ranges are checked with its configuration.
+FingerWidth = Annotated[float, Field(ge=0, le=LARGEST_STROKE_MM)]
+FingerSpeed = Annotated[float, Field(ge=SPEEDS_MM_S[0], le=SPEEDS_MM_S[1])]
+FingerForce = Annotated[float, Field(ge=FORCES_N[0], le=FORCES_N[1])]
 
 
 class ExperimentLimits(ConfigModel):
     """Limits of all steps; a step's limits can only be tighter."""
 
-    torque_nm: PositiveTorqueNm = Field(default=0.5, description="a larger torque stops the motion")
-    angle_rad: Annotated[float, Field(gt=0, le=6.28, description="from the angle at which the tool was gripped")] = 3.2
+    torque_nm: ranges.TorqueLimit = Field(default=0.5, description="a larger torque stops the motion")
+    angle_rad: ranges.Turn = Field(default=3.2, description="from the angle at which the tool was gripped")
 
 
 class _Step(ConfigModel):
-    timeout_s: float | None = Field(None, gt=0, le=24 * 3600, description="a longer step stops the experiment")
+    timeout_s: ranges.Duration | None = Field(None, description="a longer step stops the experiment")
     limits: ExperimentLimits | None = Field(None, description="tighter limits for this step")
 
 
@@ -73,7 +76,7 @@ class ApproachStep(_Step):
     """Move the tool centre in a straight line, to a pose or by a distance along the tool's axis."""
 
     do: Literal["approach"]
-    pose_m_rad: Pose | None = Field(None, description="x, y, z and rotation vector; else `along_tool_m`")
+    pose_m_rad: ranges.Pose | None = Field(None, description="x, y, z and rotation vector; else `along_tool_m`")
     along_tool_m: float | None = Field(None, ge=-0.5, le=0.5, description="along the tool's axis; else `pose_m_rad`")
     speed_m_per_s: float = Field(0.1, gt=0, le=0.5, description="speed of the tool centre")
 
@@ -90,15 +93,16 @@ class GripStep(_Step):
     """Close to a width, or onto an object in between."""
 
     do: Literal["grip"]
-    width_mm: float = Field(0.0, ge=0, le=140, description="width to close to")
-    speed_mm_per_s: float = Field(60.0, ge=30, le=250, description="speed of the fingers")
-    force_n: float = Field(20.0, ge=10, le=125, description="largest force of the fingers")
+    width_mm: FingerWidth = Field(0.0, description="width to close to")
+    speed_mm_per_s: FingerSpeed = Field(60.0, description="speed of the fingers")
+    force_n: FingerForce = Field(20.0, description="largest force of the fingers")
     expect_object: bool = Field(True, description="closing on nothing is an error")
 
 
 def opening(width_mm: float, speed_mm_per_s: float) -> GripStep:
     """Return the step that opens the gripper, with its least force."""
-    content = {"width_mm": width_mm, "speed_mm_per_s": speed_mm_per_s, "force_n": 10.0, "expect_object": False}
+    least_n = FORCES_N[0]
+    content = {"width_mm": width_mm, "speed_mm_per_s": speed_mm_per_s, "force_n": least_n, "expect_object": False}
     return GripStep.model_validate({"do": "grip", **content})
 
 
@@ -129,8 +133,8 @@ class TwistStep(_Step):
     do: Literal["twist"]
     angles_rad: Angles
     absolute: bool = Field(False, description="angles of the wrist joint, not from the angle at the grip")
-    speed_rad_per_s: WristSpeed = 0.2
-    hold_s: Seconds = Field(2.0, description="time at each angle")
+    speed_rad_per_s: ranges.WristSpeed = Field(0.2, description="speed of the wrist")
+    hold_s: ranges.Seconds = Field(2.0, description="time at each angle")
     return_to_start: bool = Field(True, description="turn back after each round")
     repeats: int = Field(1, ge=1, le=1000, description="rounds over all angles")
 
@@ -139,41 +143,64 @@ class TurnToStep(_Step):
     """Turn the wrist joint to an angle, before a tool is gripped."""
 
     do: Literal["turn_to"]
-    angle_rad: float = Field(ge=-6.28, le=6.28, description="angle of the wrist joint")
-    speed_rad_per_s: WristSpeed = 0.4
+    angle_rad: ranges.Angle = Field(description="angle of the wrist joint")
+    speed_rad_per_s: ranges.WristSpeed = Field(0.4, description="speed of the wrist")
+
+
+# Of a turn, for an eye that faces the gripper.
+Direction = Literal["clockwise", "counterclockwise"]
+# One convention for every number of a file, and for recorded angles and torques.
+SIGNS: Mapping[Direction, int] = {"clockwise": -1, "counterclockwise": 1}
+
+
+def direction_of(number: float) -> Direction | None:
+    """Return the direction of an angle or a torque; None for 0."""
+    return None if number == 0 else "clockwise" if number < 0 else "counterclockwise"
 
 
 class HoldTorqueStep(_Step):
     """Ramp the torque to a set point, and hold it in closed loop."""
 
     do: Literal["hold_torque"]
-    torque_nm: TorqueNm = Field(description="the set point; counterclockwise is positive")
+    torque_nm: ranges.TorqueSetpoint = Field(description="the set point; counterclockwise is positive")
+    direction: Direction | None = Field(None, description="of the torque, which then has no sign")
     ramp_nm_per_s: float = Field(0.05, gt=0, le=1, description="rise of the set point")
-    hold_s: Seconds = Field(10.0, description="time at the set point")
+    hold_s: ranges.Seconds = Field(10.0, description="time at the set point")
+
+    @model_validator(mode="after")
+    def _one_sign(self) -> "HoldTorqueStep":
+        if self.direction is not None and self.torque_nm < 0:
+            raise ValueError(f"with `direction`, torque_nm has no sign: write {-self.torque_nm:g}")
+        return self
+
+    @property
+    def signed_torque_nm(self) -> float:
+        """The set point; counterclockwise is positive."""
+        return self.torque_nm if self.direction is None else SIGNS[self.direction] * self.torque_nm
 
 
 class TightenStep(_Step):
     """Turn until a torque or an angle is reached."""
 
     do: Literal["tighten"]
-    until_torque_nm: PositiveTorqueNm = Field(description="the turn ends at this torque")
-    until_angle_rad: float = Field(gt=0, le=6.28, description="the turn ends at this angle")
-    speed_rad_per_s: WristSpeed = 0.05
-    direction: Literal["clockwise", "counterclockwise"] = Field("clockwise", description="direction of the turn")
+    until_torque_nm: ranges.TorqueLimit = Field(description="the turn ends at this torque")
+    until_angle_rad: ranges.Turn = Field(description="the turn ends at this angle")
+    speed_rad_per_s: ranges.WristSpeed = Field(0.05, description="speed of the wrist")
+    direction: Direction = Field(description="of the turn: the thread's, seen by an eye that faces the gripper")
 
 
 class ReleaseStep(_Step):
     """Open the gripper."""
 
     do: Literal["release"]
-    width_mm: float = Field(140.0, ge=0, le=140, description="width to open to")
+    width_mm: FingerWidth = Field(LARGEST_STROKE_MM, description="width to open to; a smaller gripper opens fully")
 
 
 class WaitStep(_Step):
     """Stand still for a time."""
 
     do: Literal["wait"]
-    wait_s: Seconds = Field(description="time to stand still")
+    wait_s: ranges.Seconds = Field(description="time to stand still")
 
 
 # Every step is in one of three groups: it may twist a gripped tool, it may grip another one, or neither.
@@ -195,7 +222,7 @@ class ExperimentFile(ConfigModel):
         "right", description="torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
     )
     limits: ExperimentLimits = Field(ExperimentLimits(), description="limits of all steps")
-    tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
+    tool_mm: float | None = Field(None, gt=0, lt=LARGEST_STROKE_MM, description="diameter of the tool, for recordings")
     slices: Literal["torque", "diameter"] | None = Field(
         None,
         description="kind of slice that `recording export --format slices` makes of each held angle; none by default",
@@ -204,8 +231,10 @@ class ExperimentFile(ConfigModel):
 
     def limits_of(self, step: Step) -> ExperimentLimits:
         """Return the tighter of the experiment's limits and the step's."""
-        own = step.limits or self.limits
-        torque_nm, angle_rad = min(own.torque_nm, self.limits.torque_nm), min(own.angle_rad, self.limits.angle_rad)
+        own = {} if step.limits is None else step.limits.model_dump(exclude_unset=True)
+        whole = self.limits
+        torque_nm = min(own.get("torque_nm", whole.torque_nm), whole.torque_nm)
+        angle_rad = min(own.get("angle_rad", whole.angle_rad), whole.angle_rad)
         # The limits of an outline may be infinite.
         return ExperimentLimits.model_construct(torque_nm=torque_nm, angle_rad=angle_rad)
 
@@ -218,6 +247,53 @@ def first_turn_before_grip(file: ExperimentFile) -> int | None:
         if isinstance(step, TwistingStep | TurnToStep):
             return number
     return None
+
+
+class Reversal(NamedTuple):
+    """A step that turns a held tool back: the numbers, from 1, of it and of the step before, and both directions."""
+
+    number: int
+    direction: Direction
+    before: int
+    direction_before: Direction
+
+
+def reversals(file: ExperimentFile) -> Iterator[Reversal]:
+    """Yield each step that turns the tool against the turn that the steps before have left in this grip."""
+    # The angles since the grip that are possible, and the last turn that was left.
+    low_rad = high_rad = 0.0
+    left: tuple[int, Direction] | None = None
+    for number, step in enumerate(file.steps, 1):
+        turns: Direction | None = None
+        leaves: Direction | None = None
+        match step:
+            case GripStep() | ReleaseStep():
+                left, low_rad, high_rad = None, 0.0, 0.0
+            case TightenStep(direction=direction):
+                turns = leaves = direction
+                low_rad -= step.until_angle_rad if direction == "clockwise" else 0.0
+                high_rad += step.until_angle_rad if direction == "counterclockwise" else 0.0
+            case HoldTorqueStep(signed_torque_nm=torque_nm):
+                turns = leaves = direction_of(torque_nm)
+                low_rad, high_rad = -math.inf, math.inf
+            case TwistStep(absolute=False, angles_rad=angles_rad):
+                turns = _turn_to(angles_rad[0], low_rad, high_rad)
+                if not step.return_to_start:
+                    leaves = _turn_to(angles_rad[-1], low_rad, high_rad)
+                    low_rad = high_rad = angles_rad[-1]
+            case TwistStep() | TurnToStep():
+                low_rad, high_rad = -math.inf, math.inf
+        if turns is not None and left is not None and turns != left[1]:
+            yield Reversal(number, turns, *left)
+        if leaves is not None:
+            left = number, leaves
+
+
+def _turn_to(angle_rad: float, low_rad: float, high_rad: float) -> Direction | None:
+    """Return the direction from any angle between two ends to another angle; None where it is unknown."""
+    if low_rad <= angle_rad <= high_rad and low_rad < high_rad:
+        return None
+    return direction_of(angle_rad - (low_rad if angle_rad < low_rad else high_rad))
 
 
 # A location in an experiment's file, and what is wrong there.
@@ -259,7 +335,7 @@ def _outlined(content: object) -> Step:
 
 def check_steps(file: ExperimentFile) -> list[Mistake]:
     """Return each step that exceeds its limits or its timeout, and the first `hold_torque` on an unidentified tool."""
-    found: list[Mistake] = []
+    found: list[Mistake] = list(_undoing(file))
     identified = False
     for number, step in enumerate(file.steps):
         limits, needs = file.limits_of(step), demand(step)
@@ -282,6 +358,19 @@ def check_steps(file: ExperimentFile) -> list[Mistake]:
                 # One sentence is enough.
                 identified = True
     return found
+
+
+def _undoing(file: ExperimentFile) -> Iterator[Mistake]:
+    """Yield each torque that undoes a `tighten`, where only its sign says so."""
+    for back in reversals(file):
+        step, before = file.steps[back.number - 1], file.steps[back.before - 1]
+        if isinstance(before, TightenStep) and isinstance(step, HoldTorqueStep) and step.direction is None:
+            yield (
+                ("steps", back.number - 1),
+                f"hold_torque turns {back.direction} by the sign of its torque_nm, and undoes step {back.before}, "
+                f"tighten {back.direction_before}; write `direction: {back.direction_before}`, or "
+                f"`direction: {back.direction}` if it is meant",
+            )
 
 
 def _forgets_tool(step: Step, torque_source: str) -> bool:

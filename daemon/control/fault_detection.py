@@ -128,9 +128,8 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, allowed_s: float, t_ns
         )
         return Fault(FaultCode.ESTIMATE_STALE, late, t_ns=latest.t_mid_ns)
     if latest.torque_nm is None and source.measures_torque:
-        return Fault(
-            FaultCode.ESTIMATE_INVALID, f"{source.name} says: {latest.reason or 'nothing'}", t_ns=latest.t_mid_ns
-        )
+        said = f"{source.name} says: {latest.reason}" if latest.reason else f"{source.name} gives no torque"
+        return Fault(FaultCode.ESTIMATE_INVALID, said, t_ns=latest.t_mid_ns)
     return None
 
 

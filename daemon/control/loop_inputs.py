@@ -58,6 +58,7 @@ class TorqueSample:
     def __post_init__(self) -> None:
         """Treat NaN and infinity as no torque."""
         if self.torque_nm is not None and not math.isfinite(self.torque_nm):
+            object.__setattr__(self, "reason", f"it measured {self.torque_nm}, which is no number")
             object.__setattr__(self, "torque_nm", None)
 
 

@@ -32,8 +32,9 @@ class WristController:
         self.source = source
         self.tool: ToolModel | None = None
         self.controller: TorqueController | None = None
-        # The torque set point of the closed loop.
+        # The torque set point of the closed loop, and the limit of its step.
         self.tracked: TrackTorque | None = None
+        self._torque_limit_nm = 0.0
         self._config = config
         self._held = False
         # Torques wait for the next angle.
@@ -83,6 +84,10 @@ class WristController:
                 self._pending.clear()
                 return command
 
+    def tracks(self, setpoint: TrackTorque, torque_limit_nm: float) -> bool:
+        """Return whether the loop is closed on this set point, within this limit."""
+        return (self.tracked, self._torque_limit_nm) == (setpoint, torque_limit_nm)
+
     def close_loop(self, setpoint: TrackTorque, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> str | None:
         """Track a torque with the identified tool; return None, or why it cannot be tracked."""
         tool = self.tool
@@ -95,7 +100,7 @@ class WristController:
             here_nm = tool.torque_nm + tool.stiffness_nm_per_rad * (wrist_rad - tool.angle_rad)
             self.controller = TorqueController(settings, t_ns, wrist_rad, here_nm, tool.known_measurements)
         self.controller.set_point(setpoint.torque_nm, settings)
-        self.tracked = setpoint
+        self.tracked, self._torque_limit_nm = setpoint, torque_limit_nm
         return None
 
     def begin_identification(self, action: IdentifyStep, torque_limit_nm: float) -> None:

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
+import structlog
 import zmq
 import zmq.asyncio
 
@@ -12,7 +13,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_map
-from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.daemon.messaging.refusals import Refusals, is_logged
 
 # Messages kept for a slow subscriber. It loses later ones; others are not delayed.
 HIGH_WATER_MARK = 1000
@@ -25,6 +26,8 @@ MAX_UNKNOWN_TOPICS = 16
 LINGER_MS = 200
 # Subscriptions read at a time, so that a subscriber that keeps changing them cannot block the publisher.
 SUBSCRIPTIONS_AT_ONCE = 8
+# The kind of error in `health` of a listener that raised an exception.
+LISTENER_FAILED = "listener failed"
 Listener: TypeAlias = Callable[[str, dict[str, Any]], None]
 
 
@@ -38,7 +41,8 @@ class Publisher:
         """Bind the socket; raises UserError if the address is in use, malformed, or needs keys."""
         self._clock = clock
         self._next_seq: Counter[tuple[str, str]] = Counter()
-        self._listeners: list[Listener] = []
+        # Each with whether its errors are raised.
+        self._listeners: list[tuple[Listener, bool]] = []
         # Topic beginnings that have subscribers.
         self._prefixes: tuple[bytes, ...] = ()
         # Topics that do not exist and have subscribers.
@@ -67,12 +71,16 @@ class Publisher:
                 await asyncio.sleep(0)
 
     def diagnostics(self) -> Mapping[str, Mapping[str, int]]:
-        """Return the refused subscribers for `health`."""
+        """Return the refused subscribers and the listeners' errors for `health`."""
         return self._refusals.diagnostics()
 
-    def add_listener(self, listener: Listener) -> None:
-        """Call `listener` with topic and content of each message from now on."""
-        self._listeners.append(listener)
+    def add_listener(self, listener: Listener, *, raises: bool = False) -> None:
+        """Call `listener` with topic and content of each message from now on.
+
+        Its errors are logged and counted: they do not end the task that publishes. With `raises` they end it, for a
+        command that has no use without the listener.
+        """
+        self._listeners.append((listener, raises))
 
     def publish(self, message: Message) -> None:
         """Stamp, number and send one message."""
@@ -86,8 +94,20 @@ class Publisher:
         """Send the map of a message that is stamped and numbered already."""
         if self.has_subscriber(topic):
             self._socket.send_multipart([topic.encode(), encode(content)], zmq.NOBLOCK)
-        for listener in self._listeners:
-            listener(topic, content)
+        for listener, raises in self._listeners:
+            try:
+                listener(topic, content)
+            except Exception:
+                if raises:
+                    raise
+                self._on_listener_error(topic)
+
+    def _on_listener_error(self, topic: str) -> None:
+        """Count the present exception, and log it at counts 1, 10, 100 and so on."""
+        self._refusals.counts[LISTENER_FAILED] += 1
+        count = self._refusals.counts[LISTENER_FAILED]
+        if is_logged(count):
+            structlog.get_logger().exception("a listener of the messages failed", topic=topic, count=count)
 
     def has_subscriber(self, topic: str) -> bool:
         """Return whether there is a subscriber to this topic."""

@@ -7,6 +7,11 @@ from dataclasses import dataclass, field
 import structlog
 
 
+def is_logged(count: int) -> bool:
+    """Return whether the event of this number is logged, of those that are frequent: 1, 10, 100 and so on."""
+    return str(count).strip("0") == "1"
+
+
 @dataclass(frozen=True, slots=True)
 class Refusals:
     """Numbers of refused requests and clients, by kind."""
@@ -17,7 +22,7 @@ class Refusals:
         """Count and log a refusal; a frequent kind is logged at counts 1, 10, 100 and so on."""
         self.counts[kind] += 1
         count = self.counts[kind]
-        if not frequent or str(count).strip("0") == "1":
+        if not frequent or is_logged(count):
             structlog.get_logger().warning("refused", reason=reason, count=count)
 
     def diagnostics(self) -> Mapping[str, Mapping[str, int]]:

@@ -8,22 +8,24 @@ from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 
 import numpy as np
+import structlog
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Adaptation, Estimate, Measured, torque_at
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
+from shearloop.errors import ActionError
+from shearloop.estimation import Adaptation, Estimate, Measured, torque_at
 from shearloop.words import counted
 
 # Largest distance in time of a pair of frames, as a share of the frame period.
@@ -145,14 +147,16 @@ class FingertipPipeline:
                 try:
                     self._adapt(reference, frames, now_ns)
                     ended.set_result(None)
-                except CalibrationError as error:
+                except Exception as error:  # noqa: BLE001 - it fails the step, and the frames go on
                     ended.set_exception(error)
         estimate = await self.estimator.estimate(*frames)
         now_ns = self.clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
         if self.loop is not None:
             t_mid_ns = message.t_mono_ns - round(1e9 * estimate.lag_s)
-            self.loop.on_torque(TorqueSample(self.name, estimate.torque_nm, message.reason, t_mid_ns, now_ns))
+            # An estimate is valid also with a diameter alone.
+            reason = message.reason or self.estimator.session.why_no_torque
+            self.loop.on_torque(TorqueSample(self.name, estimate.torque_nm, reason, t_mid_ns, now_ns))
         if self.gripper is not None:
             self.gripper.diameters.update(self.name, estimate, now_ns)
         self.publisher.publish(message)
@@ -232,6 +236,23 @@ class CombinedFingertips:
         return {"expected_hz": 1.0 / self._period_s, "estimates": self.pipeline.count}
 
 
+class DeadElectrodes:
+    """What the dead channels of the latest frame have in common; each electrode is logged once."""
+
+    def __init__(self) -> None:
+        # Of the latest frame; empty without a dead electrode.
+        self.sentence = ""
+        self._logged: set[str] = set()
+
+    def update(self, source: str, table: ChannelTable, dead: BoolArray) -> None:
+        """Take the (c,) dead channels of a frame."""
+        names = table.name_dead(dead) if dead.any() else []
+        self.sentence = f"dead channels: {', '.join(names)}; press its connector on, and wet the gel" if names else ""
+        if not self._logged.issuperset(names):
+            self._logged.update(names)
+            structlog.get_logger().bind(device=source).warning(self.sentence)
+
+
 @dataclass(frozen=True, slots=True)
 class FingertipTask:
     """Reads one board, estimates from each frame, and publishes both; `combined` also needs the frames."""
@@ -241,6 +262,7 @@ class FingertipTask:
     publisher: Publisher
     combined: CombinedFingertips | None = None
     always_heatmap: bool = False
+    dead_electrodes: DeadElectrodes = field(default_factory=DeadElectrodes)
 
     async def run(self) -> None:
         """Process every frame until cancelled."""
@@ -257,16 +279,18 @@ class FingertipTask:
         if self.combined is not None:
             await self.combined.process_pairs()
         self.publisher.publish(frame_message(self.pipeline.name, frame))
+        self.dead_electrodes.update(self.pipeline.name, self.pipeline.estimator.table, frame.dead)
         if self.always_heatmap or self.publisher.has_subscriber(EitHeatmap.topic):
             await self._publish_heatmap(frame)
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
         board = self.board.diagnostics()
+        errors = (self.dead_electrodes.sentence, str(board["last_refusal"]))
         return {
             **board,
             "rate_hz": board["measured_hz"],
-            "error": board["last_frame_error"] if board["connected"] else board["last_loss"],
+            "error": "; ".join(filter(None, errors)) if board["connected"] else board["last_loss"],
             "estimates": self.pipeline.count,
         }
 

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic_core import to_json
 
-from shearloop.bank.eit.matching import best_match
-from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import MatchingError
+from shearloop.bank.matching import best_match
+from shearloop.bank.models import MODELS
 from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, DaemonEnd, EitEstimate, EitHeatmap
 
 # Pairs of topic and source. A rig has nine topics and two fingertips.

@@ -24,8 +24,7 @@ import zmq
 import zmq.asyncio
 from aiohttp import WSCloseCode, web
 
-from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.daemon.errors import UserError
+from shearloop.bank.fingertip import Fingertip
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.client import ask, connect
@@ -34,6 +33,7 @@ from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.message_store import MessageStore
+from shearloop.errors import UserError
 
 HOST = "127.0.0.1"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})

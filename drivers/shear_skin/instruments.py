@@ -389,6 +389,8 @@ class ScpiScanner(PolledInstrument[Voltages]):
 class PairParser(LineParser[Voltages]):
     """Turns a converter board's bytes into voltages."""
 
+    board = "skin's converter board"
+
     def __init__(self, rate_hz: float = DAQ_RATE_HZ, full_scale_v: float = ADC_FULL_SCALE_V) -> None:
         super().__init__(_PAIR, MAX_PAIR_BYTES, ADC_BAUD, rate_hz)
         self._end_v = _END_OF_RANGE * full_scale_v
@@ -415,12 +417,12 @@ class AdcBoard(SerialSensor[Voltages]):
         inputs: InputRecorder | None = None,
     ) -> None:
         self.period_s = 1.0 / rate_hz
-        self._parser = PairParser(rate_hz, full_scale_v)
-        super().__init__(link, self.period_s, self._parser.handle, inputs)
+        self._pair_parser = PairParser(rate_hz, full_scale_v)
+        super().__init__(link, self.period_s, self._pair_parser, inputs)
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        return {**super().diagnostics(), "lines": self._parser.count, "errors": self._parser.errors}
+        return {**super().diagnostics(), "lines": self._pair_parser.count, "errors": self._pair_parser.errors}
 
 
 Daq: TypeAlias = ScpiScanner | AdcBoard

@@ -125,6 +125,8 @@ class MotionExecutor:
                 return f"The arm is still stopping ({self.end_reason})."
             case WristSpeed(), _Move():
                 return "A linear move is under way: stop it."
+            case MoveLinear(pose), _ if outside := self._settings.limits.workspace.why_outside(pose[:3]):
+                return f"The linear move's end at {outside}."
             case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:
                 return "A linear move needs a speed and an acceleration above 0."
             case MoveLinear(), motion if isinstance(motion, _Move | _Braking) or not sample.rests:
@@ -343,24 +345,13 @@ def clip_stop(asked: float, sample: RtdeSample, settings: UrSettings) -> float:
 
 
 def clip_linear(asked: MoveLinear, limits: UrLimits) -> tuple[MoveLinear, tuple[str, ...]]:
-    """Return the linear move within the inner workspace, speed and acceleration, and each reason for a change.
-
-    The box is convex: a line between two points inside it stays inside.
-    """
-    box = limits.workspace
+    """Return the linear move within the inner speed and acceleration, and each reason for a change."""
     reasons: list[str] = []
-    position = []
-    for axis, value, low, high in zip("xyz", asked.pose[:3], box.lower_m, box.upper_m, strict=True):
-        inside = min(max(value, low + box.margin_m), high - box.margin_m)
-        if inside != value:
-            reasons.append(f"{axis} = {value:.4f} m is outside the workspace; its edge is {inside:.4f} m")
-        position.append(inside)
     speed = _at_most(asked.speed_m_per_s, limits.linear_speed_m_per_s, "linear speed", reasons)
     acceleration = _at_most(
         asked.acceleration_m_per_s2, limits.linear_acceleration_m_per_s2, "linear acceleration", reasons
     )
-    x, y, z = position
-    return MoveLinear((x, y, z, *asked.pose[3:]), speed, acceleration), tuple(reasons)
+    return MoveLinear(asked.pose, speed, acceleration), tuple(reasons)
 
 
 def is_recent(sample: RtdeSample, settings: UrSettings) -> bool:
@@ -382,9 +373,10 @@ def why_unfit(sample: RtdeSample, settings: UrSettings) -> str:
     if sample.emergency_stop:
         return "Emergency stop: make the cell safe, release the button, then unlock."
     if sample.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
-        return _SAFETY.get(sample.safety_mode, f"The robot's safety system is in mode {sample.safety_mode}.")
+        other = f"The robot's safety system is in the mode “{sample.safety_mode_name}”: look at the teach pendant."
+        return _SAFETY.get(sample.safety_mode, other)
     if sample.robot_mode != ROBOT_MODE_RUNNING:
-        return f"The arm is not powered and released (robot mode {sample.robot_mode}): unlock to power it."
+        return f"The arm is not powered and released (robot mode: {sample.robot_mode_name}): unlock to power it."
     if sample.program_paused:
         return (
             "A program on the robot is paused, and goes on with what it did when it is resumed: stop it at the teach "
@@ -403,6 +395,12 @@ _SAFETY = {
     5: "A safeguard stop holds the robot: close the safeguard, then unlock.",
     8: "The robot's safety system reports a violation: restart it at the teach pendant.",
     9: "The robot's safety system reports a fault: restart the controller.",
+    10: "The robot validates a joint: follow the teach pendant, and restart the robot.",
+    12: "A safeguard stop of the automatic mode holds the robot: close the safeguard, reset it, then unlock.",
+    13: (
+        "The three-position enabling device holds the robot: hold it in its middle position, or select the automatic "
+        "mode, then unlock."
+    ),
 }
 
 

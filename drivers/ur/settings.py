@@ -10,21 +10,14 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
+from shearloop.drivers import ranges
 from shearloop.drivers.errors import DriverError
 
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
 
-# rtde_control_interface.h of ur-rtde 1.6: UR_JOINT_VELOCITY_MAX and its neighbours.
-_CLIENT_BOUNDS = {
-    "wrist_speed_rad_per_s": 3.14,
-    "wrist_acceleration_rad_per_s2": 40.0,
-    "linear_speed_m_per_s": 3.0,
-    "linear_acceleration_m_per_s2": 150.0,
-}
 # For so long the arm may move without its daemon.
 _Deadline = Annotated[float, Field(gt=0, le=1)]
-_Positive = Annotated[float, Field(gt=0)]
 # The wrist stands this long after the last decision (docs/safety.md).
 _PROMISED_S = 0.2
 
@@ -40,7 +33,7 @@ class _Checked:
 class Bound(_Checked):
     """A limit: commands stay at or below `inner`, measured values below `hard`."""
 
-    inner: _Positive
+    inner: float
     """Commands are clipped to it."""
     hard: float
     """A measured value beyond it stops the motion."""
@@ -52,14 +45,74 @@ class Bound(_Checked):
 
 
 @dataclass(frozen=True, slots=True)
+class WristSpeedBound(Bound):
+    """Limits on the wrist's speed."""
+
+    inner: ranges.WristSpeed
+    """Commands are clipped to it."""
+    hard: ranges.MeasuredWristSpeed
+    """A faster joint stops the motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class WristAccelerationBound(Bound):
+    """Limits on the wrist's acceleration."""
+
+    inner: ranges.WristAcceleration
+    """Commands are clipped to it."""
+    hard: ranges.WristAcceleration
+    """A larger measured value stops the motion; a stop brakes up to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedBound(Bound):
+    """Limits on the tool's speed."""
+
+    inner: ranges.Speed
+    """Commands are clipped to it."""
+    hard: ranges.MeasuredSpeed
+    """A faster tool stops the motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class AccelerationBound(Bound):
+    """Limits on the tool's acceleration."""
+
+    inner: ranges.Acceleration
+    """Commands are clipped to it."""
+    hard: ranges.Acceleration
+    """A larger measured value stops the motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForceBound(Bound):
+    """Limits on the force on the tool."""
+
+    inner: ranges.ToolForce
+    """From it on the wrist turns slower, and a straight move stops."""
+    hard: ranges.ToolForce
+    """A larger measured value stops the motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueBound(Bound):
+    """Limits on the torque on the tool."""
+
+    inner: ranges.ToolTorque
+    """From it on the wrist turns slower, and a straight move stops."""
+    hard: ranges.ToolTorque
+    """A larger measured value stops the motion."""
+
+
+@dataclass(frozen=True, slots=True)
 class JointRange(_Checked):
     """The hard ends of each joint's range in rad, and the margin that commands keep from them."""
 
-    lower_rad: Six
+    lower_rad: ranges.Joints
     """Lowest angle of each joint."""
-    upper_rad: Six
+    upper_rad: ranges.Joints
     """Highest angle of each joint."""
-    margin_rad: _Positive
+    margin_rad: ranges.AngleMargin
     """Distance that commands keep from both."""
 
     def __post_init__(self) -> None:
@@ -71,16 +124,28 @@ class JointRange(_Checked):
 class Workspace(_Checked):
     """The box for the tool centre point in m, in the base frame, and the margin that commands keep from its faces."""
 
-    lower_m: Three
+    lower_m: ranges.Position
     """Lowest x, y and z of the tool centre point in the base frame."""
-    upper_m: Three
+    upper_m: ranges.Position
     """Highest x, y and z."""
-    margin_m: _Positive
+    margin_m: ranges.CoordinateMargin
     """Distance that commands keep from both."""
 
     def __post_init__(self) -> None:
         """Refuse a box without room between the margins."""
         _check_range(self.lower_m, self.upper_m, self.margin_m)
+
+    def why_outside(self, position_m: Three) -> str:
+        """Return which coordinate of a tool centre point commands may not reach, with its bounds, or an empty string.
+
+        The box is convex: a straight line between two points inside stays inside.
+        """
+        for axis, value, low, high in zip("xyz", position_m, self.lower_m, self.upper_m, strict=True):
+            lowest, highest = low + self.margin_m, high - self.margin_m
+            if not lowest <= value <= highest:
+                box = f"{lowest:g} to {highest:g} m with its margin"
+                return f"{axis} = {value:g} m is outside the robot's workspace, {box}"
+        return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,38 +156,29 @@ class UrLimits(_Checked):
     """Range of each joint."""
     workspace: Workspace
     """Box for the tool centre point."""
-    wrist_speed_rad_per_s: Bound
+    wrist_speed_rad_per_s: WristSpeedBound
     """Speed of the last joint."""
-    wrist_acceleration_rad_per_s2: Bound
+    wrist_acceleration_rad_per_s2: WristAccelerationBound
     """Acceleration of the last joint."""
-    linear_speed_m_per_s: Bound
+    linear_speed_m_per_s: SpeedBound
     """Speed of the tool centre point."""
-    linear_acceleration_m_per_s2: Bound
+    linear_acceleration_m_per_s2: AccelerationBound
     """Acceleration of the tool centre point."""
-    force_n: Bound
+    force_n: ForceBound
     """Force on the tool centre point."""
-    torque_nm: Bound
+    torque_nm: TorqueBound
     """Torque on the tool centre point."""
-
-    def __post_init__(self) -> None:
-        """Refuse what ur-rtde would: it raises on a command beyond its own bounds, which would end the worker."""
-        for name, largest in _CLIENT_BOUNDS.items():
-            bound = getattr(self, name)
-            # A stop brakes up to the hard limit of acceleration.
-            value = bound.hard if "acceleration" in name else bound.inner
-            if value > largest:
-                raise ValueError(f"{name}: {value:g} is more than ur-rtde takes, which is {largest:g}")
 
 
 @dataclass(frozen=True, slots=True)
 class InstalledTool(_Checked):
     """Payload and tool centre point that the pendant must have for motion; a key that is absent is not compared."""
 
-    payload_kg: Annotated[float, Field(ge=0)] | None = None
+    payload_kg: ranges.Payload | None = None
     """Mass of the load."""
-    payload_cog_m: Three | None = None
+    payload_cog_m: ranges.ToolCentre | None = None
     """Centre of gravity of the load, from the flange."""
-    tcp_offset: Six | None = None
+    tcp_offset: ranges.ToolOffset | None = None
     """Tool centre point from the flange: position in m, rotation vector in rad."""
 
 
@@ -136,9 +192,9 @@ class UrSettings(_Checked):
     """Limits on commands and on measured states."""
     tool: InstalledTool = InstalledTool()
     """What the pendant must have for motion."""
-    rate_hz: _Positive = 125.0
+    rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
     """Robot states per second."""
-    watchdog_hz: Annotated[float, Field(ge=1)] = 10.0
+    watchdog_hz: Annotated[float, Field(ge=1, le=150)] = 10.0
     """The robot ends its program when it receives nothing for 1/watchdog_hz."""
     command_timeout_s: _Deadline = 0.1
     """A wrist speed holds for this long after it was decided; then the wrist stops."""

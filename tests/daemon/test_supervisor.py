@@ -5,7 +5,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from shearloop.daemon import supervisor
-from shearloop.daemon.supervisor import Supervisor, restart_pause_s
+from shearloop.daemon.supervisor import HealthReporter, Supervisor, restart_pause_s
 
 
 def test_pauses_double_from_half_a_second_to_half_a_minute():
@@ -67,3 +67,15 @@ async def test_a_task_that_dies_of_being_cancelled_is_not_started_again(monkeypa
     with capture_logs() as logs, pytest.raises(asyncio.CancelledError):
         await task
     assert [entry["event"] for entry in logs] == ["the task crashed while it was cancelled"]
+
+
+def test_a_part_that_cannot_report_hides_no_other():
+    def fail() -> None:
+        raise ZeroDivisionError("no rate yet")
+
+    health = HealthReporter(None, Supervisor(), None)
+    health.reporters.update(right=SimpleNamespace(diagnostics=fail), left=SimpleNamespace(diagnostics=lambda: {"n": 3}))
+    assert health.tasks() == {
+        "right": {"error": "its state is unknown: ZeroDivisionError: no rate yet"},
+        "left": {"n": 3},
+    }

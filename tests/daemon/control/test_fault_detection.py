@@ -69,6 +69,12 @@ def test_a_driving_sensor_whose_torque_is_void_is_named_too():
     assert "right says: no signal" in events[FaultCode.ESTIMATE_INVALID]
 
 
+def test_a_torque_that_is_missing_without_a_reason_is_not_quoted():
+    assert "right gives no torque." in found(torque(EIT, None), torque(LOAD, 0.1))[FaultCode.ESTIMATE_INVALID]
+    no_number = found(torque(EIT, float("nan")), torque(LOAD, 0.1))
+    assert "right says: it measured nan, which is no number." in no_number[FaultCode.ESTIMATE_INVALID]
+
+
 def test_what_measures_no_torque_is_watched_for_silence_alone():
     left = TorqueSource(name="left", period_s=0.5412, measures_torque=False)
     heard = torque(EIT, 0.1), torque(LOAD, 0.1)

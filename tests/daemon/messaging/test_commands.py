@@ -12,15 +12,15 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.cli.command import COMMANDS
+from shearloop.cli.command import COMMANDS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, CommandServer, RequestExecutor
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.errors import UserError
 from tests.running import running
 
 

@@ -8,17 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Estimate
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
-from shearloop.daemon.errors import ActionError
+from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
+from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, DeadElectrodes, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.errors import ActionError
+from shearloop.estimation import Estimate
 from tests.running import running
 
 MS = 1_000_000
@@ -52,6 +54,8 @@ class FakeEstimator:
 
     taring = False
     reason = "nothing"
+    table = PAPER_TABLE
+    why_no_torque = ""
 
     def __init__(self, fails: int = -1, waits: int = -1) -> None:
         self.fails, self.waits = fails, waits
@@ -131,6 +135,19 @@ async def test_each_frame_is_estimated_and_then_published_in_order():
     assert publisher.messages == expected
 
 
+async def test_the_loop_is_told_why_a_valid_estimate_has_no_torque():
+    class DiameterAlone(FakeEstimator):
+        why_no_torque = "there is no torque without the tool's diameter"
+
+        async def estimate(self, *_frames: Frame) -> Estimate:
+            return Estimate(valid=True, diameter_mm=20.0, diameter_low_mm=18.0, diameter_high_mm=22.0)
+
+    heard: list[TorqueSample] = []
+    loop = SimpleNamespace(on_torque=heard.append)
+    await estimates("right", RecordingPublisher(), DiameterAlone(), loop=loop).process(frame(0))
+    assert [(one.torque_nm, one.reason) for one in heard] == [(None, "there is no torque without the tool's diameter")]
+
+
 async def test_an_error_of_the_estimator_ends_the_task():
     with pytest.raises(ZeroDivisionError):
         await fingertip(RecordingPublisher(), FakeEstimator(fails=0)).run()
@@ -175,6 +192,23 @@ async def test_a_gain_that_no_twist_shows_is_left_with_the_reason():
     await asyncio.sleep(0)
     await task.process(frame(1))
     with pytest.raises(ActionError, match="right against load_cell: no twist in 0 frames"):
+        await adapting
+    assert publisher.messages == [("eit.estimate", "right", 1)]
+
+
+async def test_a_correction_that_crashes_fails_its_step_and_not_the_fingertip():
+    class Crashing(FakeEstimator):
+        grip_t_s = np.zeros(0)
+
+        def adapt(self, _torque_nm: np.ndarray) -> None:
+            raise np.linalg.LinAlgError("singular matrix")
+
+    publisher = RecordingPublisher()
+    task = estimates("right", publisher, Crashing())
+    adapting = asyncio.create_task(task.adapt("load_cell"))
+    await asyncio.sleep(0)
+    await task.process(frame(1))
+    with pytest.raises(np.linalg.LinAlgError):
         await adapting
     assert publisher.messages == [("eit.estimate", "right", 1)]
 
@@ -232,3 +266,14 @@ async def test_tare_that_times_out_says_why_its_frames_were_refused():
 
 def test_the_configured_frame_period_is_the_boards():
     assert FingertipConfig.model_fields["frame_period_s"].default == FRAME_PERIOD_S
+
+
+def test_health_and_log_name_the_electrode_whose_channels_are_dead(log):
+    own, electrode = DeadElectrodes(), (PAPER_TABLE.electrodes == 5).any(axis=1)
+    for dead in (NONE, electrode, NONE, electrode):
+        own.update("right", PAPER_TABLE, dead)
+        assert bool(own.sentence) == bool(dead.any())
+    assert "56 channels of electrode 5 (pin 6)" in own.sentence
+    assert log.said == [own.sentence]
+    own.update("right", PAPER_TABLE, np.arange(896) == 500)
+    assert own.sentence == ""

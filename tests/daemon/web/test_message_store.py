@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.models import conductivity as conductivity_of_mesh
+from shearloop.bank.models import conductivity as conductivity_of_mesh
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.web.message_store import HEIGHTS, MAX_STREAMS, MessageStore, conductivity_profile, page_json
-from tests.bank.conftest import small_fingertip
+from tests.fixtures.physics import small_fingertip
 
 
 def message(source: str = "right", **content: Any) -> dict[str, Any]:

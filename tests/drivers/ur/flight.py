@@ -8,18 +8,19 @@ import pytest
 
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur import messages
+from shearloop.drivers.ur import settings as ur
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, UrSettings, Workspace
+from shearloop.drivers.ur.settings import JointRange, UrLimits, UrSettings, Workspace
 
 LIMITS = UrLimits(
     joints=JointRange((-6.0, -6.0, -3.0, -6.0, -6.0, -2.0), (6.0, 6.0, 3.0, 6.0, 6.0, 2.0), 0.1),
     workspace=Workspace((-0.8, -0.8, 0.0), (0.8, 0.8, 0.9), 0.02),
-    wrist_speed_rad_per_s=Bound(0.8, 1.0),
-    wrist_acceleration_rad_per_s2=Bound(4.0, 8.0),
-    linear_speed_m_per_s=Bound(0.1, 0.15),
-    linear_acceleration_m_per_s2=Bound(0.5, 1.0),
-    force_n=Bound(40.0, 60.0),
-    torque_nm=Bound(4.0, 6.0),
+    wrist_speed_rad_per_s=ur.WristSpeedBound(0.8, 1.0),
+    wrist_acceleration_rad_per_s2=ur.WristAccelerationBound(4.0, 8.0),
+    linear_speed_m_per_s=ur.SpeedBound(0.1, 0.15),
+    linear_acceleration_m_per_s2=ur.AccelerationBound(0.5, 1.0),
+    force_n=ur.ForceBound(40.0, 60.0),
+    torque_nm=ur.TorqueBound(4.0, 6.0),
 )
 SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS, command_timeout_s=0.3, silence_timeout_s=0.3)
 AT_REST = messages.RtdeSample(
@@ -70,6 +71,9 @@ class FakeArm:
         self.accepts = True
         self.stops_moves = True
         self.unlockable = self.stoppable = True
+        # The controller's words against a request: of an error, and of an answer that may be ignored.
+        self.refuses: dict[str, str] = {}
+        self.ignores: dict[str, str] = {}
         self.stale_command = False
         self._resumed_target = 0.0
         self._watched = False
@@ -155,8 +159,12 @@ class FakeArm:
         self.note("zero_wrench")
         return True
 
-    def ask_dashboard(self, *requests: str) -> None:
+    def ask_dashboard(self, *requests: str) -> str:
         self.calls.append(requests[0])
+        if requests[0] in self.refuses:
+            raise DriverError(self.refuses[requests[0]])
+        if requests[0] in self.ignores:
+            return self.ignores[requests[0]]
         match requests[0]:
             case "unlock protective stop":
                 if not self.unlockable:
@@ -170,6 +178,7 @@ class FakeArm:
                 if not self.stoppable:
                     raise DriverError("the dashboard does not answer")
                 self.end_program()
+        return ""
 
     def upload(self) -> bool:
         self.calls.append("upload")

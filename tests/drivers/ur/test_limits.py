@@ -81,18 +81,30 @@ poses = st.tuples(*[anything] * 3, *[st.floats(-math.pi, math.pi)] * 3)
 
 
 @given(st.builds(MoveLinear, poses, above_0, above_0))
-def test_linear_move_ends_within_the_workspace_and_reports_clipping(asked):
+def test_a_linear_move_keeps_its_end_and_reports_a_slower_speed(asked):
     sent, reasons = clip_linear(asked, LIMITS)
-    box = LIMITS.workspace
-    for value, low, high in zip(sent.pose[:3], box.lower_m, box.upper_m, strict=True):
-        assert low + box.margin_m <= value <= high - box.margin_m
-    assert sent.pose[3:] == asked.pose[3:]
+    assert sent.pose == asked.pose
     assert sent.speed_m_per_s <= LIMITS.linear_speed_m_per_s.inner
     assert sent.acceleration_m_per_s2 <= LIMITS.linear_acceleration_m_per_s2.inner
-    before = (*asked.pose, asked.speed_m_per_s, asked.acceleration_m_per_s2)
-    after = (*sent.pose, sent.speed_m_per_s, sent.acceleration_m_per_s2)
+    before = (asked.speed_m_per_s, asked.acceleration_m_per_s2)
+    after = (sent.speed_m_per_s, sent.acceleration_m_per_s2)
     changes = sum(a != b for a, b in zip(before, after, strict=True))
     assert len(reasons) == changes
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2), st.floats(-1e300, 1e300) | st.floats(-1, 1))
+@example(2, 488.0)
+@example(0, 1e300)
+def test_a_linear_move_that_ends_outside_the_workspace_is_refused_and_moves_nothing(axis, value):
+    flight, box = flying(), LIMITS.workspace
+    pose = tuple(value if index == axis else here for index, here in enumerate(POSE))
+    inside = box.lower_m[axis] + box.margin_m <= value <= box.upper_m[axis] - box.margin_m
+    reply = flight.ask(MoveLinear(pose, 0.1, 0.1))
+    assert reply.accepted == inside
+    assert inside or f"{'xyz'[axis]} = {value:g} m is outside the robot's workspace" in reply.refusal
+    assert inside or flight.state.motion == "idle"
+    assert not inside or reply.sent.pose == pose
 
 
 def six(index: int, value: float) -> tuple[float, ...]:

@@ -1,0 +1,312 @@
+"""Gain of a torque: how much it changes between recordings, and its correction by twists of known torque.
+
+The same twist moves the gel differently in another grip, so the estimates of a recording have an error in common that
+grows with the torque. Its size is a random effect: estimated where several recordings were given, with a prior that
+counts as some recordings more. A correction is a regression with that prior (empirical Bayes): one twist moves the
+gain only as far as twists of one recording agree.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import TWO_SIDED_95
+
+# Standard deviation of the logarithm of one fingertip's gain between recordings, and the recordings that it counts as.
+# Cylinders and days recorded twice differ by factors of 0.44 to 1.4.
+PRIOR_SPREAD, _PRIOR_RECORDINGS = 0.28, 3
+# The same of the first twist after a grip against the later ones, and the grips that its mean of 0 counts as.
+FIRST_SPREAD, _PRIOR_GRIPS = 0.2, 1
+# The same of a tool that was not calibrated, against the law over the diameter: a factor of 4 either way.
+TOOL_SPREAD = 0.7
+# Twists of a recording differ at least by this; a few alike are chance.
+_LEAST_WITHIN = 0.05
+_LEAST_NOISE, _LEAST_ZERO = 1e-3, 1e-6
+# The gain drifts while the gel settles, so successive twists deviate alike from the later ones, by this share of the
+# variance; more twists do not average it away.
+_ALIKE = 0.8
+# Furthest diameter beyond the calibrated ones, as a ratio.
+_REACH = 1.5
+# A frame is loaded above this share of the largest torque.
+LOADED_SHARE = 0.1
+# A correction that leaves more than this share of the spread before it says nothing.
+_MOST_LEFT = 0.95
+# Damping of the first step, the most steps, and the square of a step, in standard errors, that changes nothing.
+_FIRST_DAMPING, _MOST_STEPS, _SETTLED = 1e-3, 200, 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class GainSpread:
+    """Standard deviations of the gain's logarithm, and of the rest of a loaded frame's error in N·m.
+
+    `between` is of one grip to the next, and as certain as from this number of `recordings`; `within` is of twists
+    of one grip. The first twist after a grip differs from the later ones by `first`, with the deviation `first_spread`.
+    `zero` is of the torque without motion, as a share of the load: 0 for the calibration's tool.
+    """
+
+    between: float = 0.0
+    within: float = _LEAST_WITHIN
+    noise_nm: float = 0.0
+    recordings: int = _PRIOR_RECORDINGS
+    zero: float = 0.0
+    first: float = 0.0
+    first_spread: float = FIRST_SPREAD
+
+    @classmethod
+    def fit(
+        cls,
+        predicted: FloatArray,
+        truth: FloatArray,
+        grips: IntArray,
+        is_first: BoolArray,
+        left_out: Sequence[float],
+        fingertips: int,
+    ) -> Self:
+        """Return the spread from (n,) predictions of left-out frames and their truth, in the order of time.
+
+        `grips` are the number of each one's grip, `is_first` whether it belongs to the grip's first twist, `left_out`
+        logarithms of the gains of grips that were left out of the fit. The fingertips share the prior.
+        """
+        root = math.sqrt(fingertips)
+        noise: list[FloatArray] = []
+        firsts: list[float] = []
+        squares, freedom = 0.0, 0
+        for own in (np.flatnonzero(grips == one) for one in np.unique(grips)):
+            twists = [own[rows] for rows in find_twists(truth[own])]
+            gains = [log_gain(predicted[rows], truth[rows]) for rows in twists]
+            noise += [
+                truth[rows] - (0.0 if gain is None else math.exp(gain)) * predicted[rows]
+                for rows, gain in zip(twists, gains, strict=True)
+            ]
+            # A tool's own gain is not a difference between twists, so each grip counts from its own mean.
+            known = [
+                (gain, bool(is_first[rows[0]])) for gain, rows in zip(gains, twists, strict=True) if gain is not None
+            ]
+            if later := [gain for gain, first in known if not first]:
+                mean = float(np.mean(later))
+                squares, freedom = squares + sum((gain - mean) ** 2 for gain in later), freedom + len(later) - 1
+                firsts += [gain - mean for gain, first in known if first]
+        noise_nm = float(np.sqrt(np.mean(np.concatenate(noise) ** 2))) if noise else 0.0
+        noise_nm = max(noise_nm, _LEAST_NOISE * float(np.abs(truth).max(initial=0.0)))
+        within = math.sqrt(squares / freedom) if freedom else 0.0
+        first = sum(firsts) / (_PRIOR_GRIPS + len(firsts))
+        prior = cls(
+            PRIOR_SPREAD / root,
+            max(within, _LEAST_WITHIN),
+            noise_nm,
+            first=first,
+            first_spread=_pooled(FIRST_SPREAD / root, _PRIOR_RECORDINGS, [(one - first) ** 2 for one in firsts]),
+        )
+        return prior._with_recordings([one**2 for one in left_out])
+
+    def _with_recordings(self, squares: Sequence[float]) -> Self:
+        """Return the spread after recordings with these squares of the gain's logarithm."""
+        between = _pooled(self.between, self.recordings, squares)
+        return replace(self, between=between, recordings=self.recordings + len(squares))
+
+    def reach(self, value: float) -> tuple[float, float]:
+        """Return how far the truth may lie below and above a value, at 95 %, because of the gain."""
+        factor = math.exp(TWO_SIDED_95 * self.between)
+        inward, outward = abs(value) * (1.0 - 1.0 / factor), abs(value) * (factor - 1.0)
+        return (inward, outward) if value > 0 else (outward, inward)
+
+    def correct(
+        self,
+        parts: FloatArray,
+        truth: FloatArray,
+        twists: Sequence[IntArray],
+        *,
+        first: BoolArray | None = None,
+        bounded: bool,
+    ) -> "GainCorrection":
+        """Return the factors on the parts (n, m) of predictions that m fingertips add, and the offset.
+
+        The logarithms of the factors and the offset have normal priors, and each twist is one equation, along its
+        torque: errors of its shape come from delays, not from the gain. Frames of a twist share its gain, so a long
+        twist determines the gain no better than twists agree. `first` (n,) marks frames of the first twist after a
+        grip. With `bounded` a frame without load counts only while it is predicted above zero. Raises CalibrationError
+        where the twists do not follow the torque, or leave the gain as uncertain as before.
+        """
+        m, loaded, total = parts.shape[1], np.concatenate(twists), parts.sum(axis=1)
+        is_first = np.array([first is not None and bool(first[rows].any()) for rows in twists])
+        load_nm = float(np.sqrt((truth[loaded] ** 2).mean()))
+        gain = log_gain(total[loaded], truth[loaded])
+        if gain is None:
+            raise CalibrationError(
+                "the estimates do not follow the known torque; check that the load cell and the calibration have the "
+                "same direction, and twist again"
+            )
+        # Variances of the logarithm: what successive twists have in common, and each one's own.
+        alike = _ALIKE * self.within**2
+        own = self.within**2 - alike + np.where(is_first, self.first_spread**2, 0.0)
+        # This recording's gain counts for the spread too, less the part that noise and twists explain.
+        explained = alike + float(own.mean()) / len(twists)
+        explained += self.noise_nm**2 / max(float(total[loaded] @ total[loaded]), self.noise_nm**2)
+        spread = self._with_recordings([max(gain**2 - explained, 0.0)])
+        prior = np.append(np.full(m, math.sqrt(m) * spread.between), max(self.zero, _LEAST_ZERO) * load_nm)
+        along = [truth[rows] for rows in twists]
+        power = np.array([float(one @ one) for one in along])
+        of_errors = np.diag(power * (self.noise_nm**2 + own * power)) + alike * np.outer(power, power)
+        whiten = np.linalg.inv(np.linalg.cholesky(of_errors))
+        # The first twist reads the gain times its own deviation from the later ones.
+        deviation = np.exp(np.where(is_first, self.first, 0.0))
+        of_twists = np.array([one @ parts[rows] for one, rows in zip(along, twists, strict=True)])
+        of_twists, of_offset = whiten @ (of_twists * deviation[:, None]), whiten @ [one.sum() for one in along]
+        known_power = whiten @ power
+        unloaded = np.setdiff1d(np.arange(len(truth)), loaded)
+        # The unloaded frames before a twist have one error in common.
+        weight = math.sqrt(len(twists) / max(len(unloaded), 1)) / self.noise_nm
+
+        def residuals(x: FloatArray) -> FloatArray:
+            factors, free = np.exp(x[:m]), parts[unloaded] @ np.exp(x[:m]) + x[m]
+            known = of_twists @ factors + of_offset * x[m] - known_power
+            return np.concatenate([known, weight * (np.maximum(free, 0.0) if bounded else free), x / prior])
+
+        def slopes(x: FloatArray) -> FloatArray:
+            factors = np.exp(x[:m])
+            free = np.column_stack([parts[unloaded] * factors, np.ones(len(unloaded))])
+            # Unloaded frames predicted below zero carry no information about a bound.
+            counts = (parts[unloaded] @ factors + x[m] > 0) | (not bounded)
+            known = np.column_stack([of_twists * factors, of_offset])
+            return np.concatenate([known, weight * free * counts[:, None], np.diag(1.0 / prior)])
+
+        found = _least_squares(residuals, slopes, np.zeros(m + 1))
+        if found is None:
+            raise CalibrationError("the gain of these twists does not settle; twist further, and several times")
+        factors, offset_nm = np.exp(found[:m]), float(found[m])
+        slope = slopes(found)
+        covariance = np.linalg.inv(slope.T @ slope)
+        columns = np.column_stack([parts[loaded] * factors, np.ones(len(loaded))])
+        corrected = columns.sum(axis=1) + offset_nm - 1.0
+
+        def relative(of: NDArray[np.floating]) -> float:
+            return float(np.sqrt(np.einsum("ni,ij,nj->n", columns, of, columns).mean() / (corrected**2).mean()))
+
+        left = relative(covariance)
+        if left > _MOST_LEFT * relative(np.diag(prior**2)):
+            raise CalibrationError(
+                "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
+                "these are too small; twist further, and several times"
+            )
+        errors = factors * np.sqrt(np.diag(covariance))[:m]
+        spread = replace(spread, between=min(left, spread.between))
+        return GainCorrection(factors, errors, offset_nm, spread, len(twists))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GainCorrection:
+    """Factors (m,) on the torques of m fingertips with their standard errors, and the offset of their sum.
+
+    `spread` is the gain's spread that remains, `twists` their number. Where an estimator combines its fingertips
+    otherwise, m is 1.
+    """
+
+    factors: FloatArray
+    errors: FloatArray
+    offset_nm: float
+    spread: GainSpread
+    twists: int
+
+
+@dataclass(frozen=True, slots=True)
+class ToolLaw:
+    """Gain over the tool's diameter: ln gain = intercept + slope · ln diameter, and the spread of a tool left out.
+
+    The diameters in mm reach from low_mm to high_mm.
+    """
+
+    intercept: float
+    slope: float
+    spread: float
+    low_mm: float
+    high_mm: float
+
+    @classmethod
+    def fit(cls, diameters_mm: FloatArray, gains: FloatArray) -> Self:
+        """Fit to (n,) gains of tools of three diameters or more."""
+        x, y = np.log(diameters_mm), np.log(gains)
+        slope, intercept = np.polyfit(x, y, 1)
+        tools = np.unique(x).tolist()
+        squares = [
+            float(np.mean((y[x == one] - np.polyval(np.polyfit(x[x != one], y[x != one], 1), one)) ** 2))
+            for one in tools
+        ]
+        # A line through two points says little of how far a third one lies, so the prior stays.
+        spread = max(_pooled(TOOL_SPREAD, _PRIOR_RECORDINGS, squares), TOOL_SPREAD)
+        return cls(float(intercept), float(slope), spread, float(diameters_mm.min()), float(diameters_mm.max()))
+
+    @property
+    def factor(self) -> float:
+        """How far a torque may be off either way before a twist of known torque, at 95 %."""
+        return math.exp(TWO_SIDED_95 * self.spread)
+
+    def gain(self, diameter_mm: float) -> float | None:
+        """Return the gain on a tool, None too far from the calibrated ones."""
+        if not self.low_mm / _REACH <= diameter_mm <= self.high_mm * _REACH:
+            return None
+        return math.exp(self.intercept + self.slope * math.log(diameter_mm))
+
+
+def find_twists(torque_nm: FloatArray, largest_nm: float | None = None) -> list[IntArray]:
+    """Return the rows of each stretch of loaded frames in (n,) torques, whose largest one is given or found."""
+    largest_nm = float(np.abs(torque_nm).max(initial=0.0)) if largest_nm is None else largest_nm
+    rows = np.flatnonzero(np.abs(torque_nm) > LOADED_SHARE * largest_nm)
+    return [one for one in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(one)]
+
+
+def first_twists(torque_nm: FloatArray, grips: IntArray) -> BoolArray:
+    """Return which of (n,) frames belong to the first twist of their grip, from the number of each frame's grip."""
+    found: BoolArray = np.zeros(len(torque_nm), dtype=np.bool_)
+    for rows in (np.flatnonzero(grips == one) for one in np.unique(grips)):
+        for first in find_twists(torque_nm[rows])[:1]:
+            found[rows[first]] = True
+    return found
+
+
+def loaded_log_gain(predicted: FloatArray, truth: FloatArray) -> float | None:
+    """Return the logarithm of the factor on (n,) predictions that fits the truth of the loaded frames best."""
+    rows = np.abs(truth) > LOADED_SHARE * float(np.abs(truth).max())
+    return log_gain(predicted[rows], truth[rows])
+
+
+def log_gain(predicted: FloatArray, truth: FloatArray) -> float | None:
+    """Return the logarithm of the factor on (n,) predictions that fits the truth best.
+
+    None where they do not follow the truth: a load that was missed, or of the other sign, has no gain.
+    """
+    along = float(predicted @ truth)
+    return math.log(along / float(predicted @ predicted)) if along > 0 else None
+
+
+def _least_squares(
+    residuals: Callable[[FloatArray], FloatArray], slopes: Callable[[FloatArray], FloatArray], start: FloatArray
+) -> FloatArray | None:
+    """Return the (d,) unknowns with the least squares of residuals, by Levenberg's and Marquardt's steps.
+
+    None where they do not settle. SciPy's would take the daemon a tenth of a second to import.
+    """
+    x, damping = start, _FIRST_DAMPING
+    left = residuals(x)
+    for _ in range(_MOST_STEPS):
+        slope = slopes(x)
+        information, gradient = slope.T @ slope, slope.T @ left
+        step = -np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+        if float(step @ information @ step) < _SETTLED:
+            return x
+        trial = residuals(x + step)
+        if float(trial @ trial) < float(left @ left):
+            x, left, damping = x + step, trial, damping / 10.0
+        else:
+            damping *= 10.0
+    return None
+
+
+def _pooled(prior: float, counts_as: int, squares: Sequence[float]) -> float:
+    """Return the root mean square of deviations, with a prior that counts as some."""
+    return math.sqrt((counts_as * prior**2 + sum(squares)) / (counts_as + len(squares)))

@@ -21,12 +21,12 @@ from shearloop.estimation.interval_regressor import CensoredRidge, LeftOut, Ridg
 from shearloop.estimation.regressors import left_out_groups
 
 # Ends of the steps of the memory in frames back: 18 frames are 10 s, and the gel creeps for some seconds.
-MEMORY_EDGES = (1, 2, 3, 4, 5, 7, 10, 14, 19)
-# Directions per fingertip, steps of the memory (9, 13 and 18 frames), and penalties to choose from.
+MEMORY_EDGES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 16, 19)
+# Directions per fingertip, steps of the memory (12 and 18 frames), and penalties to choose from.
 MOST_DIRECTIONS = 3
-_DIRECTIONS, _STEPS, _PENALTIES = (1, 2, 3), (6, 7, 8), (1e-5, 1e-4)
+_DIRECTIONS, _STEPS, _PENALTIES = (1, 2, 3), (10, 12), (1e-5, 1e-4)
 # Where the gel holds its position, that position shows a long twist, and the shortest memory serves.
-_STEPS_WITH_POSITION = (6,)
+_STEPS_WITH_POSITION = (8,)
 # Fits whose left-out error is within this factor of the least one are averaged.
 _NEARLY_AS_GOOD = 1.25
 # Fewest twists that are left out one by one, and most parts; with more twists, neighbours are left out together.

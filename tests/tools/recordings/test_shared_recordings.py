@@ -289,7 +289,7 @@ def test_nothing_is_said_of_the_times_of_a_recording_that_does_not_show_them(sha
     assert found is None or found.few_frames
 
 
-def test_a_load_that_one_loop_stamped_early_is_put_right(shared, twists, tmp_path):
+def test_a_load_that_one_loop_stamped_early_is_put_right(shared, tmp_path):
     series = imported(tmp_path / "other.mcap", shared / "recordings/streams/20241202_153632")
     assert load_delay_warning(series) == ""
     early = replace(series, torque_t_s=series.torque_t_s - 2.36)

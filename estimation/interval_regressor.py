@@ -401,12 +401,7 @@ def fit_interval_regressor(
     gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
     gain = GainSpread()
     if recordings is not None:
-        in_order = np.argsort(rows, kind="stable")
-        is_first = first_twists(values, recordings)
-        ordered = rows[in_order]
-        gain = GainSpread.fit(
-            reported[in_order], values[ordered], recordings[ordered], is_first[ordered], gains, fingertips
-        )
+        gain = _spread_of_gain(values, recordings, rows, reported, gains, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain, line)
 
 
@@ -420,6 +415,21 @@ def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: I
             gain = loaded_log_gain(_reported(part, part.predict(features[out])), values[out])
             gains += [] if gain is None else [gain]
     return gains
+
+
+def _spread_of_gain(
+    values: FloatArray,
+    recordings: IntArray,
+    rows: IntArray,
+    predicted: FloatArray,
+    gains: Sequence[float],
+    fingertips: int,
+) -> GainSpread:
+    """Return the spread of the gain from the predictions of left-out rows, and the gains of left-out recordings."""
+    order = np.argsort(rows, kind="stable")
+    rows, predicted = rows[order], predicted[order]
+    is_first = first_twists(values, recordings)
+    return GainSpread.fit(predicted, values[rows], recordings[rows], is_first[rows], gains, fingertips)
 
 
 def _range_of_slices(

@@ -148,8 +148,14 @@ def message_line(topic: str, content: Mapping[str, Any]) -> str:
 
 
 def message_json(topic: str, content: Mapping[str, Any]) -> str:
-    """Return one line of JSON: the topic and the content, arrays as lists."""
-    return json.dumps({"topic": topic, **content}, default=lambda array: array.tolist(), ensure_ascii=False)
+    """Return one line of JSON: the topic and the content, arrays as lists, null for a number that is not finite."""
+    from pydantic_core import to_json
+
+    def plain(value: Any) -> Any:
+        return value.tolist() if hasattr(value, "tolist") else str(value)
+
+    compact = to_json({"topic": topic, **content}, inf_nan_mode="null", bytes_mode="base64", fallback=plain)
+    return json.dumps(json.loads(compact), ensure_ascii=False)
 
 
 def _estimate(content: Mapping[str, Any]) -> str:

@@ -216,7 +216,8 @@ class ControlLoopRunner:
         if self._stop_count == stops_before and self._control_loop.start_refusal() is None:
             refusal = await self._enable()
         if self._stop_count != stops_before:
-            self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
+            if not self._closed:
+                self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
             return STOPPED_AT_START
         if refusal:
             return refusal

@@ -8,7 +8,7 @@ from pathlib import Path
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.control import experiment_schema
+from shearloop.daemon.control import experiment_check, experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
@@ -34,10 +34,11 @@ from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.models import MODELS, GripperModel
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
-from shearloop.drivers.ur.settings import UrSettings, read_settings
+from shearloop.drivers.ur.settings import UrLimits, UrSettings, read_settings
 from shearloop.errors import UserError
 from shearloop.yaml_files import located, read_yaml
 
@@ -118,18 +119,20 @@ def make_gripper(config: GripperConfig, loop: ControlLoop, publisher: Publisher)
 class Rig:
     """Robot, gripper and the control loop between them, for the operator's experiments.
 
-    `tasks` are by their names in `health`.
+    `tasks` are by their names in `health`. Experiments stay within what `robot` and `gripper` allow.
     """
 
     control_loop: ControlLoop
     runner: ControlLoopRunner
     tasks: Mapping[str, Task]
     recorder: Recorder | None
+    robot: UrLimits
+    gripper: GripperModel | None
 
     async def start(self, path: Path) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
         attached = AttachedFile.read(path) if self.recorder is not None else ()
-        file = read_experiment(path)
+        file = read_experiment(path, self.robot, self.gripper)
         reason = await self.runner.start(file)
         if reason is None and self.recorder is not None:
             self.recorder.record_experiment(file.name, attached, file.tool_mm)
@@ -202,37 +205,59 @@ def build_rig(
     estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     sources = torque_sources(config, estimators, combined)
-    check_experiment(config, sources)
-    if config.robot is None:
+    settings = robot_settings(config.robot) if config.robot is not None else None
+    check_experiment(config, sources, settings)
+    if settings is None:
         return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
-    settings = robot_settings(config.robot)
     loop = make_loop(config, settings, sources, supervisor.dead)
     gripper = make_gripper(config.gripper, loop, publisher) if config.gripper is not None else None
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)))
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
-    return sensors, Rig(loop, runner, {**fingers, "robot": robot, "loop": runner}, recorder)
+    tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
+    return sensors, Rig(loop, runner, tasks, recorder, settings.limits, gripper_model(config))
 
 
-def read_experiment(path: Path) -> experiment_schema.ExperimentFile:
-    """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
-    return _without_mistakes(path, experiment_schema.check_steps(_outline(path)))
+def gripper_model(config: DaemonConfig) -> GripperModel | None:
+    """Return the model of the configured gripper, if there is one."""
+    return MODELS[config.gripper.model] if config.gripper is not None else None
+
+
+def read_experiment(
+    path: Path, robot: UrLimits | None = None, gripper: GripperModel | None = None
+) -> experiment_schema.ExperimentFile:
+    """Return the experiment of a file; raises UserError for an invalid one.
+
+    One that exceeds its own limits is invalid, and one that exceeds those of the robot or of the gripper, where given.
+    """
+    file = _outline(path)
+    mistakes = experiment_check.check_steps(file) + list(experiment_check.check_devices(file, robot, gripper))
+    return _without_mistakes(path, mistakes)
 
 
 def check_experiment(
-    config: DaemonConfig, sources: Mapping[str, TorqueSource]
+    config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
 ) -> experiment_schema.ExperimentFile | None:
     """Return the configured experiment, if any; raises UserError if the configured devices cannot run it.
 
-    `sources` are all torques but the robot's.
+    `sources` are all torques but the robot's; `robot` has its limits, where they are known.
     """
     path = config.experiment
     if path is None:
         return None
+    return _without_mistakes(path, experiment_mistakes(path, config, sources, robot))
+
+
+def experiment_mistakes(
+    path: Path, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
+) -> list[experiment_schema.Mistake]:
+    """Return each step and key of an experiment that its own limits or the configured devices do not allow."""
     driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
     file = _outline(path)
-    mistakes = experiment_schema.check_steps(file)
+    limits = robot.limits if robot is not None else None
+    mistakes = experiment_check.check_steps(file)
+    mistakes += experiment_check.check_devices(file, limits, gripper_model(config))
     if file.torque_source and file.steps:
         mistakes += _undriven(file.torque_source, driving, config)
     if config.gripper is None:
@@ -242,7 +267,7 @@ def check_experiment(
             for number, step in enumerate(file.steps)
             if isinstance(step, experiment_schema.GripperStep)
         ]
-    return _without_mistakes(path, mistakes + _unadaptable(file, sources))
+    return mistakes + _unadaptable(file, sources)
 
 
 def _outline(path: Path) -> experiment_schema.ExperimentFile:

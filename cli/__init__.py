@@ -19,9 +19,12 @@ from typing import Any, NoReturn
 from shearloop.daemon.errors import USER_ERRORS
 from shearloop.daemon.process import interrupt_status, raise_ending_signals
 from shearloop.errors import UserError
+from shearloop.printable import printable_output
 
 # Our products are small: a BLAS with one thread is faster. Must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Colours are control characters, which the output escapes (help of Python 3.14, log outside of `logging_to_stderr`).
+os.environ.setdefault("NO_COLOR", "1")
 
 
 # Ctrl-C is their usual end, and nothing is left undone.
@@ -116,6 +119,11 @@ def command_module(name: str) -> ModuleType:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; print a user's mistake as one sentence on stderr and return status 2."""
+    with printable_output():
+        return _run(argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] in ([], ["help"]):
         arguments = [*arguments[1:2], "--help"]

@@ -80,7 +80,24 @@ def run(args: argparse.Namespace) -> int:
         print(*_lines(args.name, reply), sep="\n")
     else:
         print(f"shearloop command: {args.name} was refused: {reply.get('reason')}", file=sys.stderr)
+        if reply.get("invalid") and args.experiment is not None:
+            print(_mistakes(args.experiment), file=sys.stderr, end="")
     return 0 if accepted else 1
+
+
+def _mistakes(experiment: Path) -> str:
+    """Return the mistakes of an experiment, as lines, which the daemon does not tell.
+
+    It may read files that this user may not. Empty if the file is on the daemon's computer only.
+    """
+    from shearloop.daemon.experiment_files import read_experiment
+    from shearloop.errors import UserError
+
+    try:
+        read_experiment(experiment)
+    except UserError as error:
+        return f"{error}\n"
+    return ""
 
 
 def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:

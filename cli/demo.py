@@ -15,7 +15,7 @@ from shearloop.cli import run as run_command
 from shearloop.cli.emulator_processes import SHEARLOOP, running
 from shearloop.cli.options import add_option
 from shearloop.daemon.process import interrupt_status
-from shearloop.errors import missing
+from shearloop.errors import UserError, missing
 from shearloop.tools.outputs import writing
 
 if TYPE_CHECKING:
@@ -48,14 +48,18 @@ def run(args: argparse.Namespace) -> int:
             return interrupt_status(interrupt)
         return 0
     from shearloop.daemon.config import load_daemon_config
-    from shearloop.daemon.rig import robot_settings
+    from shearloop.daemon.rig import open_settings
 
     name = "demo.yaml" if args.recording is None else "fingertip_demo.yaml"
     played = [] if args.recording is None else ["--recording", str(args.recording)]
     config = load_daemon_config(folder / name)
     # Mistakes are found before anything is built and served.
-    if config.robot is not None:
-        robot_settings(config.robot)
+    open_settings(config)
+    if args.recording is None and not config.autostart:
+        raise UserError(
+            f"{folder / name} starts nothing by itself: it needs `emulated: true` and `autostart: true`; remove it, "
+            "and `shearloop demo` writes it anew"
+        )
     if args.recording is not None:
         from shearloop.tools.recordings.matlab_import import read_stream
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_runner import loop_state
+from shearloop.daemon.experiment_files import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig, Sensors
 from shearloop.daemon.supervisor import HealthReporter
@@ -50,6 +51,8 @@ class Commands:
             raise CommandRefusedError("no experiment is given: name its file, or one in the configuration")
         try:
             _refuse_if(await required_rig(self.rig).start(Path(path)))
+        except InvalidExperimentError as error:
+            raise CommandRefusedError(str(error), invalid=True) from error
         except UserError as error:
             raise CommandRefusedError(str(error)) from error
         if self.experiment is not None:
@@ -92,11 +95,12 @@ class Commands:
         return {"tasks": tasks, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
 
     async def _stop(self, request: Request) -> Reply:
-        stopped = self.rig.runner.stop() if self.rig is not None else None
+        spare_daemon = bool(request.get("spare_daemon"))
+        stopped = self.rig.runner.stop(also_idle=spare_daemon) if self.rig is not None else None
         waiting = self.experiment.call_off() if self.experiment is not None else None
         if stopped is not None:
             return {"stopped": stopped}
-        if request.get("spare_daemon"):
+        if spare_daemon:
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
         # Nothing moves, so the daemon itself stops, once the reply is sent.

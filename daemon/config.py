@@ -1,10 +1,11 @@
 """The daemon's configuration. Units are in the keys; unknown keys are refused; loaded values do not change."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.control.loop_inputs import LoopConfig
@@ -237,11 +238,29 @@ class DaemonConfig(ConfigModel):
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
     gripper: GripperConfig | None = Field(None, description="the gripper; needs `robot`")
     loop: LoopConfig = Field(LoopConfig(), description="settings of the closed loop")
-    experiment: Path | None = Field(None, description="started once all devices are connected")
+    emulated: bool = Field(False, description="every device is emulated on this computer; a real address is refused")
+    experiment: Path | None = Field(None, description="what `shearloop command start` runs if it names no other")
+    autostart: bool = Field(False, description="start `experiment` once all devices are connected; needs `emulated`")
+    experiments: tuple[Path, ...] = Field(
+        (), validate_default=True, description="folders of the experiments that `start` may name; default: this file's"
+    )
     stop_when_done: bool = Field(False, description="the daemon ends with that experiment: status 0 if done, else 3")
     recording: RecordingConfig | None = Field(None, description="default: no recording")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
     emulators: tuple[EmulatorConfig, ...] = Field((), description="devices to emulate, for demonstrations")
+
+    @field_validator("experiments")
+    @classmethod
+    def _own_folder(cls, folders: tuple[Path, ...], info: ValidationInfo) -> tuple[Path, ...]:
+        if not info.context:
+            return folders
+        own: Path = info.context["folder"]
+        return tuple(Path(os.path.normpath(own / folder)) for folder in folders) or (own,)
+
+    @property
+    def experiment_folders(self) -> tuple[Path, ...]:
+        """The folders of the experiments that a request may name: the configured ones, and that of `experiment`."""
+        return (*self.experiments, *((self.experiment.parent,) if self.experiment is not None else ()))
 
     @model_validator(mode="after")
     def _loop_is_whole(self) -> "DaemonConfig":
@@ -262,9 +281,30 @@ class DaemonConfig(ConfigModel):
                 raise ValueError(f"`{keys[0]}` and `{keys[1]}` are both {port}; each device needs its own")
         if self.experiment is not None and self.robot is None:
             raise ValueError("an experiment needs a robot: add `robot: ur.yaml`, or take `experiment` out")
+        if self.autostart and not self.emulated:
+            raise ValueError(
+                "`autostart` moves a robot that nobody has just asked to move: it needs `emulated: true`; "
+                "on a real rig take it out, and send `shearloop command start`"
+            )
+        if self.autostart and self.experiment is None:
+            raise ValueError("`autostart` starts no experiment: name one in `experiment`, or take `autostart` out")
+        if self.emulated:
+            for key, device in self._real_devices():
+                raise ValueError(f"`emulated: true` and `{key}: {device}`, a real device: take one of the two out")
         if self.gripper is not None and self.robot is None:
             raise ValueError("a gripper without a robot cannot be driven: add `robot: ur.yaml`, or take `gripper` out")
         return self
+
+    def _real_devices(self) -> Iterator[tuple[str, str]]:
+        """Yield the key and the name of each device that no emulator plays."""
+        for key, section in self.walk():
+            match section:
+                case SerialDevice(serial_number=str(number)):
+                    yield f"{key}.serial_number", number
+                case SerialDevice(path=Path() as path) if _is_hardware(path.resolve()):
+                    yield f"{key}.path", str(path)
+                case InstrumentSocket(host=host) | GripperSocket(host=host) if not addresses.is_loopback_host(host):
+                    yield f"{key}.host", host
 
     def _ports(self) -> dict[str, list[str]]:
         """Return the configuration keys of each serial port and socket."""
@@ -284,6 +324,11 @@ class DaemonConfig(ConfigModel):
         """The configuration keys and addresses that are open to the network."""
         both = {"publish": self.publish, "commands": self.commands}
         return {key: address for key, address in both.items() if not addresses.is_local(address)}
+
+
+def _is_hardware(port: Path) -> bool:
+    """Return whether a port is in /dev, but no pseudo-terminal; one that is not there yet is none."""
+    return port.is_relative_to("/dev") and not port.is_relative_to("/dev/pts")
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:

@@ -7,14 +7,15 @@ from pathlib import Path
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
-from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control import experiment_check, experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, Tareable, wrench_source
+from shearloop.daemon.experiment_files import ExperimentFiles, read_document, without_mistakes
 from shearloop.daemon.logs import LinkReporter
+from shearloop.daemon.messaging.addresses import is_loopback_host
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
@@ -38,9 +39,8 @@ from shearloop.drivers.robotiq.models import MODELS, GripperModel
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
-from shearloop.drivers.ur.settings import UrLimits, UrSettings, read_settings
+from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
-from shearloop.yaml_files import located, read_yaml
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -84,6 +84,22 @@ def robot_settings(path: Path) -> UrSettings:
     return settings
 
 
+def open_settings(config: DaemonConfig) -> UrSettings | None:
+    """Return the settings of the configured robot, None without one; raises DriverError as `robot_settings` does.
+
+    Raises UserError for a robot elsewhere in a rig that is said to be emulated.
+    """
+    if config.robot is None:
+        return None
+    settings = robot_settings(config.robot)
+    if config.emulated and not is_loopback_host(settings.host):
+        raise UserError(
+            f"{config.robot}: `host: {settings.host}` is not this computer, and the configuration says "
+            "`emulated: true`: take that out for a real robot, or give 127.0.0.1 for an emulated one"
+        )
+    return settings
+
+
 def make_loop(
     config: DaemonConfig, robot: UrSettings, sources: Mapping[str, TorqueSource], dead_tasks: Mapping[str, str]
 ) -> ControlLoop:
@@ -119,23 +135,26 @@ def make_gripper(config: GripperConfig, loop: ControlLoop, publisher: Publisher)
 class Rig:
     """Robot, gripper and the control loop between them, for the operator's experiments.
 
-    `tasks` are by their names in `health`. Experiments stay within what `robot` and `gripper` allow.
+    `tasks` are by their names in `health`.
     """
 
     control_loop: ControlLoop
     runner: ControlLoopRunner
     tasks: Mapping[str, Task]
+    experiments: ExperimentFiles
     recorder: Recorder | None
-    robot: UrLimits
-    gripper: GripperModel | None
 
     async def start(self, path: Path) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
-        attached = AttachedFile.read(path) if self.recorder is not None else ()
-        file = read_experiment(path, self.robot, self.gripper)
-        reason = await self.runner.start(file)
+        # While something moves, no file is read.
+        if (reason := self.runner.start_refusal()) is not None:
+            return reason
+        stops_before = self.runner.stop_count
+        experiment = await self.experiments.read(path)
+        reason = await self.runner.start(experiment.file, stops_before)
         if reason is None and self.recorder is not None:
-            self.recorder.record_experiment(file.name, attached, file.tool_mm)
+            attached = (AttachedFile.of(path, experiment.data),)
+            self.recorder.record_experiment(experiment.file.name, attached, experiment.file.tool_mm)
         return reason
 
 
@@ -205,7 +224,7 @@ def build_rig(
     estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     sources = torque_sources(config, estimators, combined)
-    settings = robot_settings(config.robot) if config.robot is not None else None
+    settings = open_settings(config)
     check_experiment(config, sources, settings)
     if settings is None:
         return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
@@ -214,26 +233,14 @@ def build_rig(
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)))
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
+    experiments = ExperimentFiles(config.experiment_folders, settings.limits, gripper_model(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
-    tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
-    return sensors, Rig(loop, runner, tasks, recorder, settings.limits, gripper_model(config))
+    return sensors, Rig(loop, runner, {**fingers, "robot": robot, "loop": runner}, experiments, recorder)
 
 
 def gripper_model(config: DaemonConfig) -> GripperModel | None:
     """Return the model of the configured gripper, if there is one."""
     return MODELS[config.gripper.model] if config.gripper is not None else None
-
-
-def read_experiment(
-    path: Path, robot: UrLimits | None = None, gripper: GripperModel | None = None
-) -> experiment_schema.ExperimentFile:
-    """Return the experiment of a file; raises UserError for an invalid one.
-
-    One that exceeds its own limits is invalid, and one that exceeds those of the robot or of the gripper, where given.
-    """
-    file = _outline(path)
-    mistakes = experiment_check.check_steps(file) + list(experiment_check.check_devices(file, robot, gripper))
-    return _without_mistakes(path, mistakes)
 
 
 def check_experiment(
@@ -246,15 +253,16 @@ def check_experiment(
     path = config.experiment
     if path is None:
         return None
-    return _without_mistakes(path, experiment_mistakes(path, config, sources, robot))
+    document = read_document(path)
+    return without_mistakes(document, experiment_mistakes(document.content, config, sources, robot))
 
 
 def experiment_mistakes(
-    path: Path, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
+    content: object, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
 ) -> list[experiment_schema.Mistake]:
-    """Return each step and key of an experiment that its own limits or the configured devices do not allow."""
+    """Return each step and key of an experiment's content that its own limits or the devices do not allow."""
     driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
-    file = _outline(path)
+    file = experiment_schema.outline(content)
     limits = robot.limits if robot is not None else None
     mistakes = experiment_check.check_steps(file)
     mistakes += experiment_check.check_devices(file, limits, gripper_model(config))
@@ -268,23 +276,6 @@ def experiment_mistakes(
             if isinstance(step, experiment_schema.GripperStep)
         ]
     return mistakes + _unadaptable(file, sources)
-
-
-def _outline(path: Path) -> experiment_schema.ExperimentFile:
-    return experiment_schema.outline(read_yaml(path, UserError, experiment_schema.ExperimentFile.what))
-
-
-def _without_mistakes(path: Path, mistakes: Sequence[experiment_schema.Mistake]) -> experiment_schema.ExperimentFile:
-    """Return the experiment of a file; raises UserError with these mistakes, and with those of its keys and values."""
-    lines: list[str] = []
-    try:
-        file = load_yaml_model(path, experiment_schema.ExperimentFile)
-    except UserError as error:
-        lines.append(str(error))
-    lines += located(path, mistakes, UserError)
-    if lines:
-        raise UserError("\n".join(lines))
-    return file
 
 
 def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[experiment_schema.Mistake]:

@@ -102,6 +102,8 @@ class HealthReporter:
     publisher: Publisher
     supervisor: Supervisor
     clock: Clock
+    # Every device is emulated.
+    emulated: bool = False
     reporters: dict[str, Reporter] = field(default_factory=dict)
 
     def tasks(self) -> dict[str, TaskFacts]:
@@ -140,6 +142,7 @@ class HealthReporter:
                 source="daemon",
                 t_mono_ns=self.clock.now_ns(),
                 tasks=self.tasks(),
+                emulated=self.emulated,
                 loop_lag_s=lag_s,
                 memory_mb=resident_memory_mb(),
                 cpu_percent=100.0 * used_s / passed_s,

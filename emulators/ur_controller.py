@@ -3,7 +3,7 @@
 import asyncio
 import re
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Collection
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import replace
 
@@ -21,6 +21,8 @@ SCRIPT_END = b"\nend\n"
 MOST_CATCH_UP_S = 0.02
 BANNER = "Connected: Universal Robots Dashboard Server"
 _ROBOT_MODES = {MODE_POWER_OFF: "POWER_OFF", MODE_IDLE: "IDLE", MODE_RUNNING: "RUNNING"}
+# What changes the robot needs remote control; UR's words differ from version to version.
+_CONTROLS = ("power on", "brake release", "unlock protective stop", "stop", "close popup", "close safety popup")
 _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
@@ -32,13 +34,16 @@ FAULTS = (
 class Controller:
     """A `Robot` that real clients can connect to."""
 
-    def __init__(self, robot: Robot, *, host: str = "127.0.0.1", rate_hz: float = 500.0) -> None:
-        """Take a robot; nothing is opened yet."""
+    def __init__(
+        self, robot: Robot, *, host: str = "127.0.0.1", rate_hz: float = 500.0, closed_ports: Collection[int] = ()
+    ) -> None:
+        """Take a robot; nothing is opened yet. `closed_ports` are of services that are not enabled."""
         self.robot = robot
         self._first_spec = robot.spec
         # What the controller refuses or ignores.
         self.faults: set[str] = set()
         self._host = host
+        self._closed_ports = closed_ports
         self._rate_hz = rate_hz
         self._silent_until_s = 0.0
         self._rtde: dict[asyncio.StreamWriter, RtdeSession] = {}
@@ -53,6 +58,8 @@ class Controller:
                 (SCRIPT_PORT, self._serve_scripts),
                 (DASHBOARD_PORT, self._serve_dashboard),
             ):
+                if port in self._closed_ports:
+                    continue
                 server = await asyncio.start_server(serve, self._host, port)
                 stack.push_async_callback(server.wait_closed)
                 stack.callback(self._drop_all)
@@ -162,6 +169,8 @@ class Controller:
     def _answer_dashboard(self, request: str) -> str:
         """Carry out a request as UR's page "Dashboard Server e-Series" describes it, and return the reply."""
         robot = self.robot
+        if "local-control" in self.faults and request in _CONTROLS:
+            return f"Command is not allowed: the robot is in local control ({request})"
         match request:
             case "PolyscopeVersion":
                 return f"URSoftware {'.'.join(map(str, robot.spec.version))} (Jun 01 2024)"

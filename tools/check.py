@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from shearloop.drivers.robotiq.models import GripperModel
     from shearloop.drivers.ur.settings import UrLimits, UrSettings
     from shearloop.tools.plan import Plan
+    from shearloop.yaml_files import Document
 
 # Raises UserError for an emulator of a configuration that cannot be started; the emulators are no affair of this room.
 CheckEmulators = Callable[[tuple["EmulatorConfig", ...], Path], object]
@@ -44,6 +45,7 @@ class Parts:
 def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulators) -> Parts:
     """Return what each part of the configuration in this file is; opens every file that it names."""
     from shearloop.daemon.control.loop_inputs import TorqueSource
+    from shearloop.daemon.experiment_files import read_document
     from shearloop.daemon.rig import check_experiment, experiment_mistakes, gripper_model
     from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources
 
@@ -79,9 +81,10 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
     with parts.of("experiment"):
         warm_up_s = max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0)
         if config.experiment is not None:
-            mistakes = experiment_mistakes(config.experiment, config, sources, robot)
+            document = read_document(config.experiment)
+            mistakes = experiment_mistakes(document.content, config, sources, robot)
             limits = robot.limits if robot is not None else None
-            _add_plan(parts, config.experiment, mistakes, limits, gripper_model(config), warm_up_s)
+            _add_plan(parts, document, mistakes, limits, gripper_model(config), warm_up_s)
         experiment = check_experiment(config, sources, robot)
         if experiment is not None:
             text = (
@@ -96,27 +99,27 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
 def check_experiment_alone(path: Path) -> Parts:
     """Return the plan of an experiment, or its mistakes, without a configuration."""
     from shearloop.daemon.control.experiment_check import check_steps
-    from shearloop.daemon.control.experiment_schema import ExperimentFile, outline
-    from shearloop.daemon.rig import read_experiment
-    from shearloop.yaml_files import read_yaml
+    from shearloop.daemon.control.experiment_schema import outline
+    from shearloop.daemon.experiment_files import read_document, without_mistakes
 
     parts = Parts()
     with parts.of("experiment"):
-        _add_plan(parts, path, check_steps(outline(read_yaml(path, UserError, ExperimentFile.what))))
-        read_experiment(path)
+        document = read_document(path)
+        mistakes = check_steps(outline(document.content))
+        _add_plan(parts, document, mistakes)
+        without_mistakes(document, mistakes)
     return parts
 
 
 def _add_plan(
     parts: Parts,
-    path: Path,
+    document: "Document",
     mistakes: "Sequence[Mistake]",
     robot: "UrLimits | None" = None,
     gripper: "GripperModel | None" = None,
     warm_up_s: float = 0.0,
 ) -> None:
     """Add the plan of an experiment whose keys and values are valid."""
-    from shearloop.daemon.config_file import load_yaml_model
     from shearloop.daemon.control.experiment_schema import ExperimentFile
     from shearloop.tools.plan import plan_of
 
@@ -126,7 +129,7 @@ def _add_plan(
             refused[place[0]] = (*refused.get(place[0], ()), why)
     # A file that cannot be read is named with its mistakes.
     with suppress(UserError):
-        parts.plans.append(plan_of(load_yaml_model(path, ExperimentFile), robot, gripper, refused, warm_up_s))
+        parts.plans.append(plan_of(document.model(ExperimentFile), robot, gripper, refused, warm_up_s))
 
 
 def _torque(estimator: "FrameEstimator") -> str:
@@ -138,7 +141,7 @@ def _torque(estimator: "FrameEstimator") -> str:
 
 def _check_rig(config: "DaemonConfig", parts: Parts) -> "UrSettings | None":
     """Check load cell, gripper and robot; return the robot's settings, if there are any."""
-    from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, robot_settings
+    from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, open_settings
 
     if (cell := config.load_cell) is not None:
         with parts.of("load_cell"):
@@ -150,9 +153,8 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "UrSettings | None":
             gripper_calibration(hand)
             own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
             parts.texts["gripper"] = f"{hand.model}, {own}"
-    if config.robot is not None:
-        with parts.of("robot"):
-            settings = robot_settings(config.robot)
+    with parts.of("robot"):
+        if (settings := open_settings(config)) is not None:
             text = f"{settings.host}, limits of {config.robot}"
             parts.texts["robot"] = f"{text}. {settings.warning}" if settings.warning else text
             return settings

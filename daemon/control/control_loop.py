@@ -159,7 +159,10 @@ class ControlLoop:
         """Take the end of the present action, and why it failed, if it did."""
         experiment, arm, gripped = self.experiment, self.inputs.arm, self._gripped
         action = experiment.command.action if experiment is not None else None
-        if experiment is None or not experiment.end_action(error) or error:
+        if experiment is None or not experiment.end_action(error):
+            return
+        if error:
+            self.safety.stop(Fault(FaultCode.STEP_FAILED, experiment.stop_reason))
             return
         if isinstance(action, AdaptStep) and action.fingertip == self.wrist.source.name:
             # The stiffness was identified with another gain.
@@ -179,15 +182,22 @@ class ControlLoop:
         """Take the end of the release after a stop, and why the gripper did not open, if it did not."""
         self._gripped.release_error = error
 
-    def start(self, file: ExperimentFile, t_ns: int) -> str | None:
-        """Begin an experiment; return None, or why it cannot begin."""
+    def start_refusal(self) -> str | None:
+        """Return why no experiment can begin, whichever it is, or None."""
         if (running := self.running) is not None:
             return f"the experiment {running.file.name!r} is still running; stop it first"
+        if self.safety.stopped:
+            reasons = " ".join(fault.sentence for fault in self.safety.stop_faults)
+            return f"a stop has not been acknowledged; `shearloop command unlock` does so: {reasons}"
+        return None
+
+    def start(self, file: ExperimentFile, t_ns: int) -> str | None:
+        """Begin an experiment; return None, or why it cannot begin."""
+        if (reason := self.start_refusal()) is not None:
+            return reason
         if file.torque_source not in self._wrists:
             known = ", ".join(self._wrists)
             return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
-        if self.safety.stopped:
-            return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
         driving = self._sources[file.torque_source]
         watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
         faults = detect_faults(self.inputs, watched, self.config, t_ns)
@@ -217,8 +227,9 @@ class ControlLoop:
         """Continue after `pause`; return None, or why not."""
         return self.experiment.resume() if self.experiment is not None else "no experiment is paused"
 
-    def stop(self, reason: str) -> None:
-        """End the experiment and stand still."""
+    def stop(self, reason: str, fault: Fault) -> None:
+        """End the experiment, if one runs, and stand still until the operator acknowledges the stop."""
+        self.safety.stop(fault)
         if self.experiment is not None:
             self.experiment.stop(reason)
 
@@ -286,16 +297,16 @@ class ControlLoop:
         command = experiment.command
         # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now.
         if _turns(command) and not gripped.expected and (uncertain := self._why_uncertain()):
-            experiment.fail(f"{uncertain}; put a `grip` or a `release` before it")
+            self._fail(experiment, f"{uncertain}; put a `grip` or a `release` before it")
         awaited = self._awaited_torques(experiment, t_ns)
         still = held or awaited is not None or experiment.phase is ExperimentPhase.PAUSED
         limit_nm = experiment.limits.torque_nm
         if isinstance(command.wrist, TrackTorque) and not still and not wrist.tracks(command.wrist, limit_nm):
             reason = wrist.close_loop(command.wrist, t_ns, wrist_rad, limit_nm)
             if reason:
-                experiment.fail(reason)
+                self._fail(experiment, reason)
         if not experiment.running:
-            return self._ended(decision)
+            return self._ended(self.safety.report(decision.faults))
         action = command.action if command.action is not None and not still and experiment.begin_action() else None
         if isinstance(action, IdentifyStep):
             wrist.begin_identification(action, limit_nm)
@@ -307,7 +318,7 @@ class ControlLoop:
             if excitation.done:
                 self.on_action_ended(excitation.failure)
                 if not experiment.running:
-                    return self._ended(decision)
+                    return self._ended(self.safety.report(decision.faults))
         else:
             velocity = wrist.turn(command.wrist, t_ns, wrist_rad, origin_rad)
         phase = "held" if held else experiment.phase.value
@@ -334,6 +345,11 @@ class ControlLoop:
             self._gripped.unmeasured_since_ns = None
             return None
         return f"waiting for the first torque of {', '.join(awaited)}{f': {reason}' if reason else ''}"
+
+    def _fail(self, experiment: Experiment, reason: str) -> None:
+        """End an experiment whose step cannot be done; the stop waits for the operator as every other."""
+        experiment.fail(reason)
+        self.safety.stop(Fault(FaultCode.STEP_FAILED, experiment.stop_reason))
 
     def _forget_tool(self) -> None:
         self.wrist.reset()

@@ -23,7 +23,7 @@ from shearloop.daemon.control.experiment_schema import (
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
@@ -68,6 +68,8 @@ LONGEST_TARE_S = 30.0
 # A tare gives up this much before its step is overdue, so that the sensors' reasons are reported.
 GIVES_UP_BEFORE_S = 0.1
 ENDING = "the daemon ends; start it again"
+STOPPED_AT_START = "it was stopped during its start"
+UNLOCKING = "robot and gripper are being unlocked; wait for the end"
 # The columns of `robot.state` that the robot's state has under the same name.
 _SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s"}
 
@@ -152,25 +154,31 @@ class ControlLoopRunner:
             self._states.publish_stop(self._timeline.end())
             await self._actions.close()
 
-    def stop(self) -> str | None:
-        """End the experiment, also during its start, or the unlocking; return its name, or None."""
+    def stop(self, *, also_idle: bool = False) -> str | None:
+        """End the experiment, also during its start, or the unlocking; return its name, or None.
+
+        The next start waits for `unlock`. `also_idle`: also where nothing moves.
+        """
         self._stop_count += 1
-        if (experiment := self._control_loop.running) is None:
-            return "unlock" if self.stop_unlocking() else None
-        self._request_stop("the operator stopped it")
-        return experiment.file.name
+        experiment, unlocking = self._control_loop.running, self.stop_unlocking()
+        stopped = experiment.file.name if experiment is not None else "unlock" if unlocking else None
+        if stopped is not None or also_idle:
+            what = f"{stopped!r} was under way" if stopped is not None else "nothing was under way"
+            self._request_stop("the operator stopped it", Fault(FaultCode.OPERATOR_STOP, what))
+        return stopped
 
     def close(self) -> None:
         """Stop the running experiment at the daemon's end, and start nothing more."""
         self._stop_count, self._closed = self._stop_count + 1, True
         if self._control_loop.running is not None:
-            self._request_stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")
+            ended = "the wrist is stopped, a gripped tool stays gripped"
+            self._request_stop(f"the daemon ended: {ended}", Fault(FaultCode.DAEMON_ENDED, ended))
             # The loop is cancelled before the next state.
             self.decide_now()
 
-    def _request_stop(self, reason: str) -> None:
+    def _request_stop(self, reason: str, fault: Fault) -> None:
         self._timeline.request(self._clock.now_ns())
-        self._control_loop.stop(reason)
+        self._control_loop.stop(reason, fault)
 
     def decide_now(self) -> None:
         """Decide without a new state, at the daemon's end."""
@@ -181,26 +189,53 @@ class ControlLoopRunner:
         except Exception:  # noqa: BLE001 - the robot's process stops the arm as it ends
             structlog.get_logger().exception("the loop crashed at its last decision")
 
-    async def start(self, file: ExperimentFile) -> str | None:
-        """Begin an experiment; return None, or why it cannot begin."""
+    @property
+    def stop_count(self) -> int:
+        """The number of stops so far: one that comes while an experiment is read or starts ends its start."""
+        return self._stop_count
+
+    def start_refusal(self) -> str | None:
+        """Return why no experiment can begin, whichever it is, or None."""
         if self._closed:
             return ENDING
-        stops_before = self._stop_count
-        # While an experiment runs the control loop refuses; a stopped arm must not be enabled on the way.
-        if self._control_loop.running is None:
-            reply = await self._robot.send(Enable())
-            if not reply.accepted:
-                return reply.refusal
-            with suppress(TimeoutError):
-                async with asyncio.timeout(ENABLED_WITHIN_S):
-                    while (state := await self._robot.next_state()).blocked:
-                        pass
-                    self._take_state(state)
-        if self._stop_count != stops_before:
-            return "it was stopped during its start"
         if self._actions.unlocking:
-            return "robot and gripper are being unlocked; wait for the end"
+            return UNLOCKING
+        return self._control_loop.start_refusal()
+
+    async def start(self, file: ExperimentFile, stops_before: int | None = None) -> str | None:
+        """Begin an experiment; return None, or why it cannot begin.
+
+        `stops_before` is the `stop_count` at the request, if the file was read since.
+        """
+        if self._closed:
+            return ENDING
+        stops_before = self._stop_count if stops_before is None else stops_before
+        refusal = None
+        # The control loop refuses while an experiment runs or a stop waits for the operator; a stopped arm must not be
+        # enabled on the way.
+        if self._stop_count == stops_before and self._control_loop.start_refusal() is None:
+            refusal = await self._enable()
+        if self._stop_count != stops_before:
+            if not self._closed:
+                self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
+            return STOPPED_AT_START
+        if refusal:
+            return refusal
+        if self._actions.unlocking:
+            return UNLOCKING
         return self._control_loop.start(file, self._clock.now_ns())
+
+    async def _enable(self) -> str | None:
+        """Let the arm move after a power-up, and take a state that shows it; return None, or why not."""
+        reply = await self._robot.send(Enable())
+        if not reply.accepted:
+            return reply.refusal
+        with suppress(TimeoutError):
+            async with asyncio.timeout(ENABLED_WITHIN_S):
+                while (state := await self._robot.next_state()).blocked:
+                    pass
+                self._take_state(state)
+        return None
 
     async def experiment_ended(self) -> Experiment:
         """Return the present or the next experiment once its end has been published, or another one has begun."""

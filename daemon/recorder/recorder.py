@@ -18,7 +18,7 @@ from functools import partial
 from io import FileIO
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from pydantic_core import PydanticSerializationError
@@ -32,6 +32,7 @@ from shearloop.daemon.recorder.writer import PARTIAL, McapFile
 from shearloop.daemon.sensing.frame_estimator import channel_table
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.errors import UserError
+from shearloop.files import read_file
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.
 FLUSH_S = 0.5
@@ -60,12 +61,15 @@ class AttachedFile:
     def read(cls, path: Path) -> tuple["AttachedFile", ...]:
         """Return the file, or nothing if it is missing, unreadable or too large."""
         try:
-            if not path.is_file() or path.stat().st_size > _LARGEST_ATTACHED_BYTES:
-                return ()
-            media_type = "application/yaml" if path.suffix in (".yaml", ".yml") else "application/octet-stream"
-            return (cls(str(path), media_type, path.read_bytes()),)
+            return (cls.of(path, read_file(path, _LARGEST_ATTACHED_BYTES)),)
         except OSError:
             return ()
+
+    @classmethod
+    def of(cls, path: Path, data: bytes) -> Self:
+        """Return a file that has been read."""
+        media_type = "application/yaml" if path.suffix in (".yaml", ".yml") else "application/octet-stream"
+        return cls(str(path), media_type, data)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ than the band demands (the inverse of a play).
 """
 
 import csv
+import io
 import math
 from collections import deque
 from collections.abc import Sequence
@@ -26,6 +27,7 @@ from scipy.special import stdtrit
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.skin.membrane import PAPER_SECTION, UNSTRETCHED, Belt, Direction, ShearInterval, direction_of
+from shearloop.files import open_file
 from shearloop.words import counted
 from shearloop.yaml_files import read_yaml, save_yaml, validated
 
@@ -185,7 +187,7 @@ class _Row(BaseModel):
 def read_table(path: Path) -> CalibrationTable:
     """Return the rows of a CSV file with these columns; raises CalibrationError with the line and column at fault."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with open_file(path) as raw, io.TextIOWrapper(raw, newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file, restkey="a value without a column")
             rows = [validated(row, _Row, f"{path}, line {reader.line_num}", CalibrationError) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:

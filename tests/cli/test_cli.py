@@ -74,6 +74,23 @@ def fingertip(**changes: Any) -> dict[str, Any]:
         ({"commands": "tcp://127.0.0.1:7762a"}, ["commands: must end in a port, a whole number"]),
         ({"commands": "tcp://127.0.0.1"}, ["commands: must end in a port, a whole number"]),
         ({"publish": "ipc:///tmp/both", "commands": "ipc:///tmp/both"}, ["are both ipc:///tmp/both"]),
+        (
+            {"emulated": True, **fingertip(device={"serial_number": "1"})},
+            ["`fingertips.right.device.serial_number: 1`"],
+        ),
+        (
+            {"emulated": True, **fingertip(device={"path": "/dev/ttyACM0"})},
+            ["device.path: /dev/ttyACM0`, a real device"],
+        ),
+        (
+            {"emulated": True, "robot": "ur.yaml", "gripper": {"socket": {"host": "192.168.1.10"}}},
+            ["`gripper.socket.host"],
+        ),
+        (
+            {"autostart": True, "experiment": "one.yaml", "robot": "ur.yaml"},
+            ["`autostart` moves a robot that nobody has"],
+        ),
+        ({"autostart": True, "emulated": True}, ["`autostart` starts no experiment"]),
         ({"experiment": "", "robot": "ur.yaml"}, ["experiment: must be the path of a file, not '.'"]),
         ({"robot": "a\0b"}, ["robot: must be the path of a file"]),
         ({"fingertips": {"Right Hand": {}}}, ["fingertips"]),
@@ -95,6 +112,14 @@ def test_a_configuration_mistake_names_file_key_and_cure(command, changes, parts
     said = mistake(command, str(path))
     assert any(str(path.with_name(name)) in said for name in (path.name, "no.bank", "no.cal"))
     assert [part for part in parts if part not in said] == []
+
+
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_a_real_robot_in_an_emulated_rig_is_refused(command, config, tmp_path, mistake):
+    shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
+    said = mistake(command, str(config(robot="ur.yaml", emulated=True)))
+    assert f"{tmp_path / 'ur.yaml'}: `host: 192.168.1.10` is not this computer" in said
 
 
 @pytest.mark.usefixtures("ur_rtde")

@@ -6,10 +6,9 @@ import pytest
 import yaml
 
 from shearloop.cli import main
-from shearloop.daemon.rig import read_experiment
+from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.ur.settings import read_settings
-from shearloop.errors import UserError
 from tests.fixtures.daemons import collector, running_daemon, shearloop
 
 ROOT = Path(__file__).parents[2]
@@ -74,15 +73,15 @@ OUTSIDE = [
 
 
 @pytest.mark.parametrize(("step", "said"), OUTSIDE)
-def test_what_lies_outside_the_devices_is_refused_by_check_and_by_start(step, said, tmp_path, capsys):
+async def test_what_lies_outside_the_devices_is_refused_by_check_and_by_start(step, said, tmp_path, capsys):
     path = written(tmp_path, {"do": "release"}, step)
     assert main(["check", str(path), "--config", str(rig(tmp_path))]) == 2
     out, err = capsys.readouterr()
     assert f"REFUSED: {said}" in out, "the plan shows where"
     assert f"steps[1]: {said}" in err
     # As `command start` does, before the experiment begins.
-    with pytest.raises(UserError, match="steps"):
-        read_experiment(path, read_settings(ROBOT).limits, MODELS["2F-140"])
+    with pytest.raises(InvalidExperimentError):
+        await ExperimentFiles((tmp_path,), read_settings(ROBOT).limits, MODELS["2F-140"]).read(path)
 
 
 @pytest.mark.parametrize(

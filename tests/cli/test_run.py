@@ -16,7 +16,7 @@ import yaml
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.configured_experiment import ConfiguredExperiment, CrashMarker
+from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
@@ -133,7 +133,8 @@ def robotless(ur_rtde, config, tmp_path) -> Path:  # noqa: ARG001 - it skips
         "gripper": {"socket": {"host": own_address(7)}},
         "load_cell": {"device": {"path": "load"}},
     }
-    return config(**rig, experiment=str(Path("config/experiments/loosen.yaml").resolve()))
+    experiment = str(Path("config/experiments/loosen.yaml").resolve())
+    return config(**rig, experiment=experiment, emulated=True, autostart=True)
 
 
 async def test_stop_cancels_a_waiting_experiment_and_keeps_the_daemon(robotless):
@@ -143,9 +144,9 @@ async def test_stop_cancels_a_waiting_experiment_and_keeps_the_daemon(robotless)
             continue
         reply = await ask(daemon, "stop", spare_daemon=True)
         assert reply == {"ok": True, "stopped": "the start of loosen.yaml"}
-        while not (await health.get())["tasks"]["experiment"]["done"]:
-            continue
         assert await ask(daemon, "stop", spare_daemon=True) == {"ok": True, "stopped": ""}
+        refused = await ask(daemon, "start")
+        assert "a stop has not been acknowledged" in refused["reason"]
 
 
 async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, monkeypatch):
@@ -220,7 +221,7 @@ def waiting_config(ur_rtde, config, tmp_path) -> Path:  # noqa: ARG001 - it skip
     robot_at(own_address(6), tmp_path)
     steps = {"name": "test", "torque_source": "wrench", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
-    return config(robot="ur.yaml", experiment="experiment.yaml", stop_when_done=True)
+    return config(robot="ur.yaml", experiment="experiment.yaml", emulated=True, autostart=True, stop_when_done=True)
 
 
 @pytest.mark.usefixtures("default_signals")
@@ -240,16 +241,27 @@ async def done_experiment() -> SimpleNamespace:
 RUNNER = SimpleNamespace(experiment_ended=done_experiment)
 
 
-async def test_no_experiment_starts_automatically_after_a_crash(waiting_config, tmp_path, monkeypatch, log):
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    crashed = CrashMarker()
-    assert not crashed.left_behind
-    crashed.set()
+async def test_a_configured_experiment_waits_for_the_operator(waiting_config, log):
+    """Whatever connects, and whoever restarts the daemon: only `autostart` starts it without a command."""
+    content = {**yaml.safe_load(waiting_config.read_text()), "autostart": False}
+    waiting_config.write_text(yaml.safe_dump(content))
+    begun: list[Path] = []
+
+    async def start(path: Path) -> str | None:
+        begun.append(path)
+        return None
+
     async with running_daemon(waiting_config) as daemon:
+        daemon._rig.start = start
+        daemon._rig.runner.experiment_ended = done_experiment
         await log.says(LEFT_TO_OPERATOR)
-    assert not daemon.finished
-    assert any("crashed after it had started an experiment" in one for one in log.said)
-    assert not CrashMarker().left_behind, "this one ended in good order"
+        health = collector(daemon, "health")
+        assert (await health.get())["tasks"]["experiment"]["alive"]
+        assert begun == []
+        assert (await ask(daemon, "start"))["ok"]
+        await daemon._end.wait()
+    assert [path.name for path in begun] == ["experiment.yaml"]
+    assert daemon.finished
 
 
 @pytest.mark.parametrize(("own", "finished"), [(True, True), (False, False)])
@@ -278,22 +290,19 @@ async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, wait
     assert daemon.finished is finished
 
 
-@pytest.mark.parametrize("crashed", [False, True], ids=["called off", "after a crash"])
-async def test_a_manually_started_experiment_is_followed_to_its_end(crashed, tmp_path, monkeypatch):
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    if crashed:
-        CrashMarker().set()
+@pytest.mark.parametrize("autostart", [False, True])
+async def test_a_manually_started_experiment_is_followed_to_its_end(autostart, tmp_path):
     path = tmp_path / "experiment.yaml"
 
     async def not_yet(_path: Path) -> str | None:
         experiment.call_off()
         return "the gripper is not ready"
 
-    experiment = ConfiguredExperiment(path, SimpleNamespace(start=not_yet, runner=RUNNER))
+    rig = SimpleNamespace(start=not_yet, runner=RUNNER)
+    experiment = ConfiguredExperiment(path, rig, autostart=autostart)
     async with deadline("the experiment was not seen to its end"), asyncio.TaskGroup() as group:
-        await experiment.run()
-        assert not experiment.has_begun.is_set()
-        running = group.create_task(experiment.wait_for_end())
+        running = group.create_task(experiment.run())
+        await asyncio.sleep(0)
         experiment.on_begun(tmp_path / "another.yaml")
         await asyncio.sleep(0)
         assert not running.done()
@@ -312,26 +321,16 @@ async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(
         begun.append(path)
         raise UserError("the file is none")
 
-    experiment = ConfiguredExperiment(tmp_path / "experiment.yaml", SimpleNamespace(start=begin, runner=RUNNER))
+    rig = SimpleNamespace(start=begin, runner=RUNNER)
+    experiment = ConfiguredExperiment(tmp_path / "experiment.yaml", rig, autostart=True)
     with pytest.raises(UserError):
         await experiment.run()
     if by == "stop":
         assert experiment.call_off() == experiment.path
     else:
         experiment.on_begun(tmp_path / "another.yaml")
-    await experiment.run()
+    async with asyncio.TaskGroup() as group:
+        running = group.create_task(experiment.run())
+        await asyncio.sleep(0)
+        running.cancel()
     assert not experiment.has_begun.is_set()
-
-
-def test_no_crash_marker_without_a_service_manager(monkeypatch):
-    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
-    mark = CrashMarker()
-    mark.set()
-    mark.clear()
-    assert not CrashMarker().left_behind
-
-
-def test_a_failing_crash_marker_is_reported(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "nowhere"))
-    CrashMarker().set()
-    assert "cannot write the crash marker" in capsys.readouterr().out

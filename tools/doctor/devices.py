@@ -16,8 +16,9 @@ from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.sensing.frame_estimator import fingertip_table
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.messages import ActivationStatus
-from shearloop.drivers.ur.control_box import query_controller, untested_sentence
+from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
+from shearloop.drivers.ur.control_box import REMOTE_CURE, check_ports, query_controller, untested_sentence
+from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 from shearloop.tools.doctor.boards import (
@@ -69,9 +70,8 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
     finally:
         await client.close()
     if state.flt:
-        found = f"{client.name} answers, with fault {state.flt}"
-        cure = "clear the fault, then `shearloop command unlock`"
-        return [trouble("gripper", found, "it does not move", cure)]
+        found = f"{client.name} answers, with fault {state.flt}: {fault_of(state.flt).sentence}"
+        return [from_error("gripper", found, "it does not move", "`shearloop command unlock`")]
     if state.sta is not ActivationStatus.ACTIVE:
         cure = "keep fingers and tools away when the daemon starts"
         return [note("gripper", f"{client.name} answers; not activated", "it opens and closes once at the start", cure)]
@@ -81,6 +81,10 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
 def _check_robot(settings: Path) -> Iterator[Finding]:
     try:
         host = read_settings(settings).host
+        try:
+            check_ports(host, ROBOT_TIMEOUT_S)
+        except RobotLostError as error:
+            yield from_error("robot's ports", error, "the daemon cannot drive the robot without them")
         seen = query_controller(host, ROBOT_TIMEOUT_S)
     except DriverError as error:
         cure = "look at the teach pendant, and check the cable and `host` in the robot's settings"
@@ -94,8 +98,7 @@ def _check_robot(settings: Path) -> Iterator[Finding]:
         yield good("robot", answers)
     if seen.remote is False:
         means = "it accepts no motion from the network"
-        cure = "switch it to remote control, top right on the teach pendant"
-        yield trouble("remote control", "the robot is in local control", means, cure)
+        yield trouble("remote control", "the robot is in local control", means, REMOTE_CURE)
     else:
         yield good("remote control", "on" if seen.remote else "this controller has no such mode")
     mode = f"robot mode {seen.robot_mode}, safety mode {seen.safety_mode}"

@@ -10,7 +10,8 @@ import pytest
 
 from shearloop.daemon.control.control_loop import LOADED_NM, ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
-from shearloop.daemon.control.experiment_schema import ExperimentFile, check_steps, first_motion
+from shearloop.daemon.control.experiment_check import check_steps
+from shearloop.daemon.control.experiment_schema import ExperimentFile, first_motion
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample
 from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
 from shearloop.drivers.errors import DriverError

@@ -39,6 +39,7 @@ from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
+from shearloop.errors import UserError
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:

@@ -7,7 +7,11 @@ export OPENBLAS_NUM_THREADS := 1
 # Without bytecode files every test process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install install-dev system-packages demo demo-python docs docs-site test test-fast lint format clean
+# `make CONSTRAINTS=constraints.txt …` installs the versions that the checks run with; without it, the newest allowed.
+CONSTRAINTS ?=
+PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS))
+
+.PHONY: lock coverage install install-dev system-packages demo demo-python docs docs-site test test-fast lint format clean
 
 # Before anything is installed.
 demo-python:
@@ -20,15 +24,15 @@ install-dev: $(VENV)/.installed-dev
 $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.version_info >= (3, 11) or sys.exit(f"Python {v} is too old: shearloop needs 3.11 or later, e.g. `make demo PYTHON=python3.12`.")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[plot,view]'
+	$(PIP_INSTALL) --editable '.[plot,view]'
 	touch $@
 
 $(VENV)/.installed-exports: pyproject.toml $(VENV)/.installed
-	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[export,rerun]'
+	$(PIP_INSTALL) --editable '.[export,rerun]'
 	touch $@
 
 $(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
-	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]'
+	$(PIP_INSTALL) --editable '.[dev]'
 	touch $@
 
 # Debian packages for the tests of the service and of the live page, which are skipped without them.
@@ -61,6 +65,14 @@ FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.
 	$(addprefix tests/daemon/test_,config_file.py process.py settings.py)
 test-fast: install-dev
 	$(PYTEST) -n 3 --dist loadfile -m 'not real_time' $(PYTEST_ARGS) $(FAST)
+
+# Lines and branches that the tests run in their own process; what runs in processes of its own is not seen.
+coverage: install-dev
+	$(PYTEST) -n 2 --dist loadfile -m 'not real_time' --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(PYTEST_ARGS)
+
+lock: install-dev
+	{ echo '# The versions that the checks run with. `make lock` writes this file from the environment.'; \
+	  $(BIN)/python -m pip freeze --exclude-editable; } >constraints.txt
 
 lint: install-dev
 	$(BIN)/ruff check .

@@ -264,8 +264,8 @@ class DaemonConfig(ConfigModel):
 
     @model_validator(mode="after")
     def _loop_is_whole(self) -> "DaemonConfig":
-        if not self.fingertips and self.skin is None:
-            raise ValueError("nothing is measured: give `fingertips`, a `skin`, or both")
+        if not self.fingertips and self.skin is None and self.load_cell is None:
+            raise ValueError("nothing is measured: give `fingertips`, a `skin` or a `load_cell`")
         if taken := sorted(TAKEN_NAMES & self.fingertips.keys()):
             text = f"a fingertip cannot be named {taken[0]!r}, as another part of the daemon is"
             raise ValueError(f"{text}: try right or left")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.printable import printable
 from shearloop.words import counted, times
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ class RunSummary:
     def _add(self, text: str) -> None:
         self.text = f"{self.text}\n{text}".lstrip("\n")
         if self._out is not None:
-            self._out.write(f"\n{text}\n\n")
+            self._out.write(f"\n{printable(text)}\n\n")
 
 
 def _came_late(reason: str) -> bool:

@@ -171,7 +171,7 @@ def _open_error(path: str, error: serial.SerialException) -> DriverError:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.EIO:
             return DeviceNotFoundError(f"There is no serial port {path}; {_available_ports()}.")
         case errno.EACCES | errno.EPERM:
-            return DeviceUnavailableError(f"This user may not open {path}; add the user to the port's group.")
+            return DeviceUnavailableError(f"This user may not open {path}; `shearloop ports` names the cure.")
         case errno.EAGAIN | errno.EBUSY:
             return DeviceUnavailableError(f"{path} is in use by another program; close that first.")
     return DeviceUnavailableError(f"{path} cannot be opened as a serial port: {error}.")

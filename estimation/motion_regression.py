@@ -269,8 +269,8 @@ def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
     clear: BoolArray = squares > max(_CLEAR * noise, _ROUNDING * float(squares[-1]))
     clear[-1] = True
     squares, modes = squares[clear], modes[:, clear]
-    # One recording under several diameters would give an infinitely steep line.
-    least = _ROUNDING * noise + math.sqrt(np.finfo(np.float64).tiny)
+    # One recording under several diameters differs by rounding alone, and would give an arbitrarily steep line.
+    least = _ROUNDING * noise + float(np.finfo(np.float64).eps * (positions**2).sum())
     true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
     along = centred.T @ (modes @ (modes.T @ (diameters - diameters.mean()) / true))
     mean = np.mean([one.position.mean(axis=0) for one in grips], axis=0)

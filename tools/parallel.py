@@ -15,7 +15,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing import active_children, get_context
-from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from shearloop.errors import UserError, missing
@@ -63,7 +62,6 @@ class ProcessExecutor:
             raise UserError("a process was killed, perhaps for lack of memory; run again with fewer --jobs") from error
         finally:
             if wanted:
-                _unblock_queue(pool)
                 for process in active_children():
                     if process not in others:
                         process.terminate()
@@ -74,13 +72,6 @@ def _ignore_terminal() -> None:
     """Leave Ctrl-C and a closed terminal to the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-
-
-def _unblock_queue(pool: ProcessPoolExecutor) -> None:
-    """Let a large task that is being sent fail: Python before 3.11.5 waits forever (CPython issue 94777)."""
-    if sys.version_info < (3, 11, 5):
-        reader: Connection = vars(vars(pool)["_call_queue"])["_reader"]
-        reader.close()
 
 
 class DaskExecutor:

@@ -8,6 +8,7 @@ A message has two ZeroMQ frames: the topic and a msgpack map. Scalars are plain 
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, ClassVar, TypeAlias, TypeVar, dataclass_transform
 
 import msgpack
@@ -247,6 +248,7 @@ class Health(Message):
         "", "per task: alive, done, restarts, rate_hz, expected_hz, errors by kind, and the latest error in a sentence"
     )
     emulated: bool = column("", "whether every device is emulated, by `emulated: true` in the configuration")
+    tare_refusal: str = column("", "why `tare` is refused now, in a sentence; empty when it is not")
     loop_lag_s: float = column("s", "how late the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")
     cpu_percent: float = column("%", "of one core since the message before")
@@ -258,6 +260,14 @@ class DaemonEnd(Message):
 
     finished: bool = column("", "whether the experiment of `stop_when_done` is done; true without one")
     summary: str = column("", "summary of the last experiment, in lines; empty without one")
+
+
+@cache
+def units(topic: str) -> Mapping[str, str]:
+    """Return the unit of each key of a topic that has one; empty for an unknown topic."""
+    fields = dataclasses.fields(TOPICS[topic]) if topic in TOPICS else ()
+    envelope = {"timestamp": "s", "t_mono_ns": "ns"} if topic in TOPICS else {}
+    return {**envelope, **{item.name: item.metadata["unit"] for item in fields if item.metadata.get("unit")}}
 
 
 def stale_after_s(topic: str) -> float:

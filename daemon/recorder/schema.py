@@ -42,6 +42,9 @@ END_METADATA = "shearloop.end"
 CONFIGURATION = "configuration.json"
 # The numbers of k and sigma of a heatmap; other arrays have one dimension.
 SCORES_SHAPE = "scores_shape"
+ARRIVAL = "arrival_unix_ns"
+# The keys of an imported message, which has no source.
+IMPORTED_KEYS: Mapping[str, tuple[str, ...]] = {FRAME_TOPIC: (ARRIVAL, "line"), LOAD_TOPIC: ("torque_nm",)}
 SIDES = ("right", "left")
 # Metadata key of the tool's diameter in mm. The gripper opens no wider than the largest.
 DIAMETER_NOTE = "diameter_mm"
@@ -132,13 +135,6 @@ def schemas() -> Mapping[str, dict[str, Any]]:
     }
 
 
-def with_missing_keys(topic: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a recorded message with None for the keys that were left out."""
-    # An imported message has no source and never had the other keys.
-    absent = _optional_keys(topic) if topic in TOPICS and "source" in content else ()
-    return {**content, **{key: None for key in absent if key not in content}}
-
-
 def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> bytes:
     """Return a message's map as JSON: float32 arrays or their bytes as flat lists, without keys that have no value."""
     plain: dict[str, Any] = {}
@@ -152,7 +148,7 @@ def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> byte
         elif value is not None and (not key.endswith("_shape") or key == SCORES_SHAPE):
             plain[key] = value
     if topic == EitFrame.topic:
-        plain["arrival_unix_ns"] = content["t_mono_ns"] + round(content["age_s"] * 1e9) + offset_ns
+        plain[ARRIVAL] = content["t_mono_ns"] + round(content["age_s"] * 1e9) + offset_ns
     return as_json(plain)
 
 
@@ -181,7 +177,7 @@ def _mapping_as_dict(value: Any) -> Any:
 
 
 @cache
-def _optional_keys(topic: str) -> tuple[str, ...]:
+def optional_keys(topic: str) -> tuple[str, ...]:
     """Return the keys that a message leaves out if they have no finite value."""
     hints = typing.get_type_hints(TOPICS[topic])
     names = (item.name for item in dataclasses.fields(TOPICS[topic]))
@@ -198,16 +194,14 @@ def _message_schema(topic: str) -> dict[str, Any]:
         unit, meaning = item.metadata.get("unit", ""), item.metadata.get("meaning", "")
         described = f"{meaning} ({unit})" if unit else meaning
         properties[item.name] = {**json_type(hints[item.name]), "description": described}
-    required = [name for name in properties if name not in _optional_keys(topic)]
+    required = [name for name in properties if name not in optional_keys(topic)]
     if topic == FRAME_TOPIC:
-        properties["arrival_unix_ns"] = {"type": "integer", "description": "arrival of the line's last byte"}
-        # An imported frame has no other keys.
-        required = ["arrival_unix_ns", "line"]
+        properties[ARRIVAL] = {"type": "integer", "description": "arrival of the line's last byte"}
     elif topic == EitHeatmap.topic:
         numbers = {"type": "array", "items": {"type": "integer"}}
         properties[SCORES_SHAPE] = {**numbers, "description": "numbers of k and of sigma"}
-    elif topic == LOAD_TOPIC:
-        required = []
+    if topic in IMPORTED_KEYS:
+        required = [key for key in IMPORTED_KEYS[topic] if key not in optional_keys(topic)]
     return _object(topic, properties, required)
 
 

@@ -130,7 +130,7 @@ class MotionExecutor:
             case WristSpeed(), _Move():
                 return "A linear move is under way: stop it."
             case MoveLinear(pose), _ if outside := self._settings.limits.workspace.why_outside(pose[:3]):
-                return f"The linear move's end at {outside}."
+                return f"The linear move would end at {outside}; nothing moves."
             case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:
                 return "A linear move needs a speed and an acceleration above 0."
             case MoveLinear(), motion if isinstance(motion, _Move | _Braking) or not sample.rests:

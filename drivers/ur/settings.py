@@ -144,7 +144,7 @@ class Workspace(_Checked):
             lowest, highest = low + self.margin_m, high - self.margin_m
             if not lowest <= value <= highest:
                 box = f"{lowest:g} to {highest:g} m with its margin"
-                return f"{axis} = {value:g} m is outside the robot's workspace, {box}"
+                return f"{axis} = {value:g} m, outside the robot's workspace, which is {box}"
         return ""
 
 

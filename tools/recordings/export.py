@@ -1,6 +1,7 @@
 """Exports topics of a recording as tables: CSV or Parquet, a file per topic, or MATLAB, all topics in a file."""
 
-import csv
+import re
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from scipy.io import savemat
 
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
+from shearloop.tools.recordings.columns import columns
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import read_messages
 from shearloop.tools.recordings.tables import Rows, arrays, columns_of, read_rows, row_of
@@ -20,6 +22,10 @@ _BATCH = 200_000
 # Largest size of the messages in one MATLAB file, in numbers of eight bytes; a key of a message counts as ten. It
 # bounds the memory and keeps each variable below the format's 2 GB.
 _MAT_SIZE, _KEY_SIZE = 12_000_000, 10
+# MATLAB takes 63 characters.
+_LONGEST_NAME = 59
+# A cell with one of these stands in quotes.
+_QUOTED = re.compile(r'[",\r\n]')
 
 
 def export(path: Path, form: str, out: Path, topics: list[str], progress: Progress = lambda _: None) -> list[Path]:
@@ -41,11 +47,12 @@ def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) ->
     if part(2).exists():
         raise UserError(f"{part(2)} exists and would look like a part of this export; remove it, or use another --out")
     written: list[Path] = []
+    names = _struct_names(topics)
     waiting: dict[str, Rows] = {topic: [] for topic in topics}
     size = 0
 
     def write() -> None:
-        structs = {topic.replace(".", "_").replace("-", "_"): arrays(rows) for topic, rows in waiting.items() if rows}
+        structs = {name: arrays(waiting[topic]) for topic, name in names.items() if waiting[topic]}
         target = part(len(written) + 1)
         # savemat changes names and hides the reason if it opens the file itself.
         with target.open("xb" if written else "wb") as file:
@@ -62,6 +69,19 @@ def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) ->
     if size or not written:
         write()
     return written
+
+
+def _struct_names(topics: Iterable[str]) -> dict[str, str]:
+    """Return a name of MATLAB for each topic, and number those that would be alike: `eit.frame.a-b` and `….a_b`."""
+    names: dict[str, str] = {}
+    for topic in topics:
+        plain = re.sub(r"\W", "_", topic, flags=re.ASCII)[:_LONGEST_NAME]
+        number, name = 1, plain
+        while name in names.values():
+            number += 1
+            name = f"{plain}_{number}"
+        names[topic] = name
+    return names
 
 
 def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress: Progress) -> list[Path]:
@@ -87,32 +107,36 @@ class _CsvTable:
     def __init__(self, path: Path, first: dict[str, Any]) -> None:
         """Write the names of the columns, as in the first row."""
         self._path = path
+        self._scalars = [key for key, value in first.items() if not isinstance(value, list)]
+        self._lengths = {key: len(value) for key, value in first.items() if isinstance(value, list)}
         self._file = path.open("w", newline="", encoding="utf-8")
-        self._table = csv.writer(self._file, lineterminator="")
-        names = [key for key, value in first.items() if not isinstance(value, list)]
-        arrays = {key: value for key, value in first.items() if isinstance(value, list)}
-        names += [f"{key}_{i}" for key, value in arrays.items() for i in range(len(value))]
-        self._width = len(names)
-        self._table.writerow(names)
-        self._file.write("\r\n")
+        elements = [f"{key}_{i}" for key, length in self._lengths.items() for i in range(length)]
+        self._file.write(",".join([*self._scalars, *elements]) + "\r\n")
 
     def add(self, row: dict[str, Any]) -> None:
-        """Write one row; raises UserError if it has other columns than the first."""
-        cells = [value for value in row.values() if not isinstance(value, list)]
-        arrays = [value for value in row.values() if isinstance(value, list)]
-        width = len(cells) + sum(map(len, arrays))
-        if width != self._width:
-            raise UserError(
-                f"{self._path}: the first message has {self._width} values and a later one {width}; use --format mat"
-            )
-        self._table.writerow(cells)
+        """Write one row by the names of its values; raises UserError if an array has another length than the first."""
+        for key, length in self._lengths.items():
+            if len(row[key]) != length:
+                raise UserError(
+                    f"{self._path}: the first message has {length} values of {key} and a later one {len(row[key])}; "
+                    "use --format mat"
+                )
+        cells = [_csv_cell(row[key]) for key in self._scalars]
         # The csv module takes ten times as long for numbers.
-        text = b"".join(b"," + to_json(value)[1:-1] for value in arrays if value).replace(b"null", b"").decode()
-        self._file.write(f"{text}\r\n")
+        cells += [to_json(row[key])[1:-1].replace(b"null", b"").decode() for key in self._lengths if row[key]]
+        self._file.write(",".join(cells) + "\r\n")
 
     def close(self) -> None:
         """End the file."""
         self._file.close()
+
+
+def _csv_cell(value: Any) -> str:
+    """Return a scalar as a cell of CSV: empty for None, in quotes where it holds a comma, a quote or a line's end."""
+    if value is None:
+        return ""
+    text = str(value)
+    return '"' + text.replace('"', '""') + '"' if _QUOTED.search(text) else text
 
 
 class _ParquetTable:
@@ -123,15 +147,12 @@ class _ParquetTable:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        types = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string", "object": "string"}
-
-        def arrow_type(described: dict[str, Any]) -> Any:
-            if described["type"] == "array":
-                return pa.list_(arrow_type(described["items"]))
-            return pa.type_for_alias(types[described["type"]])
-
-        described = {"log_time_ns": {"type": "integer"}, **schema.schemas()[schema.schema_name(topic)]["properties"]}
-        self._schema = pa.schema([(key, arrow_type(described[key])) for key in first])
+        names = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string", "object": "string"}
+        types = {kind: pa.type_for_alias(name) for kind, name in names.items()}
+        types["array"] = pa.list_(types["number"])
+        known = columns(schema.schema_name(topic))
+        kinds = {key: known[key].kind if key in known else "integer" for key in first}
+        self._schema = pa.schema([(key, types[kind]) for key, kind in kinds.items()])
         self._arrays = [field.name for field in self._schema if field.type == pa.list_(pa.float64())]
         scalars = [field.name for field in self._schema if not pa.types.is_list(field.type)]
         # Measured values seldom repeat: a dictionary of them would only cost time, and so would limits of arrays.
@@ -142,7 +163,7 @@ class _ParquetTable:
     def add(self, row: dict[str, Any]) -> None:
         """Add one row."""
         # Arrow takes twice as long for a list.
-        arrays = {key: np.array(row[key], dtype=np.float64) for key in self._arrays if row.get(key) is not None}
+        arrays = {key: np.array(row[key], dtype=np.float64) for key in self._arrays}
         self._rows.append(row | arrays)
         if len(self._rows) == self._rows_at_once:
             self._write()

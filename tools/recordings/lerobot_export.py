@@ -24,8 +24,9 @@ from shearloop.daemon.messaging.messages import (
 )
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
+from shearloop.tools.recordings.columns import ContentError, check_length
 from shearloop.tools.recordings.intact_records import Progress
-from shearloop.tools.recordings.reader import open_recording, read_messages, reading
+from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
 
 ROWS_PER_S = 25
 _PERIOD_NS = 10**9 // ROWS_PER_S
@@ -51,7 +52,7 @@ _FEATURES: Mapping[str, tuple[str, str]] = {
     ),
 }
 # Keys of six numbers.
-_VECTORS = ("joints_rad", "tcp_pose", "wrench")
+_VECTORS, _VECTOR = ("joints_rad", "tcp_pose", "wrench"), 6
 
 # When the daemon had a message, its number, topic and content, and when it was measured.
 _Known: TypeAlias = tuple[int, int, str, dict[str, Any], int]
@@ -69,7 +70,7 @@ class _Held:
         self._keys = keys.split()
         self.names = [f"channel_{i}" for i in range(table.n_channels)] if self._table else []
         for key in self._keys:
-            self.names += [f"{key}_{i}" for i in range(6)] if key in _VECTORS else [key]
+            self.names += [f"{key}_{i}" for i in range(_VECTOR)] if key in _VECTORS else [key]
         values = [0.0 if name == "valid" else np.nan for name in self.names]
         self.vector: NDArray[np.float32] = np.array(values, dtype=np.float32)
         self.measured_ns: int | None = None
@@ -78,11 +79,17 @@ class _Held:
         """Keep a message."""
         if self._table is not None:
             line = np.array(content["line"], dtype=np.float64)
-            self.vector = self._table.channels_of_line(line).astype(np.float32)
+            check_length("line", len(line), self._table.n_line_values)
+            vector = self._table.channels_of_line(line)
         else:
             # An imported torque has no `valid`, and counts as valid.
-            values = [np.ravel(content.get(key, key == "valid")) for key in self._keys]
-            self.vector = np.concatenate(values).astype(np.float32)
+            values = {key: np.ravel(content.get(key, key == "valid")) for key in self._keys}
+            for key, value in values.items():
+                check_length(key, len(value), _VECTOR if key in _VECTORS else 1)
+            vector = np.concatenate([values[key].astype(np.float64) for key in self._keys])
+        # A number beyond float32 becomes infinite.
+        with np.errstate(over="ignore"):
+            self.vector = vector.astype(np.float32)
         self.measured_ns = measured_ns
 
     def age_s(self, now_ns: int) -> float:
@@ -127,7 +134,10 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
     with open_recording(path) as recording:
         attachments = recording.attachments()
         held = {topic: _Held(topic, recording.table) for topic in topics if schema.schema_name(topic) in _FEATURES}
-        configuration = json.loads(attachments.pop(schema.CONFIGURATION, b"null"))
+        try:
+            configuration = json.loads(attachments.pop(schema.CONFIGURATION, b"null"))
+        except (ValueError, RecursionError) as error:
+            raise ContentError(f"the attachment {schema.CONFIGURATION} is not JSON ({error})") from error
     if not held:
         raise UserError(f"{path}: nothing to export; a dataset needs one of the topics {', '.join(_FEATURES)}")
     dataset = _Dataset(out, held)
@@ -174,7 +184,7 @@ class _Dataset:
                     if len(rows) == _BATCH:
                         writer.write_table(self._table(rows))
                         rows.clear()
-                with reading(path):
+                with refusing_content(path, topic):
                     self._held[topic].hold(content, measured_ns)
             if now_ns >= 0:
                 rows.append(self._row(now_ns))
@@ -204,10 +214,13 @@ class _Dataset:
         for number, (topic, content, message) in enumerate(read_messages(path, self._held, progress)):
             if number == 0:
                 self._started_ns = message.log_time
-            with reading(path):
-                known_ns = max(message.publish_time, message.log_time, content.get("arrival_unix_ns") or 0)
-                if known_ns - self._started_ns > _LONGEST_NS:
-                    raise ValueError("its times span more than a day")
+            known_ns = max(message.publish_time, message.log_time, content.get(schema.ARRIVAL) or 0)
+            if known_ns - self._started_ns > _LONGEST_NS:
+                hours = (known_ns - self._started_ns) / 3.6e12
+                raise UserError(
+                    f"{path}: its messages span {hours:.0f} hours, and a dataset holds 24 at most; export it with "
+                    "--format parquet"
+                )
             heapq.heappush(waiting, (known_ns, number, topic, content, message.log_time))
             while waiting[0][0] < message.log_time:
                 yield heapq.heappop(waiting)

@@ -30,6 +30,7 @@ from shearloop.drivers.serial_sensor import InputKind
 from shearloop.errors import UserError
 from shearloop.estimation import Measured
 from shearloop.files import open_file, replace_file
+from shearloop.tools.recordings.columns import ContentError, OtherKeysError, check_time, read_content
 from shearloop.tools.recordings.intact_records import (
     LARGEST_RECORD_BYTES,
     IntactRecords,
@@ -39,6 +40,7 @@ from shearloop.tools.recordings.intact_records import (
 )
 
 _NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
+_OTHER_PROGRAM = "another program made or changed this recording: record or import it again"
 # Metadata of every recording; the other keys are notes of this one.
 _IDENTITY_KEYS = ("format_version", "channel_table_hash", "electrodes", "injection", "software", "code_sha256")
 
@@ -104,6 +106,8 @@ class OpenRecording:
         # By the records' names.
         self.metadata = {record.name: dict(record.metadata) for record in self._reader.iter_metadata()}
         self.identity, self.table = _checked_identity(path, self.metadata.get(schema.METADATA))
+        # By topic, whether its messages have no source.
+        self._imported: dict[str, bool] = {}
 
     def attachments(self) -> dict[str, bytes]:
         """Return the attached files by name."""
@@ -115,6 +119,19 @@ class OpenRecording:
         """Return the messages of some topics or of all, by log time or in the order of the file."""
         found = self._reader.iter_messages(topics, log_time_order=by_time)
         return ((channel, message) for _, channel, message in found)
+
+    def content(self, channel: Channel, message: Message) -> dict[str, Any]:
+        """Return a message's content by the names of its topic; raises ContentError and UnknownTopicError."""
+        try:
+            content = read_content(channel.topic, message.data)
+            check_time("its log time", message.log_time)
+            check_time("its publish time", message.publish_time)
+            imported = "source" not in content
+            if imported != self._imported.setdefault(channel.topic, imported):
+                raise ContentError("it has other keys than the first one")
+        except ContentError as error:
+            raise type(error)(f"{channel.topic}, number {message.sequence}: {error}") from error
+        return content
 
 
 @contextmanager
@@ -145,14 +162,27 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
     with reading(path), open_file(path) as file:
         check_magic(path, file)
         recording = OpenRecording(path, file)
+        other = f"version {recording.identity.get('software', 'unknown')} wrote this recording: read it with that "
+        other += "version, or export other topics"
         try:
             yield recording
         except schema.UnknownTopicError as error:
             raise UserError(
-                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; version "
-                f"{recording.identity.get('software', 'unknown')} wrote this recording: read it with that version, or "
-                "export other topics"
+                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; {other}"
             ) from error
+        except ContentError as error:
+            ours = recording.identity.get("code_sha256") == schema.code_digest()
+            cure = other if isinstance(error, OtherKeysError) and not ours else _OTHER_PROGRAM
+            raise UserError(f"{path}: a message cannot be used: {error}; {cure}") from error
+
+
+@contextmanager
+def refusing_content(path: Path, topic: str) -> Iterator[None]:
+    """Turn a ContentError of one message of a topic into a UserError."""
+    try:
+        yield
+    except ContentError as error:
+        raise UserError(f"{path}: a message cannot be used: {topic}: {error}; {_OTHER_PROGRAM}") from error
 
 
 def read_messages(
@@ -164,8 +194,7 @@ def read_messages(
     """
     with open_recording(path) as recording:
         for number, (channel, message) in enumerate(recording.messages(topics), start=1):
-            live = schema.schema_name(channel.topic)
-            yield channel.topic, schema.with_missing_keys(live, from_json(message.data)), message
+            yield channel.topic, recording.content(channel, message), message
             progress(number)
 
 

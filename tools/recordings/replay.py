@@ -40,6 +40,7 @@ from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
+from shearloop.tools.recordings.columns import ContentError
 from shearloop.tools.recordings.reader import open_recording, reading
 from shearloop.yaml_files import validated
 
@@ -117,11 +118,11 @@ class RecordedRun:
             # An imported recording has one side after the other, a live one is in order.
             recorded = recording.messages(by_time=not self.has_inputs)
             for number, (channel, message) in enumerate(recorded):
-                content = json.loads(message.data)
-                if self.has_inputs:
-                    yield _live_event(channel.topic, content)
-                else:
+                content = recording.content(channel, message)
+                if schema.schema_name(channel.topic) in schema.IMPORTED_KEYS and "source" not in content:
                     yield _imported_event(channel.topic, content, message.log_time, number)
+                else:
+                    yield _live_event(channel.topic, content)
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
@@ -346,7 +347,7 @@ def _live_event(topic: str, content: dict[str, Any]) -> RecordedEvent:
     if live == schema.INPUT:
         raw = schema.input_event(content)
         return RecordedEvent(topic, raw.t_ns, content, topic.removeprefix(schema.input_topic("")), raw)
-    return RecordedEvent(live, content["t_mono_ns"], schema.with_missing_keys(live, content), content["source"])
+    return RecordedEvent(live, content["t_mono_ns"], content, content["source"])
 
 
 def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: int) -> RecordedEvent:
@@ -354,7 +355,7 @@ def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: in
         # The line as the board sent it: four decimals, each followed by a comma and a space.
         values = np.asarray(content["line"], dtype=np.float64)
         if math.isqrt(values.size) ** 2 != values.size:
-            raise ValueError(f"a line of {values.size} values")
+            raise ContentError(f"{topic}: a line of {values.size} values")
         text = "".join(f"{value:.4f}, " for value in values.tolist()) + "\r\n"
         side, t_ns = topic.removeprefix(f"{schema.FRAME_TOPIC}."), int(content["arrival_unix_ns"])
         return RecordedEvent(schema.input_topic(side), t_ns, {}, side, RawEvent(InputKind.DATA, t_ns, text.encode()))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.fingertip import Fingertip
-from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage
+from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage, units
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.web.message_store import conductivity_profile
 from shearloop.errors import require
@@ -20,9 +20,10 @@ TIMELINE = "time"
 _BATCH, _IMAGE_BATCH = 1000, 30
 # Longer arrays are frames and heatmaps.
 _LONGEST_SCALARS = 8
+_POSE = 6
 _NOT_SHOWN = (*ENVELOPE, "scores", schema.SCORES_SHAPE)
-# One chart for each unit, by the end of the keys.
-_CHARTS = {"torque (N·m)": "_nm", "diameter (mm)": "_mm", "shear force (N)": "_n", "angle (rad)": "_rad"}
+# The charts, each of one unit.
+_CHARTS = {"N·m": "torque (N·m)", "mm": "diameter (mm)", "N": "shear force (N)", "rad": "angle (rad)"}
 
 
 class _RerunFile:
@@ -41,21 +42,22 @@ class _RerunFile:
         self._models: dict[str, str] = {}
         self._images: set[str] = set()
         self._poses: set[str] = set()
+        # By entity.
+        self._units: dict[str, str] = {}
 
     def add(self, topic: str, content: Mapping[str, Any], t_ns: int) -> None:
         """Add one message of a recorded topic."""
-        entity = topic.replace(".", "/")
+        entity, live = self._rr.new_entity_path(topic.split(".")).lstrip("/"), schema.schema_name(topic)
         for key, value in content.items():
             if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in _NOT_SHOWN:
                 continue
             if isinstance(value, bool | int | float | list):
+                self._units.setdefault(f"{entity}/{key}", units(live).get(key, ""))
                 self._add(f"{entity}/{key}", value, t_ns)
-        live = schema.schema_name(topic)
         if live == EitHeatmap.topic:
             self._models[content["source"]] = content["model"]
-            # Recordings of 0.1 have no shape.
-            if shape := content.get(schema.SCORES_SHAPE):
-                self._add_image(f"{entity}/scores", np.array(content["scores"], float).reshape(shape), t_ns)
+            shape = [int(side) for side in content[schema.SCORES_SHAPE]]
+            self._add_image(f"{entity}/scores", np.array(content["scores"], float).reshape(shape), t_ns)
         elif live == EitEstimate.topic and content["k"] is not None and content["sigma"] is not None:
             model = self._models.get(content["source"], "")
             profile = conductivity_profile(model, content["k"], content["sigma"], self._height_cm)
@@ -64,7 +66,7 @@ class _RerunFile:
                 column = np.array(profile)[::-1, None] / 2
                 width = round(len(column) * self._width_cm / self._height_cm)
                 self._add_image(f"{entity}/conductivity", np.repeat(column, width, axis=1), t_ns)
-        elif live == RobotStateMessage.topic and None not in content["tcp_pose"]:
+        elif live == RobotStateMessage.topic and len(content["tcp_pose"]) == _POSE and None not in content["tcp_pose"]:
             self._add_pose(f"{entity}/tool_centre", content["tcp_pose"], t_ns)
 
     def close(self) -> None:
@@ -77,6 +79,9 @@ class _RerunFile:
 
     def _add(self, entity: str, value: Any, t_ns: int) -> None:
         times, values = self._waiting.setdefault(entity, ([], []))
+        # The values of a batch have one shape.
+        if values and np.shape(values[0]) != np.shape(value) and entity not in self._images:
+            self._send(entity)
         times.append(t_ns)
         values.append(value)
         if len(times) == (_IMAGE_BATCH if entity in self._images else _BATCH):
@@ -120,7 +125,10 @@ class _RerunFile:
     def _layout(self) -> Any:
         from rerun import blueprint
 
-        charted = {name: [one for one in self._waiting if one.endswith(end)] for name, end in _CHARTS.items()}
+        charted = {
+            name: [entity for entity in self._waiting if self._units.get(entity) == unit]
+            for unit, name in _CHARTS.items()
+        }
         charts = [blueprint.TimeSeriesView(name=name, contents=lines) for name, lines in charted.items() if lines]
         images = [blueprint.Spatial2DView(name=one, origin=one) for one in sorted(self._images)]
         poses = [blueprint.Spatial3DView(name=one, contents=[one]) for one in sorted(self._poses)]

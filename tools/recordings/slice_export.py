@@ -21,9 +21,10 @@ from shearloop.daemon.messaging.messages import EitFrame, GripperStateMessage, L
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError
 from shearloop.files import replace_file
+from shearloop.tools.recordings.columns import ContentError, check_length
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.matlab_import import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
-from shearloop.tools.recordings.reader import open_recording, read_messages
+from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.
 WINDOW_FRAMES, STD_FRAMES = 9, 9 / 5
@@ -60,7 +61,8 @@ def export_slices(
     # Only a control loop holds angles; imported recordings have none.
     used = [topic for topic in topics if schema.schema_name(topic) in _TOPICS] if LoopState.topic in topics else []
     for topic, content, _ in read_messages(path, used, progress):
-        found = sweep.add(schema.schema_name(topic), content)
+        with refusing_content(path, topic):
+            found = sweep.add(schema.schema_name(topic), content)
         if isinstance(found, _Slice):
             written.append(_save_slice(out, found))
             if found.diameter_mm is None and (largest is None or abs(found.torque_nm) > abs(largest.torque_nm)):
@@ -117,9 +119,12 @@ class _Sweep:
 
     def add(self, topic: str, content: Mapping[str, Any]) -> _Slice | str | None:
         """Take one message; return the slice of a hold that it ends, or why there is none."""
+        if "source" not in content:
+            raise ContentError("it is imported, and the control loop's messages are not")
         t_ns = content["t_mono_ns"]
         match topic:
             case EitFrame.topic if not content["repeated"]:
+                check_length("line", len(content["line"]), self._table.n_line_values)
                 frames = self._frames.setdefault(content["source"], deque(maxlen=MAX_FRAMES))
                 frames.append((t_ns, np.array(content["line"], dtype=np.float64)))
             case LoadTorque.topic if content["valid"]:
@@ -173,6 +178,8 @@ class _Sweep:
             return "the gripper measured no diameter"
         times, lines = np.array([t_ns for t_ns, _ in frames], float), [line for _, line in frames]
         period_ns = float(np.diff(times).mean())
+        if period_ns <= 0:
+            return "the frames of the hold have one time"
         # Around the middle of the times, for at most nine frames.
         periods = (times - 0.5 * (times[0] + times[-1])) / period_ns
         weights = np.exp(-0.5 * (periods / STD_FRAMES) ** 2) * (np.abs(periods) <= WINDOW_FRAMES / 2)

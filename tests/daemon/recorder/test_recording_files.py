@@ -107,7 +107,9 @@ def test_csv_is_refused_where_a_later_array_is_longer(tmp_path, mistake):
     with new_recording(tmp_path / "x.mcap", "a bench") as file:
         for length in (3, 4):
             file.add_frame("right", 10**18, 10**18, np.zeros(length))
-    assert "a later one 6; use --format mat" in mistake("recording", "export", tmp_path / "x.mcap", "--format", "csv")
+    assert "3 values of line and a later one 4; use --format mat" in mistake(
+        "recording", "export", tmp_path / "x.mcap", "--format", "csv"
+    )
 
 
 def test_a_recording_is_read_into_arrays_and_frames(recording, monkeypatch):

@@ -21,10 +21,11 @@ from shearloop.daemon.recorder.schema import (
     input_json,
     json_type,
     message_json,
+    recorded_topic,
     schemas,
-    with_missing_keys,
 )
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.tools.recordings.columns import read_content
 from tests.sample_messages import sample
 
 PLAIN = {"boolean", "string", "number", "integer"}
@@ -71,7 +72,7 @@ def test_each_message_matches_its_schema(topic):
         written = json.loads(message_json(topic, on_wire, 0))
         Draft202012Validator(schemas()[topic]).validate(written)
         assert None not in written.values()
-        restored = with_missing_keys(topic, written)
+        restored = read_content(recorded_topic(topic, message.source), as_json(written))
         for item in dataclasses.fields(message):
             value = getattr(message, item.name)
             if isinstance(value, tuple):

@@ -6,12 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shearloop.daemon.messaging.messages import TOPICS, wire_map
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import McapFile
 from shearloop.errors import UserError
 from shearloop.tools.recordings.matlab_import import read_diameter_slices, read_line, read_torque_slices
 from shearloop.tools.recordings.slice_export import export_slices
 from shearloop.tools.recordings.tables import RecordedTopics
+from tests.sample_messages import sample
 
 S = 1_000_000_000
 PERIOD_S = 0.5
@@ -38,7 +40,7 @@ class Sweep:
         end_s = self.t_s + for_s
         while self.t_s < end_s:
             self.t_s += PERIOD_S
-            line = (self.rest + torque_nm).tolist()
+            line = self.rest + torque_nm
             self._add("eit.frame.right", {"source": "right", "line": line, "repeated": repeated})
             self._add("load.torque", {"source": "load_cell", "torque_nm": torque_nm, "valid": valid})
 
@@ -60,7 +62,9 @@ class Sweep:
 
     def _add(self, topic: str, content: dict[str, Any]) -> None:
         t_ns = round(self.t_s * S)
-        self._file.add(topic, t_ns, t_ns, schema.as_json({"t_mono_ns": t_ns, **content}))
+        kind = TOPICS[schema.schema_name(topic)]
+        wire = wire_map(sample(kind, t_mono_ns=t_ns, **content), t_ns / S, 0)
+        self._file.add(topic, t_ns, t_ns, schema.message_json(kind.topic, wire, 0))
 
 
 def test_each_hold_becomes_a_slice_for_reproduce(tmp_path):

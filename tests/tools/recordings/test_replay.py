@@ -20,10 +20,11 @@ from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.messaging.messages import EitEstimate, wire_map, with_packed_arrays
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.recorder.schema import message_json, with_missing_keys
+from shearloop.daemon.recorder.schema import message_json, recorded_topic
 from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import EstimatorSession, Measured
+from shearloop.tools.recordings.columns import read_content
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
 from tests.fixtures.daemons import ask, emulated_kit, running_daemon
@@ -197,8 +198,9 @@ def estimate(**changes: Any) -> dict[str, Any]:
 
 def recorded(content: dict[str, Any]) -> RecordedEvent:
     """Return a message as it comes back from a recording, which leaves out what has no value."""
-    plain = json.loads(message_json(TOPIC, content, 0))
-    return RecordedEvent(TOPIC, content["t_mono_ns"], with_missing_keys(TOPIC, plain), content["source"])
+    data = message_json(TOPIC, content, 0)
+    plain = read_content(recorded_topic(TOPIC, content["source"]), data)
+    return RecordedEvent(TOPIC, content["t_mono_ns"], plain, content["source"])
 
 
 @pytest.mark.parametrize(

@@ -56,16 +56,6 @@ def write(path: Path, topics: tuple[str, ...]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def rerun_runtime(tmp_path_factory) -> None:
-    """Start the SDK's threads and files, which stay until the process ends."""
-    rerun = pytest.importorskip("rerun", reason="needs the extra `rerun`")
-    stream = rerun.RecordingStream("test")
-    stream.save(tmp_path_factory.mktemp("rerun") / "a.rrd")
-    stream.disconnect()
-    list(pytest.importorskip("rerun.chunk").RrdReader(tmp_path_factory.getbasetemp() / "rerun0" / "a.rrd").stream())
-
-
-@pytest.fixture(scope="module")
 def foxglove_runtime() -> None:
     """Start the SDK's threads and files, which stay until the process ends."""
     foxglove = pytest.importorskip("foxglove", reason="needs the extra `foxglove`")

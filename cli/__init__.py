@@ -58,6 +58,8 @@ COMMANDS = {
     "reproduce": ("reproduce", "compute the paper's numbers and figures from recorded slices"),
 }
 
+# What may move the rig: no other word is taken for one of these.
+MOVING = frozenset({"start", "resume", "unlock", "release", "commission"})
 EXIT_OK, EXIT_USAGE = 0, 2
 # Of `run`: the experiment of `stop_when_done` did not finish.
 EXIT_UNFINISHED = 3
@@ -97,7 +99,9 @@ class Parser(argparse.ArgumentParser):
         if choice is not None:
             name, given, known = choice[1], choice[2], [one.strip("'") for one in choice[3].split(", ")]
             of = f" of {name}" if name.startswith("--") else ""
-            meant = "".join(f"; did you mean {one}?" for one in get_close_matches(given, known, 1))
+            # A mistyped word must not become a motion.
+            safe = [one for one in known if one not in MOVING]
+            meant = "".join(f"; did you mean {one}?" for one in get_close_matches(given, safe, 1))
             return f"there is no {given!r}{of}{meant or '; there are ' + ', '.join(known)}"
         required = re.fullmatch(r"the following arguments are required: (.*)", message)
         if required is not None:

@@ -102,9 +102,12 @@ def reversals(file: ExperimentFile) -> Iterator[Reversal]:
 
 
 def check_steps(file: ExperimentFile) -> list[Mistake]:
-    """Return each step that exceeds its limits or its timeout, and the first `hold_torque` on an unidentified tool."""
+    """Return each step that exceeds its limits or its timeout, and each step that the steps before it make wrong.
+
+    These are the first `hold_torque` on an unidentified tool, and a `tare` of a gripped one.
+    """
     found: list[Mistake] = list(_undoing(file))
-    identified = False
+    identified = gripped = False
     for number, step in enumerate(file.steps):
         limits, needs = file.limits_of(step), demand(step)
         torque = needs.torque_nm, limits.torque_nm, "N·m", "torque_nm"
@@ -115,6 +118,11 @@ def check_steps(file: ExperimentFile) -> list[Mistake]:
         if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
             asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
             found.append((("steps", number), f"{asks}; raise timeout_s"))
+        if isinstance(step, GripperStep):
+            gripped = isinstance(step, GripStep) and step.expect_object
+        if gripped and isinstance(step, TareStep):
+            cure = "put it before the `grip`, or a `release` before it"
+            found.append((("steps", number), f"tare would make the gripped tool's torque the zero; {cure}"))
         match step:
             case IdentifyStep():
                 identified = True

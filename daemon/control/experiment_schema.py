@@ -239,14 +239,48 @@ class ExperimentFile(ConfigModel):
         return ExperimentLimits.model_construct(torque_nm=torque_nm, angle_rad=angle_rad)
 
 
-def first_turn_before_grip(file: ExperimentFile) -> int | None:
-    """Return the number, from 1, of the first step that turns the wrist before any grip or release, or None."""
+def first_motion_before_grip(file: ExperimentFile) -> int | None:
+    """Return the number, from 1, of the first step that moves the arm before any grip or release, or None."""
     for number, step in enumerate(file.steps, 1):
         if isinstance(step, GripperStep):
             return None
-        if isinstance(step, TwistingStep | TurnToStep):
+        if isinstance(step, TwistingStep | TurnToStep | ApproachStep):
             return number
     return None
+
+
+def first_motion(file: ExperimentFile) -> str:
+    """Return the first motion of an experiment as a sentence, for the operator who starts it."""
+    for number, step in enumerate(file.steps, 1):
+        if (motion := motion_of(step)) is not None:
+            return f"the first motion is step {number} of {len(file.steps)} ({step.do}): {motion}"
+    return "no step moves anything"
+
+
+def motion_of(step: Step) -> str | None:
+    """Return what moves in a step, as a sentence, or None."""
+    match step:
+        case ApproachStep(along_tool_m=float(distance_m)):
+            return f"the arm moves {1e3 * distance_m:+.0f} mm along the tool's axis, at {step.speed_m_per_s:g} m/s"
+        case ApproachStep(pose_m_rad=tuple(pose)):
+            x, y, z = (f"{1e3 * value:.0f}" for value in pose[:3])
+            return f"the arm moves to x {x}, y {y}, z {z} mm, at {step.speed_m_per_s:g} m/s"
+        case GripStep():
+            return f"the fingers close to {step.width_mm:g} mm, or onto a tool with at most {step.force_n:g} N"
+        case ReleaseStep():
+            return f"the fingers open to {step.width_mm:g} mm, and a tool in them drops"
+        case TurnToStep():
+            return f"the wrist turns to {step.angle_rad:g} rad, at {step.speed_rad_per_s:g} rad/s"
+        case TwistStep():
+            return f"the wrist twists to {step.angles_rad[0]:g} rad, at {step.speed_rad_per_s:g} rad/s"
+        case IdentifyStep():
+            return f"the wrist turns to and fro, by at most {step.amplitude_rad:g} rad"
+        case HoldTorqueStep():
+            return f"the wrist turns until the torque is {step.torque_nm:+g} N·m"
+        case TightenStep():
+            return f"the wrist turns {step.direction}, at {step.speed_rad_per_s:g} rad/s"
+        case _:
+            return None
 
 
 # A location in an experiment's file, and what is wrong there.

@@ -180,6 +180,11 @@ class FaultCode(Enum):
     OPERATOR_STOP = Rule(
         _KEEP, "the operator stopped it: {detail}.", "`shearloop command unlock` allows the next start."
     )
+    TOOL_GRIPPED = Rule(
+        Response.NOTE,
+        "the gripper still holds something: {detail}.",
+        "Secure it. Then `shearloop command release --yes` opens the gripper, and what it holds drops.",
+    )
     DAEMON_ENDED = Rule(
         _KEEP, "the daemon ended: {detail}.", "Look at the rig, then `shearloop command unlock` allows the next start."
     )

@@ -248,6 +248,7 @@ class Health(Message):
         "", "per task: alive, done, restarts, rate_hz, expected_hz, errors by kind, and the latest error in a sentence"
     )
     emulated: bool = column("", "whether every device is emulated, by `emulated: true` in the configuration")
+    tare_refusal: str = column("", "why `tare` is refused now, in a sentence; empty when it is not")
     loop_lag_s: float = column("s", "how late the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")
     cpu_percent: float = column("%", "of one core since the message before")

@@ -19,9 +19,12 @@ from typing import Any, NoReturn
 from shearloop.daemon.errors import USER_ERRORS
 from shearloop.daemon.process import interrupt_status, raise_ending_signals
 from shearloop.errors import UserError
+from shearloop.printable import printable_output
 
 # Our products are small: a BLAS with one thread is faster. Must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Colours are control characters, which the output escapes (help of Python 3.14, log outside of `logging_to_stderr`).
+os.environ.setdefault("NO_COLOR", "1")
 
 
 # Ctrl-C is their usual end, and nothing is left undone.
@@ -55,6 +58,8 @@ COMMANDS = {
     "reproduce": ("reproduce", "compute the paper's numbers and figures from recorded slices"),
 }
 
+# What may move the rig: no other word is taken for one of these.
+MOVING = frozenset({"start", "resume", "unlock", "release", "commission"})
 EXIT_OK, EXIT_USAGE = 0, 2
 # Of `run`: the experiment of `stop_when_done` did not finish.
 EXIT_UNFINISHED = 3
@@ -94,7 +99,9 @@ class Parser(argparse.ArgumentParser):
         if choice is not None:
             name, given, known = choice[1], choice[2], [one.strip("'") for one in choice[3].split(", ")]
             of = f" of {name}" if name.startswith("--") else ""
-            meant = "".join(f"; did you mean {one}?" for one in get_close_matches(given, known, 1))
+            # A mistyped word must not become a motion.
+            safe = [one for one in known if one not in MOVING]
+            meant = "".join(f"; did you mean {one}?" for one in get_close_matches(given, safe, 1))
             return f"there is no {given!r}{of}{meant or '; there are ' + ', '.join(known)}"
         required = re.fullmatch(r"the following arguments are required: (.*)", message)
         if required is not None:
@@ -116,6 +123,11 @@ def command_module(name: str) -> ModuleType:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; print a user's mistake as one sentence on stderr and return status 2."""
+    with printable_output():
+        return _run(argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] in ([], ["help"]):
         arguments = [*arguments[1:2], "--help"]

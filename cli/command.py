@@ -17,6 +17,7 @@ COMMANDS = {
     "pause": "hold the arm until `resume`; moving fingers finish their move",
     "resume": "continue after `pause`",
     "stop": "stop the experiment and the arm; without an experiment, stop the daemon",
+    "release": "open the gripper, also after a stop: a tool in it drops; needs --yes",
     "unlock": "allow motion again after a stop, when no person is within reach",
 }
 
@@ -26,6 +27,7 @@ examples:
   shearloop command tare --source right
   shearloop command start --experiment config/experiments/loosen.yaml
   shearloop command stop
+  shearloop command release --yes
 
 Exit status: 0 done, 1 refused, 2 no answer. On the daemon's own machine `stop` and
 `status` need no key. `shearloop listen` prints the daemon's messages.
@@ -41,15 +43,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
     parser.add_argument("--source", metavar="NAME", help="for tare: name of the sensor (default: all)")
     add_option(parser, "--experiment", Path, "FILE", "for start (default: that of the configuration)")
+    parser.add_argument("--yes", action="store_true", help="for release: the tool may drop; for tare: nothing is held")
     add_connection(parser, addresses.COMMAND_ADDRESS, "the daemon's command address")
-    default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for unlock {addresses.UNLOCK_TIMEOUT_S:g} s"
+    default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for unlock and release {addresses.UNLOCK_TIMEOUT_S:g} s"
     add_option(parser, "--timeout", TIMEOUT_S, "S", f"time to wait for the reply (default: {default})")
     parser.add_argument("--json", action="store_true", help="print the reply as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Send one command and print its reply; status 1 if the daemon refused it."""
-    arguments = {} if args.source is None else {"source": args.source}
+    arguments: dict[str, Any] = {} if args.source is None else {"source": args.source}
+    if args.yes:
+        arguments["confirmed"] = True
     if args.experiment is not None:
         # The daemon may run in another folder.
         arguments["experiment"] = str(args.experiment.resolve())
@@ -68,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         # It imports too much for a `stop` on a busy computer.
         from shearloop.daemon.messaging.client import send_command
 
-        if args.name == "unlock" and args.timeout is None:
+        if args.name in ("unlock", "release") and args.timeout is None:
             # A missing daemon is reported without the long timeout.
             send_command(address, {"command": "status"}, addresses.COMMAND_TIMEOUT_S, keys)
             timeout_s = addresses.UNLOCK_TIMEOUT_S

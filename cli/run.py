@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.options import add_option
 from shearloop.errors import UserError
+from shearloop.printable import printable
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
@@ -90,7 +91,7 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
             finished = asyncio.run(run_daemon(config, tuple(listeners), on_ready, summary))
         finally:
             if at_end and summary.text:
-                at_end.write(f"\n{summary.text}\n\n")
+                at_end.write(f"\n{printable(summary.text)}\n\n")
     return EXIT_OK if finished else EXIT_UNFINISHED
 
 

@@ -12,6 +12,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from shearloop.errors import UserError
+from shearloop.printable import printable
 from shearloop.tools.task_row import task_row
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def print_result(result: object, sentences: Iterable[str], *, as_json: bool) -> 
 def print_estimate(out: "TextIO | NonBlockingWriter", topic: str, content: Mapping[str, Any]) -> None:
     """Print a message that is an estimate."""
     if topic in ("eit.estimate", "skin.shear"):
-        out.write(message_line(topic, content) + "\n")
+        out.write(printable(message_line(topic, content)) + "\n")
         out.flush()
 
 
@@ -73,6 +74,7 @@ class StatusLine:
         from shearloop.daemon.logs import CLEAR_LINE
 
         # A longer line would wrap, and could not be cleared.
+        text, end = (printable(part).replace("\n", " ") for part in (text, end))
         width = shutil.get_terminal_size().columns - 1 - len(end)
         self._out.write(f"{CLEAR_LINE}{text if len(text) <= width else text[: width - 1] + '…'}{end}")
         self._out.flush()

@@ -74,6 +74,8 @@ class Daemon:
                 opened.callback(self.recorder.close)
             self.health = HealthReporter(self.publisher, self.supervisor, clock, emulated=config.emulated)
             self.sensors, self._rig = build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
+            if self._rig is not None:
+                self.health.tare_refusal = self._rig.control_loop.tare_refusal
             self._experiment: ConfiguredExperiment | None = None
             if config.experiment is not None and self._rig is not None:
                 daemon_end = self._end if config.stop_when_done else None

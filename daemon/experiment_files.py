@@ -13,7 +13,10 @@ from pathlib import Path
 
 import structlog
 
-from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, check_steps, outline
+from shearloop.daemon.control.experiment_check import check_devices, check_steps
+from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
+from shearloop.drivers.robotiq.models import GripperModel
+from shearloop.drivers.ur.settings import UrLimits
 from shearloop.errors import UserError
 from shearloop.files import read_file
 from shearloop.yaml_files import MOST_BYTES, Document, shown
@@ -30,8 +33,13 @@ class InvalidExperimentError(UserError):
 
 def read_experiment(path: Path) -> ExperimentFile:
     """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
-    document = read_document(path)
-    return without_mistakes(document, check_steps(outline(document.content)))
+    return _checked(read_document(path), None, None)
+
+
+def _checked(document: Document, robot: UrLimits | None, gripper: GripperModel | None) -> ExperimentFile:
+    """Return the experiment of a document; raises UserError for one that is invalid, or that these do not allow."""
+    file = outline(document.content)
+    return without_mistakes(document, [*check_steps(file), *check_devices(file, robot, gripper)])
 
 
 def read_document(path: Path) -> Document:
@@ -63,9 +71,14 @@ class ReadExperiment:
 
 @dataclass(slots=True)
 class ExperimentFiles:
-    """The experiments that a request may name: regular files of at most 128 kB in `folders`, or below them."""
+    """The experiments that a request may name: regular files of at most 128 kB in `folders`, or below them.
+
+    They stay within what `robot` and `gripper` allow, where these are given.
+    """
 
     folders: tuple[Path, ...]
+    robot: UrLimits | None = None
+    gripper: GripperModel | None = None
     _reading: threading.Thread | None = field(default=None, init=False)
 
     async def read(self, path: Path) -> ReadExperiment:
@@ -110,7 +123,7 @@ class ExperimentFiles:
             raise UserError(f"{name}: the experiment cannot be read: {reason}") from error
         try:
             document = Document.parse(path, data, UserError, ExperimentFile.what)
-            file = without_mistakes(document, check_steps(outline(document.content)))
+            file = _checked(document, self.robot, self.gripper)
         except UserError as error:
             structlog.get_logger().warning("the experiment is not valid", mistakes=str(error))
             raise InvalidExperimentError(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
-from shearloop.daemon.control import experiment_schema
+from shearloop.daemon.control import experiment_check, experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
@@ -35,6 +35,7 @@ from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.models import MODELS, GripperModel
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
@@ -223,8 +224,8 @@ def build_rig(
     estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     sources = torque_sources(config, estimators, combined)
-    check_experiment(config, sources)
     settings = open_settings(config)
+    check_experiment(config, sources, settings)
     if settings is None:
         return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
     loop = make_loop(config, settings, sources, supervisor.dead)
@@ -232,25 +233,39 @@ def build_rig(
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)))
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
-    experiments = ExperimentFiles(config.experiment_folders)
+    experiments = ExperimentFiles(config.experiment_folders, settings.limits, gripper_model(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
     return sensors, Rig(loop, runner, {**fingers, "robot": robot, "loop": runner}, experiments, recorder)
 
 
+def gripper_model(config: DaemonConfig) -> GripperModel | None:
+    """Return the model of the configured gripper, if there is one."""
+    return MODELS[config.gripper.model] if config.gripper is not None else None
+
+
 def check_experiment(
-    config: DaemonConfig, sources: Mapping[str, TorqueSource]
+    config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
 ) -> experiment_schema.ExperimentFile | None:
     """Return the configured experiment, if any; raises UserError if the configured devices cannot run it.
 
-    `sources` are all torques but the robot's.
+    `sources` are all torques but the robot's; `robot` has its limits, where they are known.
     """
     path = config.experiment
     if path is None:
         return None
-    driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
     document = read_document(path)
-    file = experiment_schema.outline(document.content)
-    mistakes = experiment_schema.check_steps(file)
+    return without_mistakes(document, experiment_mistakes(document.content, config, sources, robot))
+
+
+def experiment_mistakes(
+    content: object, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
+) -> list[experiment_schema.Mistake]:
+    """Return each step and key of an experiment's content that its own limits or the devices do not allow."""
+    driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
+    file = experiment_schema.outline(content)
+    limits = robot.limits if robot is not None else None
+    mistakes = experiment_check.check_steps(file)
+    mistakes += experiment_check.check_devices(file, limits, gripper_model(config))
     if file.torque_source and file.steps:
         mistakes += _undriven(file.torque_source, driving, config)
     if config.gripper is None:
@@ -260,7 +275,7 @@ def check_experiment(
             for number, step in enumerate(file.steps)
             if isinstance(step, experiment_schema.GripperStep)
         ]
-    return without_mistakes(document, mistakes + _unadaptable(file, sources))
+    return mistakes + _unadaptable(file, sources)
 
 
 def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[experiment_schema.Mistake]:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
@@ -141,68 +140,96 @@ class GainSpread:
         """
         m, loaded, total = parts.shape[1], np.concatenate(twists), parts.sum(axis=1)
         is_first = np.array([first is not None and bool(first[rows].any()) for rows in twists])
+        # Variances of the logarithm: what successive twists have in common, and each one's own.
+        alike = _ALIKE * self.within**2
+        own = self.within**2 - alike + np.where(is_first, self.first_spread**2, 0.0)
+        spread = self._with_this(total[loaded], truth[loaded], alike + float(own.mean()) / len(twists))
         load_nm = float(np.sqrt((truth[loaded] ** 2).mean()))
-        gain = log_gain(total[loaded], truth[loaded])
+        along = [truth[rows] for rows in twists]
+        power = np.array([float(one @ one) for one in along])
+        errors = np.diag(power * (self.noise_nm**2 + own * power)) + alike * np.outer(power, power)
+        whiten = np.linalg.inv(np.linalg.cholesky(errors))
+        # The first twist reads the gain times its own deviation from the later ones.
+        deviation = np.exp(np.where(is_first, self.first, 0.0))[:, None]
+        of_parts = np.array([one @ parts[rows] for one, rows in zip(along, twists, strict=True)])
+        unloaded = np.setdiff1d(np.arange(len(truth)), loaded)
+        equations = _Equations(
+            whiten @ (deviation * of_parts),
+            whiten @ np.array([one.sum() for one in along]),
+            whiten @ power,
+            parts[unloaded],
+            # The unloaded frames before a twist have one error in common.
+            math.sqrt(len(twists) / max(len(unloaded), 1)) / self.noise_nm,
+            np.append(np.full(m, math.sqrt(m) * spread.between), max(self.zero, _LEAST_ZERO) * load_nm),
+            bounded,
+        )
+        x = _least_squares(equations.residuals, equations.slopes, np.zeros(m + 1))
+        if x is None:
+            raise CalibrationError("the gain of these twists does not settle; twist further, and several times")
+        factors, offset_nm = np.exp(x[:m]), float(x[m])
+        slope = equations.slopes(x)
+        covariance = np.linalg.inv(slope.T @ slope)
+        columns = np.column_stack([parts[loaded] * factors, np.ones(len(loaded))])
+        corrected = parts[loaded] @ factors + offset_nm
+        before, left = (
+            float(np.sqrt(np.einsum("ni,ij,nj->n", columns, one, columns).mean() / (corrected**2).mean()))
+            for one in (np.diag(equations.prior**2), covariance)
+        )
+        if left > _MOST_LEFT * before:
+            raise CalibrationError(
+                "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
+                "these are too small; twist further, and several times"
+            )
+        spread = replace(spread, between=min(left, spread.between))
+        return GainCorrection(factors, factors * np.sqrt(np.diag(covariance))[:m], offset_nm, spread, len(twists))
+
+    def _with_this(self, predicted: FloatArray, truth: FloatArray, explained: float) -> Self:
+        """Return the spread with the gain of loaded frames (n,), less the variance that twists and noise explain.
+
+        Raises CalibrationError where they have no gain.
+        """
+        gain = log_gain(predicted, truth)
         if gain is None:
             raise CalibrationError(
                 "the estimates do not follow the known torque; check that the load cell and the calibration have the "
                 "same direction, and twist again"
             )
-        # Variances of the logarithm: what successive twists have in common, and each one's own.
-        alike = _ALIKE * self.within**2
-        own = self.within**2 - alike + np.where(is_first, self.first_spread**2, 0.0)
-        # This recording's gain counts for the spread too, less the part that noise and twists explain.
-        explained = alike + float(own.mean()) / len(twists)
-        explained += self.noise_nm**2 / max(float(total[loaded] @ total[loaded]), self.noise_nm**2)
-        spread = self._with_recordings([max(gain**2 - explained, 0.0)])
-        prior = np.append(np.full(m, math.sqrt(m) * spread.between), max(self.zero, _LEAST_ZERO) * load_nm)
-        along = [truth[rows] for rows in twists]
-        power = np.array([float(one @ one) for one in along])
-        of_errors = np.diag(power * (self.noise_nm**2 + own * power)) + alike * np.outer(power, power)
-        whiten = np.linalg.inv(np.linalg.cholesky(of_errors))
-        # The first twist reads the gain times its own deviation from the later ones.
-        deviation = np.exp(np.where(is_first, self.first, 0.0))
-        of_twists = np.array([one @ parts[rows] for one, rows in zip(along, twists, strict=True)])
-        of_twists, of_offset = whiten @ (of_twists * deviation[:, None]), whiten @ [one.sum() for one in along]
-        known_power = whiten @ power
-        unloaded = np.setdiff1d(np.arange(len(truth)), loaded)
-        # The unloaded frames before a twist have one error in common.
-        weight = math.sqrt(len(twists) / max(len(unloaded), 1)) / self.noise_nm
+        explained += self.noise_nm**2 / max(float(predicted @ predicted), self.noise_nm**2)
+        return self._with_recordings([max(gain**2 - explained, 0.0)])
 
-        def residuals(x: FloatArray) -> FloatArray:
-            factors, free = np.exp(x[:m]), parts[unloaded] @ np.exp(x[:m]) + x[m]
-            known = of_twists @ factors + of_offset * x[m] - known_power
-            return np.concatenate([known, weight * (np.maximum(free, 0.0) if bounded else free), x / prior])
 
-        def slopes(x: FloatArray) -> FloatArray:
-            factors = np.exp(x[:m])
-            free = np.column_stack([parts[unloaded] * factors, np.ones(len(unloaded))])
-            # Unloaded frames predicted below zero carry no information about a bound.
-            counts = (parts[unloaded] @ factors + x[m] > 0) | (not bounded)
-            known = np.column_stack([of_twists * factors, of_offset])
-            return np.concatenate([known, weight * free * counts[:, None], np.diag(1.0 / prior)])
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """What twists say of the unknowns x: the logarithms of m factors, and the offset. In standard errors.
 
-        found = _least_squares(residuals, slopes, np.zeros(m + 1))
-        if found is None:
-            raise CalibrationError("the gain of these twists does not settle; twist further, and several times")
-        factors, offset_nm = np.exp(found[:m]), float(found[m])
-        slope = slopes(found)
-        covariance = np.linalg.inv(slope.T @ slope)
-        columns = np.column_stack([parts[loaded] * factors, np.ones(len(loaded))])
-        corrected = columns.sum(axis=1) + offset_nm - 1.0
+    A twist says of_parts (k, m) · factors + of_offset (k,) · offset = known (k,), a frame without load parts (n, m) ·
+    factors + offset = 0 with this weight, or at most 0 where it is `bounded`, and the prior (m + 1,) deviations x = 0.
+    """
 
-        def relative(of: NDArray[np.floating]) -> float:
-            return float(np.sqrt(np.einsum("ni,ij,nj->n", columns, of, columns).mean() / (corrected**2).mean()))
+    of_parts: FloatArray
+    of_offset: FloatArray
+    known: FloatArray
+    parts: FloatArray
+    weight: float
+    prior: FloatArray
+    bounded: bool
 
-        left = relative(covariance)
-        if left > _MOST_LEFT * relative(np.diag(prior**2)):
-            raise CalibrationError(
-                "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
-                "these are too small; twist further, and several times"
-            )
-        errors = factors * np.sqrt(np.diag(covariance))[:m]
-        spread = replace(spread, between=min(left, spread.between))
-        return GainCorrection(factors, errors, offset_nm, spread, len(twists))
+    def residuals(self, x: FloatArray) -> FloatArray:
+        """Return the (k + n + m + 1,) residuals."""
+        factors, offset = np.exp(x[:-1]), x[-1]
+        free = self.parts @ factors + offset
+        of_twists = self.of_parts @ factors + self.of_offset * offset - self.known
+        return np.concatenate(
+            [of_twists, self.weight * (np.maximum(free, 0.0) if self.bounded else free), x / self.prior]
+        )
+
+    def slopes(self, x: FloatArray) -> FloatArray:
+        """Return their derivatives (k + n + m + 1, m + 1); bounds that do not bind carry no information."""
+        factors, offset = np.exp(x[:-1]), x[-1]
+        counts = (self.parts @ factors + offset > 0) | (not self.bounded)
+        free = np.column_stack([self.parts * factors, np.ones(len(self.parts))]) * counts[:, None]
+        of_twists = np.column_stack([self.of_parts * factors, self.of_offset])
+        return np.concatenate([of_twists, self.weight * free, np.diag(1.0 / self.prior)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

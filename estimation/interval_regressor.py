@@ -389,8 +389,7 @@ def fit_interval_regressor(
     residuals = reported - truth
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
     inflation = 1.0 if isinstance(point, InverseCalibration) else _INFLATION
-    if left_out:
-        inflation = student_inflation(len(np.unique(rows)))
+    inflation = student_inflation(len(np.unique(rows))) if left_out else inflation
     of_loads = _inflation_of_twists(values, twists) if twists else None
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
@@ -411,15 +410,10 @@ def fit_interval_regressor(
     if fit_line is not None:
         refit_line = None if full_range else partial(refit, by=fit_line)
         span, line = _range_of_slices(point, features, values, refit, refit_line)
-    gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
     gain = GainSpread()
     if recordings is not None:
-        in_order = np.argsort(rows, kind="stable")
-        is_first = first_twists(values, recordings)
-        ordered = rows[in_order]
-        gain = GainSpread.fit(
-            reported[in_order], values[ordered], recordings[ordered], is_first[ordered], gains, fingertips
-        )
+        gains = _gains_of_recordings(features, values, recordings, refit)
+        gain = _spread_of_gain(values, recordings, rows, reported, gains, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain, line)
 
 
@@ -439,6 +433,21 @@ def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: I
             gain = loaded_log_gain(reported_values(part, part.predict(features[out])), values[out])
             gains += [] if gain is None else [gain]
     return gains
+
+
+def _spread_of_gain(
+    values: FloatArray,
+    recordings: IntArray,
+    rows: IntArray,
+    predicted: FloatArray,
+    gains: Sequence[float],
+    fingertips: int,
+) -> GainSpread:
+    """Return the spread of the gain from the predictions of left-out rows, and the gains of left-out recordings."""
+    order = np.argsort(rows, kind="stable")
+    rows, predicted = rows[order], predicted[order]
+    is_first = first_twists(values, recordings)
+    return GainSpread.fit(predicted, values[rows], recordings[rows], is_first[rows], gains, fingertips)
 
 
 def _range_of_slices(

@@ -2,10 +2,13 @@
 
 import codecs
 import contextlib
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from shearloop.errors import UserError
+from shearloop.printable import own_stream, printable
 
 # Longer than the 124 characters of text at the start of a MATLAB file.
 _HEAD_BYTES = 512
@@ -54,7 +57,8 @@ def progress_bar(name: str, total: int, unit: str) -> Iterator[Callable[[int], N
 
     # tqdm would start a monitoring thread that outlives the bars.
     tqdm.monitor_interval = 0
-    with tqdm(total=total, unit=unit, desc=name, disable=None, leave=False, unit_scale=unit == "B") as bar:
+    shown: dict[str, Any] = {"disable": None, "leave": False, "file": own_stream(sys.stderr)}
+    with tqdm(total=total, unit=unit, desc=printable(name), unit_scale=unit == "B", **shown) as bar:
 
         def show(done: int) -> None:
             bar.update(done - bar.n)

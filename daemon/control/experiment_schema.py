@@ -1,7 +1,7 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
@@ -239,61 +239,48 @@ class ExperimentFile(ConfigModel):
         return ExperimentLimits.model_construct(torque_nm=torque_nm, angle_rad=angle_rad)
 
 
-def first_turn_before_grip(file: ExperimentFile) -> int | None:
-    """Return the number, from 1, of the first step that turns the wrist before any grip or release, or None."""
+def first_motion_before_grip(file: ExperimentFile) -> int | None:
+    """Return the number, from 1, of the first step that moves the arm before any grip or release, or None."""
     for number, step in enumerate(file.steps, 1):
         if isinstance(step, GripperStep):
             return None
-        if isinstance(step, TwistingStep | TurnToStep):
+        if isinstance(step, TwistingStep | TurnToStep | ApproachStep):
             return number
     return None
 
 
-class Reversal(NamedTuple):
-    """A step that turns a held tool back: the numbers, from 1, of it and of the step before, and both directions."""
-
-    number: int
-    direction: Direction
-    before: int
-    direction_before: Direction
-
-
-def reversals(file: ExperimentFile) -> Iterator[Reversal]:
-    """Yield each step that turns the tool against the turn that the steps before have left in this grip."""
-    # The angles since the grip that are possible, and the last turn that was left.
-    low_rad = high_rad = 0.0
-    left: tuple[int, Direction] | None = None
+def first_motion(file: ExperimentFile) -> str:
+    """Return the first motion of an experiment as a sentence, for the operator who starts it."""
     for number, step in enumerate(file.steps, 1):
-        turns: Direction | None = None
-        leaves: Direction | None = None
-        match step:
-            case GripStep() | ReleaseStep():
-                left, low_rad, high_rad = None, 0.0, 0.0
-            case TightenStep(direction=direction):
-                turns = leaves = direction
-                low_rad -= step.until_angle_rad if direction == "clockwise" else 0.0
-                high_rad += step.until_angle_rad if direction == "counterclockwise" else 0.0
-            case HoldTorqueStep(signed_torque_nm=torque_nm):
-                turns = leaves = direction_of(torque_nm)
-                low_rad, high_rad = -math.inf, math.inf
-            case TwistStep(absolute=False, angles_rad=angles_rad):
-                turns = _turn_to(angles_rad[0], low_rad, high_rad)
-                if not step.return_to_start:
-                    leaves = _turn_to(angles_rad[-1], low_rad, high_rad)
-                    low_rad = high_rad = angles_rad[-1]
-            case TwistStep() | TurnToStep():
-                low_rad, high_rad = -math.inf, math.inf
-        if turns is not None and left is not None and turns != left[1]:
-            yield Reversal(number, turns, *left)
-        if leaves is not None:
-            left = number, leaves
+        if (motion := motion_of(step)) is not None:
+            return f"the first motion is step {number} of {len(file.steps)} ({step.do}): {motion}"
+    return "no step moves anything"
 
 
-def _turn_to(angle_rad: float, low_rad: float, high_rad: float) -> Direction | None:
-    """Return the direction from any angle between two ends to another angle; None where it is unknown."""
-    if low_rad <= angle_rad <= high_rad and low_rad < high_rad:
-        return None
-    return direction_of(angle_rad - (low_rad if angle_rad < low_rad else high_rad))
+def motion_of(step: Step) -> str | None:
+    """Return what moves in a step, as a sentence, or None."""
+    match step:
+        case ApproachStep(along_tool_m=float(distance_m)):
+            return f"the arm moves {1e3 * distance_m:+.0f} mm along the tool's axis, at {step.speed_m_per_s:g} m/s"
+        case ApproachStep(pose_m_rad=tuple(pose)):
+            x, y, z = (f"{1e3 * value:.0f}" for value in pose[:3])
+            return f"the arm moves to x {x}, y {y}, z {z} mm, at {step.speed_m_per_s:g} m/s"
+        case GripStep():
+            return f"the fingers close to {step.width_mm:g} mm, or onto a tool with at most {step.force_n:g} N"
+        case ReleaseStep():
+            return f"the fingers open to {step.width_mm:g} mm, and a tool in them drops"
+        case TurnToStep():
+            return f"the wrist turns to {step.angle_rad:g} rad, at {step.speed_rad_per_s:g} rad/s"
+        case TwistStep():
+            return f"the wrist twists to {step.angles_rad[0]:g} rad, at {step.speed_rad_per_s:g} rad/s"
+        case IdentifyStep():
+            return f"the wrist turns to and fro, by at most {step.amplitude_rad:g} rad"
+        case HoldTorqueStep():
+            return f"the wrist turns until the torque is {step.torque_nm:+g} N·m"
+        case TightenStep():
+            return f"the wrist turns {step.direction}, at {step.speed_rad_per_s:g} rad/s"
+        case _:
+            return None
 
 
 # A location in an experiment's file, and what is wrong there.
@@ -333,54 +320,6 @@ def _outlined(content: object) -> Step:
         return step
 
 
-def check_steps(file: ExperimentFile) -> list[Mistake]:
-    """Return each step that exceeds its limits or its timeout, and the first `hold_torque` on an unidentified tool."""
-    found: list[Mistake] = list(_undoing(file))
-    identified = False
-    for number, step in enumerate(file.steps):
-        limits, needs = file.limits_of(step), demand(step)
-        torque = needs.torque_nm, limits.torque_nm, "N·m", "torque_nm"
-        for value, limit, unit, key in (torque, (needs.angle_rad, limits.angle_rad, "rad", "angle_rad")):
-            if value >= limit:
-                asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
-                found.append((("steps", number), f"{asks}; raise limits.{key}, or ask for less"))
-        if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
-            asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
-            found.append((("steps", number), f"{asks}; raise timeout_s"))
-        match step:
-            case IdentifyStep():
-                identified = True
-            case _ if _forgets_tool(step, file.torque_source):
-                identified = False
-            case HoldTorqueStep() if not identified:
-                cure = "put an `identify` step before it, after the last `tare`, `grip`, `release` or `adapt`"
-                found.append((("steps", number), f"hold_torque needs an identified tool; {cure}"))
-                # One sentence is enough.
-                identified = True
-    return found
-
-
-def _undoing(file: ExperimentFile) -> Iterator[Mistake]:
-    """Yield each torque that undoes a `tighten`, where only its sign says so."""
-    for back in reversals(file):
-        step, before = file.steps[back.number - 1], file.steps[back.before - 1]
-        if isinstance(before, TightenStep) and isinstance(step, HoldTorqueStep) and step.direction is None:
-            yield (
-                ("steps", back.number - 1),
-                f"hold_torque turns {back.direction} by the sign of its torque_nm, and undoes step {back.before}, "
-                f"tighten {back.direction_before}; write `direction: {back.direction_before}`, or "
-                f"`direction: {back.direction}` if it is meant",
-            )
-
-
-def _forgets_tool(step: Step, torque_source: str) -> bool:
-    """Return whether an identification is invalid afterwards: a new grip, zero, or gain of the driving torque."""
-    match step:
-        case AdaptStep(fingertip=fingertip):
-            return fingertip == torque_source
-    return isinstance(step, TareStep | GripperStep)
-
-
 class Demand(NamedTuple):
     """The largest torque (N·m) and angle from the grip (rad) of a step, and its times.
 
@@ -413,6 +352,8 @@ def demand(step: Step) -> Demand:
             return Demand(stands_s=wait_s)
         case TareStep():
             return Demand(moves_s=6.0)
+        case ApproachStep(along_tool_m=float() as distance_m):
+            return Demand(moves_s=1.0 + abs(distance_m) / step.speed_m_per_s)
         case ApproachStep() | GripStep() | ReleaseStep() | AdaptStep() | TurnToStep():
             return Demand(moves_s=3.0)
         case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | WaitStep():

@@ -67,6 +67,11 @@ class GripperTask:
         """Open wide; raises DriverError and ActionError."""
         await _tried(lambda: self.grip(OPENING))
 
+    async def open_by_operator(self) -> None:
+        """Open wide, also after a fault, once the operator says that a tool may drop; raises as `release` does."""
+        await self.unlock()
+        await self.release()
+
     async def halt(self) -> None:
         """Stop the fingers; raises DriverError."""
         await _tried(self.gripper.halt)

@@ -1,7 +1,7 @@
 """The task that runs the control loop: robot states in, commands out, 125 times a second; and its messages."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -69,7 +69,7 @@ LONGEST_TARE_S = 30.0
 GIVES_UP_BEFORE_S = 0.1
 ENDING = "the daemon ends; start it again"
 STOPPED_AT_START = "it was stopped during its start"
-UNLOCKING = "robot and gripper are being unlocked; wait for the end"
+UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
 # The columns of `robot.state` that the robot's state has under the same name.
 _SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s"}
 
@@ -272,8 +272,33 @@ class ControlLoopRunner:
         self._control_loop.acknowledge()
         return None
 
+    def release_refusal(self) -> str | None:
+        """Return why the operator cannot open the gripper now, or None.
+
+        The emergency stop, a torque beyond its limit and a stop that waits for `unlock` do not prevent it.
+        """
+        if self._closed:
+            return ENDING
+        if self._actions.unlocking:
+            return UNLOCKING
+        state = self._robot.state
+        if state is not None and not (state.rests and state.motion == "idle"):
+            return "the arm is moving; wait until it stands still, or stop it"
+        return self._control_loop.release_refusal()
+
+    async def release(self) -> str | None:
+        """Open the gripper on the operator's confirmed command; return None, or why not."""
+        if (reason := self.release_refusal()) is not None:
+            return reason
+        try:
+            await self._actions.open_by_operator()
+        except (ActionError, DriverError) as error:
+            return str(error)
+        self._control_loop.on_release_ended()
+        return None
+
     def stop_unlocking(self) -> bool:
-        """End an unlocking, and halt the fingers that it moves; return whether one was under way."""
+        """End an unlocking or a release, and halt the fingers that it moves; return whether one was under way."""
         stopped = self._actions.stop_unlocking()
         if stopped:
             # The robot's process ends its part.
@@ -419,7 +444,7 @@ class ActionExecutor:
 
     @property
     def unlocking(self) -> bool:
-        """Whether robot and gripper are being unlocked."""
+        """Whether robot and gripper are being unlocked, or the gripper is opened for the operator."""
         return self._unlocking is not None and not self._unlocking.done()
 
     def begin(self, action: Action) -> None:
@@ -441,15 +466,29 @@ class ActionExecutor:
 
     async def unlock(self) -> None:
         """Enable robot and gripper while no experiment runs; raises DriverError and ActionError."""
+        await self._by_operator("unlock", "unlocking", self._unlock)
+
+    async def open_by_operator(self) -> None:
+        """Open the gripper while no experiment runs; raises DriverError and ActionError."""
+        await self._by_operator("release", "the release", self._open)
+
+    async def _by_operator(self, command: str, name: str, act: Callable[[], Coroutine[Any, Any, None]]) -> None:
         if self.unlocking:
-            raise ActionError("unlocking is under way")
-        task = self._unlocking = asyncio.create_task(self._unlock(), name="unlock")
+            raise ActionError(UNLOCKING)
+        task = self._unlocking = asyncio.create_task(act(), name=command)
         # Nobody asks for a failure that comes after the caller was cancelled.
         task.add_done_callback(lambda done: done.cancelled() or done.exception())
         await asyncio.wait([task])
         if task.cancelled():
-            raise ActionError("unlocking was stopped; send `unlock` again")
+            raise ActionError(f"{name} was stopped; send `{command}` again")
         task.result()
+
+    async def _open(self) -> None:
+        if self.gripper is None:
+            raise ActionError("no gripper is configured")
+        self.fingers_move = True
+        await self.gripper.open_by_operator()
+        self.fingers_move = False
 
     async def _unlock(self) -> None:
         _accepted(await self.robot.send(Unlock()))

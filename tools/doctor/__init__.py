@@ -17,7 +17,7 @@ from shearloop.errors import UserError
 from shearloop.tools.check import CheckEmulators, check_parts
 from shearloop.tools.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
 from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, trouble
-from shearloop.tools.serial_ports import list_serial_ports
+from shearloop.tools.serial_ports import HiddenBoard, has_brltty, list_hidden_boards, list_serial_ports
 
 __all__ = ["Finding", "examine"]
 
@@ -34,7 +34,7 @@ def examine(
 ) -> Iterator[Finding]:
     """Yield one finding after another; listen to all devices at once for `seconds`."""
     yield from check_computer()
-    yield check_ports()
+    yield from check_ports()
     if config_path is None:
         yield check_disk(Path())
         yield note("configuration", "not given", "files and devices were not checked", "`shearloop doctor CONFIG`")
@@ -108,17 +108,34 @@ def check_disk(folder: Path) -> Finding:
     return good("disk", found)
 
 
-def check_ports() -> Finding:
-    """List the USB serial ports with their serial numbers."""
-    ports = list_serial_ports()
+def check_ports() -> Iterator[Finding]:
+    """List the USB serial ports with their serial numbers, and the boards that have none."""
+    ports, hidden = list_serial_ports(), list_hidden_boards()
+    yield from map(_explain_hidden, hidden)
     if not ports:
-        means = "no board is plugged in, or the system has not noticed it"
-        return note("USB serial ports", "none", means, "plug the boards in; look at `sudo dmesg | tail`")
+        if not hidden:
+            means = "no board is plugged in, or the system has not noticed it"
+            yield note("USB serial ports", "none", means, "plug the boards in; look at `sudo dmesg | tail`")
+        return
     shown = ", ".join(f"{port.path} ({port.serial_number or 'without a serial number'})" for port in ports)
     denied = "; ".join(f"{port.path}: {port.error}" for port in ports if port.error)
     if denied:
-        return note("USB serial ports", shown, denied, "see `shearloop ports`")
-    return good("USB serial ports", shown)
+        yield note("USB serial ports", shown, denied, "see `shearloop ports`")
+    else:
+        yield good("USB serial ports", shown)
+
+
+def _explain_hidden(board: HiddenBoard) -> Finding:
+    subject = f"USB {board.usb}"
+    found = f"likely the {board.likely}; it is plugged in and has no serial port"
+    if has_brltty():
+        means = "brltty, which serves Braille displays, takes boards with such a converter"
+        cure = "`sudo apt remove brltty` if nobody needs a Braille display here; then plug the board in again"
+        return trouble(subject, found, means, cure)
+    means = "the kernel's driver for it is missing, or another program has taken the board"
+    modules = "`sudo apt install linux-modules-extra-$(uname -r)`"
+    cure = f"look at `sudo dmesg | tail`; on Ubuntu {modules}, then plug it in again"
+    return trouble(subject, found, means, cure)
 
 
 def check_files(

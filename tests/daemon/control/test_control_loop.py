@@ -20,8 +20,8 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     rig = started(
         Rig(new_loop()),
         {"do": "approach", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0]},
-        GRIP,
         {"do": "tare"},
+        GRIP,
         {"do": "identify"},
         {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 20},
         {"do": "release"},
@@ -29,7 +29,7 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     )
     rig.run(200)
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
-    assert [type(action) for action in rig.begun] == [ApproachStep, GripStep, TareStep, GripStep]
+    assert [type(action) for action in rig.begun] == [ApproachStep, TareStep, GripStep, GripStep]
     held = np.array(rig.true_nm)[-round(15 / TICK_S) - 110 : -110]
     assert held.mean() == pytest.approx(0.1, abs=0.008)
     assert held.std() < 0.006

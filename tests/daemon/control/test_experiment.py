@@ -16,14 +16,8 @@ from shearloop.daemon.control.experiment import (
     StepCommand,
     TrackTorque,
 )
-from shearloop.daemon.control.experiment_schema import (
-    STEP_KINDS,
-    ExperimentFile,
-    ExperimentLimits,
-    check_steps,
-    outline,
-    reversals,
-)
+from shearloop.daemon.control.experiment_check import check_steps, reversals
+from shearloop.daemon.control.experiment_schema import STEP_KINDS, ExperimentFile, ExperimentLimits, outline
 
 TICK_NS = 8_000_000
 STIFFNESS_NM_PER_RAD = 0.2

@@ -197,7 +197,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ({}, "nothing is measured: give `fingertips`, a `skin`, or both"),
+        ({}, "nothing is measured: give `fingertips`, a `skin` or a `load_cell`"),
         ({"skin": section({**ADC, **SCANNER})}, "skin.daq: give either scanner or adc, and not both"),
         ({"skin": section({})}, "skin.daq: give either scanner or adc, and not both"),
         ({"skin": section(ADC, source={})}, "skin.source: give either socket or serial"),

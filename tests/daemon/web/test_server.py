@@ -453,7 +453,7 @@ async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(conf
     async with running_daemon(config(**places, curve=curve)) as daemon:
         async with page_of(places, tmp_path, "ada") as page:
             assert await page.hears()
-            for command in ("tare", "start", "pause", "resume", "unlock"):
+            for command in ("tare", "start", "pause", "resume", "unlock", "release"):
                 assert (await post(page, f"/commands/{command}"))[0] == 403, command
             bearer = {"Authorization": f"Bearer {page.token}"}
             assert await post(page, "/commands/tare", **bearer) == (200, {"ok": True, "tared": ["right"]})

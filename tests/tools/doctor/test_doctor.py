@@ -12,11 +12,11 @@ from shearloop.cli.emulator_processes import check_emulators
 from shearloop.daemon.config import CurveConfig, SerialDevice, load_daemon_config
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
-from shearloop.tools import doctor
+from shearloop.tools import doctor, serial_ports
 from shearloop.tools.doctor.boards import check_port
 from shearloop.tools.doctor.devices import check_task
 from shearloop.tools.doctor.findings import from_error
-from shearloop.tools.serial_ports import SerialPortInfo
+from shearloop.tools.serial_ports import HiddenBoard, SerialPortInfo, access_cure, has_brltty, list_hidden_boards
 from tests.emulator_process import own_address
 from tests.fixtures.daemons import DEADLINE_S, robot_at, shearloop
 
@@ -192,7 +192,7 @@ def test_ports_are_listed_with_their_configuration_entry(monkeypatch, ran, resul
     assert (first["likely"], first["usb"], first["error"]) == ("EIT-kit (Teensy)", "16c0:0483", "")
     assert second["named_by"] == "{path: /dev/null}"
     there[:] = [port(device="/dev/gone")]
-    assert "sudo usermod -aG dialout" in ran("ports").out
+    assert "No such file or directory" in ran("ports").out
 
 
 def test_each_denied_port_is_reported_with_its_reason(monkeypatch):
@@ -205,5 +205,76 @@ def test_each_denied_port_is_reported_with_its_reason(monkeypatch):
         port("/dev/ttyUSB1", "no right"),
     ]
     monkeypatch.setattr("shearloop.tools.doctor.list_serial_ports", lambda: there)
-    found = doctor.check_ports()
+    monkeypatch.setattr("shearloop.tools.doctor.list_hidden_boards", list)
+    (found,) = doctor.check_ports()
     assert (found.state, found.means) == ("note", "/dev/ttyUSB0: another program holds it; /dev/ttyUSB1: no right")
+
+
+@pytest.mark.parametrize("group", ["dialout", "uucp", "shearloop", "root", "tty", "1234"])
+@pytest.mark.parametrize("mode", [0o660, 0o600, 0o640])
+@pytest.mark.parametrize("joined", [False, True])
+def test_the_cure_of_a_denied_port_belongs_to_its_group_and_mode(group, mode, joined):
+    said = access_cure(group, mode, joined=joined)
+    usual = group in ("dialout", "uucp", "shearloop") and mode == 0o660
+    assert (f"usermod -aG {group} " in said) == ((usual and not joined) or (group == "shearloop" and not usual))
+    assert ("log out and in again" in said) == (usual and joined)
+    assert ("sudo shearloop install" in said) == (not usual)
+    assert "; " in said
+
+
+def usb_bus(folder: Path, *, port: bool, vendor: str = "1a86") -> Path:
+    """Write what the system says of a CH340, of a mouse, and of an interface."""
+    for name, numbers in (("1-2", (vendor, "7523")), ("1-3", ("046d", "c077"))):
+        (folder / name).mkdir(parents=True)
+        for file, number in zip(("idVendor", "idProduct"), numbers, strict=True):
+            (folder / name / file).write_text(f"{number}\n")
+    (folder / "1-2" / "1-2:1.0" / "ttyUSB0" if port else folder / "1-2" / "1-2:1.0").mkdir(parents=True)
+    (folder / "1-2:1.0").mkdir()
+    return folder
+
+
+def test_a_board_without_a_port_is_told_from_one_with_a_port(tmp_path):
+    assert list_hidden_boards(usb_bus(tmp_path / "with", port=True)) == []
+    (found,) = list_hidden_boards(usb_bus(tmp_path / "without", port=False))
+    assert (found.usb, found.likely) == ("1a86:7523", "load cell (CH340)")
+    assert list_hidden_boards(tmp_path / "none") == []
+
+
+def test_brltty_is_recognised_by_its_process_or_its_rule(tmp_path):
+    processes, rules = tmp_path / "proc", tmp_path / "rules.d"
+    (processes / "42").mkdir(parents=True)
+    rules.mkdir()
+    (processes / "42/comm").write_text("python3\n")
+    assert not has_brltty(processes, [rules, tmp_path / "none"])
+    (rules / "85-brltty.rules").touch()
+    assert has_brltty(processes, [rules])
+    (rules / "85-brltty.rules").unlink()
+    (processes / "42/comm").write_text("brltty\n")
+    assert has_brltty(processes, [rules])
+
+
+@pytest.mark.parametrize("brltty", [True, False])
+def test_the_doctor_says_who_took_a_board(monkeypatch, brltty):
+    monkeypatch.setattr("shearloop.tools.doctor.list_hidden_boards", lambda: [HiddenBoard("1a86:7523", "load cell")])
+    monkeypatch.setattr("shearloop.tools.doctor.list_serial_ports", list)
+    monkeypatch.setattr("shearloop.tools.doctor.has_brltty", lambda: brltty)
+    (found,) = doctor.check_ports()
+    assert found.subject == "USB 1a86:7523"
+    assert ("apt remove brltty" in found.next_step) == brltty
+    assert ("dmesg" in found.next_step) != brltty
+
+
+def test_boards_without_a_serial_number_are_named_by_their_socket(tmp_path, monkeypatch):
+    """By identity, two copies have the same name."""
+    port = tmp_path / "ttyUSB1"
+    port.touch()
+    for name, link in (("by-id", "usb-1a86_USB_Serial-if00"), ("by-path", "pci-0000:00:14.0-usb-0:2:1.0")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / link).symlink_to(port)
+    monkeypatch.setattr(serial_ports, "OWN_LINKS", tmp_path / "own")
+    monkeypatch.setattr(serial_ports, "UDEV_LINKS", {"by-id": tmp_path / "by-id", "by-path": tmp_path / "by-path"})
+    assert serial_ports._stable_name(str(port), None).endswith("by-path/pci-0000:00:14.0-usb-0:2:1.0")
+    assert serial_ports._stable_name(str(port), "123").endswith("by-id/usb-1a86_USB_Serial-if00")
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own/pci-0000:00:14.0-usb-0:2:1.0").symlink_to(port)
+    assert serial_ports._stable_name(str(port), None).startswith(str(tmp_path / "own"))

@@ -98,6 +98,8 @@ class ControlLoop:
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
+        # How many experiments have begun.
+        self.runs = 0
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
         self.config = config
         self._sources = sources
@@ -296,6 +298,9 @@ class ControlLoop:
             expected=expected,
             release_error=before.release_error,
         )
+        self.runs += 1
+        # Until the first tick, nobody takes the end of the run before for the end of this one.
+        self.status = LoopStatus(self.experiment.phase.value, "", WristCommand(), SafetyDecision(Response.NOTE))
         return None
 
     def pause(self) -> str | None:

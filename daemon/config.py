@@ -31,7 +31,7 @@ from shearloop.estimation.estimator_names import EstimatorName
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {
     *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording"),
-    *("commands", "stop", "publish", "clients", "health", "daemon", "clock"),
+    *("commands", "stop", "publish", "clients", "health", "daemon", "clock", "memory"),
 }
 
 

@@ -140,3 +140,7 @@ class LinkReporter:
         (log.info if event.up else log.debug if event.repeated else log.warning)(event.sentence)
         if self.loop is not None:
             self.loop.on_link(self.device, event.sentence, up=event.up)
+
+    def on_refusal(self, sentence: str) -> None:
+        """Log refused data as a warning."""
+        structlog.get_logger().bind(device=self.device).warning(sentence)

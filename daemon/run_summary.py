@@ -250,11 +250,14 @@ def _held(
         if reached_s < np.inf:
             yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point changed, by {name}"
         for t_ns, description in events:
-            after = sources[name].between(t_ns, step.to_ns)
+            # The next disturbance has a line of its own.
+            next_ns = min((other_ns for other_ns, _ in events if other_ns > t_ns), default=None)
+            after = sources[name].between(t_ns, step.to_ns if next_ns is None else next_ns - 1)
             if after.torque_nm.size:
                 worst_nm = np.abs(after.torque_nm - set_nm).max()
                 back_s = recovered_s((after.t_ns - t_ns) / 1e9, after.torque_nm, set_nm)
-                back = "not back by the end" if back_s == np.inf else f"back within ± {BAND:.0%} after {back_s:.1f} s"
+                never = "not back by the end" if next_ns is None else "not back by the next one"
+                back = never if back_s == np.inf else f"back within ± {BAND:.0%} after {back_s:.1f} s"
                 since_s = (t_ns - from_ns) / 1e9
                 yield f"    disturbed after {since_s:.1f} s ({description}): {worst_nm:.3f} N·m off, {back}"
 

@@ -88,6 +88,11 @@ class LineSplitter:
         self.too_long = 0
         self.too_long_start = b""
 
+    @property
+    def dropping(self) -> bool:
+        """Whether the line under way is too long."""
+        return self._dropping
+
     def restart(self) -> None:
         """Drop a half-received line: the port was reopened."""
         self.partial = b""
@@ -312,7 +317,11 @@ class SerialSensor(Generic[ValueT]):
         event = RawEvent(kind, t_ns, data)
         if self._inputs is not None:
             self._inputs.record(event)
-        return self._parser.handle(event)
+        before = self._parser.refused
+        values = self._parser.handle(event)
+        if self._parser.refused > before:
+            self._link.monitor.refused(self._parser.refusal)
+        return values
 
     async def _open(self) -> Port:
         port = await self._link.open()

@@ -28,7 +28,7 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class FittedCreep:
-    """A gel's creep, with the residual's standard deviation without and with it (N·m).
+    """A gel's creep, with the standard deviation of the scaled estimates' error without and with it (N·m of torque).
 
     Torque is `scale` times a reading plus `offset_nm`, less the creep. Scale and offset are errors of the estimator and
     of the zero; they are fitted but not corrected.
@@ -70,16 +70,18 @@ def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> Fitt
     plain = np.column_stack([np.ones_like(torque), *([] if scale_is_right else [torque])])
     before_nm = _least_squares(plain, wanted)[1]
     best: FittedCreep | None = None
-    slowest = False
+    # Of the readings, not of the torque.
+    least_nm, slowest = np.inf, False
     for time_s in _TIMES_S:
         followed = np.concatenate([_low_passed(grip, float(time_s)) for grip in grips])
         (lag, offset_nm, *gains), after_nm = _least_squares(np.column_stack([followed, plain]), wanted)
         gain = float(gains[0]) if gains else 1.0
         # Negative gain or lag is unphysical: noise that happens to fit.
-        if gain > 0.0 <= lag and (best is None or after_nm < best.after_nm):
+        if gain > 0.0 <= lag and after_nm < least_nm:
+            least_nm = after_nm
             share = float(lag / (gain + lag))
             creep = Creep(share, float(time_s) * (1.0 - share))
-            best = FittedCreep(creep, 1.0 / gain, -float(offset_nm) / gain, before_nm, after_nm)
+            best = FittedCreep(creep, 1.0 / gain, -float(offset_nm) / gain, before_nm / gain, after_nm / gain)
             slowest = time_s == _TIMES_S[-1]
     if best is None:
         raise UserError("creep: the torque does not fall behind the readings; is the load cell's zero right?")

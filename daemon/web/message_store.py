@@ -109,7 +109,8 @@ class MessageStore:
         """Return values that the page draws and does not compute itself."""
         if topic == EitHeatmap.topic:
             self._models[source] = str(content.get("model", ""))
-            return {"peaks": _peaks(content.get("scores"))}
+            known = MODELS.get(self._models[source])
+            return {"peaks": _peaks(content.get("scores")), "k_unit": known.k_unit if known is not None else ""}
         k, sigma = content.get("k"), content.get("sigma")
         if topic == EitEstimate.topic and isinstance(k, float) and isinstance(sigma, float):
             model = self._models.get(source, "")

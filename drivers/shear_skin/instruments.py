@@ -24,6 +24,7 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
 )
 from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
+from shearloop.drivers.refused_lines import shown
 from shearloop.drivers.serial_sensor import (
     InputKind,
     InputRecorder,
@@ -182,16 +183,25 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             left_s = (until_ns - monotonic_ns()) / 1e9
             received = await self._port.read(left_s) if left_s > 0 else None
             if received is None:
-                raise DeviceSilentError(
-                    f"{self.instrument} at {self._port.path} has not answered {query!r} within {self.timeout_s:.2g} "
-                    "s; see that it is on, and that baud rate and line end are as configured."
-                )
+                raise DeviceSilentError(self._no_answer(query))
             replies, arrival_ns = split_replies(self._lines, received.data), received.t_arrival_ns
         reply = Reply(replies[0], asked_ns, arrival_ns)
         if self.inputs is not None:
             self.inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
             self.inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
         return reply
+
+    def _no_answer(self, query: str) -> str:
+        where = f"{self.instrument} at {self._port.path}"
+        if came := self._lines.partial or (self._lines.too_long_start if self._lines.dropping else b""):
+            return (
+                f"{where} answered {query!r} with {shown(came)} and no line end within {self.timeout_s:.2g} s; see "
+                "that baud rate and line end are as configured, and that it is this instrument."
+            )
+        return (
+            f"{where} has not answered {query!r} within {self.timeout_s:.2g} s; see that it is on, and that baud rate "
+            "and line end are as configured."
+        )
 
     async def _check(self) -> None:
         """Raise ProtocolError if the instrument rejected a command."""

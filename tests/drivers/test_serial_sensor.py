@@ -36,6 +36,7 @@ class PlayedLink(Link):
     """A link whose ports send bytes at times after their opening, in s; None is a silence."""
 
     events: list[LinkEvent] = field(default_factory=list)
+    refusals: list[str] = field(default_factory=list)
     reads: list[tuple[float, bytes | None]] = field(default_factory=list)
     # How long each read would have waited.
     waits_s: list[float] = field(default_factory=list)
@@ -45,6 +46,9 @@ class PlayedLink(Link):
 
     def on_link_event(self, event: LinkEvent) -> None:
         self.events.append(event)
+
+    def on_refusal(self, sentence: str) -> None:
+        self.refusals.append(sentence)
 
     async def _connect(self) -> Port:
         opened_ns, reads = time.monotonic_ns(), iter(self.reads)
@@ -102,6 +106,9 @@ async def test_a_board_that_sends_a_value_now_and_then_among_refused_lines_is_no
     await played(device, link, losses=1)
     # The end of what is played is a silence.
     assert "has sent nothing for " in link.losses()[0]
+    # The log has the first one, and health the number.
+    (told,) = link.refusals
+    assert "'0,091'" in told
     assert sum(device.diagnostics()["errors"].values()) > 200
 
 
@@ -127,6 +134,9 @@ class _StopAfter:
 
     def __init__(self, link: PlayedLink, losses: int) -> None:
         self._link, self._losses = link, losses
+
+    def on_refusal(self, sentence: str) -> None:
+        self._link.on_refusal(sentence)
 
     def on_link_event(self, event: LinkEvent) -> None:
         self._link.events.append(event)

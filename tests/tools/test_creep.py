@@ -50,6 +50,12 @@ def test_a_wrong_scale_of_the_estimator_is_not_taken_for_creep():
     assert found.creep.share == pytest.approx(0.08, abs=0.005)
     assert found.creep.time_s == pytest.approx(20.0, rel=0.1)
     assert (found.scale, found.offset_nm) == (pytest.approx(1 / 1.1, rel=0.01), pytest.approx(0.0, abs=1e-4))
+    # The error is that of the scaled estimates, in N·m of torque.
+    noise = np.random.default_rng(5).normal(0, 0.01, times.size)
+    once, twice = (fit_creep([Stretch(times, factor * (shears + noise), torques)]) for factor in (1.0, 2.0))
+    assert twice.after_nm == pytest.approx(once.after_nm, rel=1e-6)
+    assert twice.before_nm == pytest.approx(once.before_nm, rel=1e-6)
+    assert once.after_nm == pytest.approx(0.01, rel=0.1)
     fooled = fit_creep([Stretch(times, 1.1 * shears, torques)], scale_is_right=True)
     assert fooled.creep.time_s < 5.0
 

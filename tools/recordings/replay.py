@@ -360,7 +360,8 @@ def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: in
         side, t_ns = topic.removeprefix(f"{schema.FRAME_TOPIC}."), int(content["arrival_unix_ns"])
         return RecordedEvent(schema.input_topic(side), t_ns, {}, side, RawEvent(InputKind.DATA, t_ns, text.encode()))
     complete = {
-        "source": topic.partition(".")[0],
+        # The only imported topic beside the frames.
+        "source": LOAD_CELL,
         "raw": content.get("torque_nm"),
         "saturated": False,
         "spike": False,

@@ -129,7 +129,8 @@ export class FingertipPanel {
     this.drawn.map = heatmap;
     if (!heatmap) return;
     const { scores, k_low: kLow, k_high: kHigh, sigma_low: sigmaLow, sigma_high: sigmaHigh } = heatmap.content;
-    drawMap(this.part("map"), { scores: array(scores), k: [kLow, kHigh], sigma: [sigmaLow, sigmaHigh] }, heatmap.peaks);
+    const map = { scores: array(scores), k: [kLow, kHigh], kUnit: heatmap.k_unit, sigma: [sigmaLow, sigmaHigh] };
+    drawMap(this.part("map"), map, heatmap.peaks);
   }
 
   mapText(heatmap, said) {

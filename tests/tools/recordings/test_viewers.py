@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.cli import main
-from shearloop.daemon.messaging.messages import TOPICS, decode, encode, wire_map
+from shearloop.daemon.messaging.messages import TOPICS, decode, encode, units, wire_map
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import McapFile
 from shearloop.errors import UserError
@@ -88,6 +88,30 @@ def test_rerun_reads_scalars_images_and_the_pose(topics, tmp_path):
         np.testing.assert_allclose(pose["Transform3D:translation"], [[[0, 1, 2]]] * 4)
         turn = Rotation.from_rotvec([3, 4, 5]).as_quat()
         np.testing.assert_allclose(pose["Transform3D:quaternion"], [[turn]] * 4, rtol=1e-6)
+
+
+@pytest.mark.usefixtures("rerun_runtime")
+def test_a_chart_of_rerun_holds_the_keys_of_one_unit(tmp_path, monkeypatch, ran):
+    from rerun import blueprint
+
+    charts: dict[str, list[str]] = {}
+    view = blueprint.TimeSeriesView
+
+    def drawn(*, name: str, contents: list[str]) -> Any:
+        charts[name] = contents
+        return view(name=name, contents=contents)
+
+    monkeypatch.setattr(blueprint, "TimeSeriesView", drawn)
+    ran("recording", "export", write(tmp_path / "a.mcap", RIG), "--format", "rrd")
+    shown = {name: {unit_of(entity) for entity in chart} for name, chart in charts.items()}
+    assert shown == {"torque (N·m)": {"N·m"}, "diameter (mm)": {"mm"}, "shear force (N)": {"N"}, "angle (rad)": {"rad"}}
+    assert "loop/state/stiffness_nm_per_rad" not in {one for chart in charts.values() for one in chart}
+
+
+def unit_of(entity: str) -> str:
+    """Return the unit of an entity of a scalar."""
+    topic, _, key = entity.rpartition("/")
+    return units(schema.schema_name(topic.replace("/", ".")))[key]
 
 
 def columns(chunks: list[Any], entity: str) -> dict[str, list[Any]]:

@@ -195,6 +195,15 @@ class ControlLoop:
             self._gripped.origin_rad = self._gripped.force_n = None
 
     @property
+    def grip(self) -> tuple[float | None, float | None]:
+        """The wrist's angle in rad at the present grip, and its largest force in N; None for what is unknown."""
+        return self._gripped.origin_rad, self._gripped.force_n
+
+    def restore_grip(self, origin_rad: float | None, force_n: float | None) -> None:
+        """Take the angle and the force of a grip that a process before this one has closed."""
+        self._gripped.origin_rad, self._gripped.force_n = origin_rad, force_n
+
+    @property
     def held(self) -> str | None:
         """What is between the fingers, with its width and the force of the grip, or None."""
         gripper, force_n = self.inputs.gripper, self._gripped.force_n

@@ -1,11 +1,12 @@
 """The daemon's configuration. Units are in the keys; unknown keys are refused; loaded values do not change."""
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, WithJsonSchema, field_validator, model_validator
 
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.control.loop_inputs import LoopConfig
@@ -24,14 +25,16 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
     URCAP_PORT,
 )
+from shearloop.drivers.hosts import why_no_host
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
+from shearloop.yaml_files import shown
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {
     *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording"),
-    *("commands", "stop", "publish", "clients", "health", "daemon", "clock"),
+    *("commands", "stop", "publish", "clients", "health", "daemon", "clock", "memory"),
 }
 
 
@@ -42,13 +45,38 @@ def _known_transport(address: str) -> str:
         raise ValueError(
             f"must end in a port, a whole number up to {addresses.LARGEST_PORT}, as in tcp://127.0.0.1:7761"
         )
+    if addresses.names_localhost(address):
+        raise ValueError("names localhost, and a socket is bound to an address: write 127.0.0.1 instead of localhost")
+    if (size := addresses.ipc_size(address)) > addresses.LONGEST_IPC:
+        raise ValueError(
+            f"has a path of {size} bytes, and a socket's has at most {addresses.LONGEST_IPC}: choose a shorter one"
+        )
     return address
+
+
+_NAME = r"^[a-z][a-z0-9_-]{0,31}$"
+
+
+def _valid_host(host: str) -> str:
+    if reason := why_no_host(host):
+        raise ValueError(f"{shown(host)} {reason}; give the device's name or address")
+    return host
+
+
+def _valid_name(name: str) -> str:
+    if not re.fullmatch(_NAME, name):
+        near = re.sub(r"[^a-z0-9_-]", "_", name.lower())
+        hint = f"; did you mean {near}?" if re.fullmatch(_NAME, near) else ""
+        form = "a lower-case letter, then up to 31 lower-case letters, digits, - and _"
+        raise ValueError(f"{shown(name)} is no name of a fingertip: a name is {form}{hint}")
+    return name
 
 
 Address = Annotated[str, AfterValidator(_known_transport)]
 # A multimeter's channels are numbered with the slot first, such as 1601.
 Channel = Annotated[int, Field(ge=1, le=9999)]
-FingertipName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
+FingertipName = Annotated[str, AfterValidator(_valid_name), WithJsonSchema({"type": "string", "pattern": _NAME})]
+Host = Annotated[str, AfterValidator(_valid_host)]
 
 
 class CurveConfig(ConfigModel):
@@ -108,7 +136,7 @@ class LoadCellConfig(ConfigModel):
 class InstrumentSocket(ConfigModel):
     """An instrument on the network, or a serial one behind a terminal server."""
 
-    host: str = Field(min_length=1, description="name or address")
+    host: Host = Field(description="name or address")
     port: int = Field(ge=1, le=65535, description="TCP port, as set on the instrument or server")
 
 
@@ -181,7 +209,7 @@ class SkinConfig(ConfigModel):
 class GripperSocket(ConfigModel):
     """The gripper behind the URCap's socket."""
 
-    host: str = Field(min_length=1, description="the robot's name or address")
+    host: Host = Field(description="the robot's name or address")
     port: int = Field(URCAP_PORT, ge=1, le=65535, description="TCP port of the URCap")
 
 

@@ -117,8 +117,8 @@ class Material:
 class CalibrationRows:
     """Calibration frames: the recording (n,), number and age (n,) of each there, its features (n, d) and the truth.
 
-    position and mean_position (n, m·c) are the difference to the idle frame and its mean over the grip, in units of
-    noise.
+    grip (n,) numbers the grips of all recordings. position and mean_position (n, m·c) are the difference to the idle
+    frame and its mean over the grip, in units of noise.
     """
 
     recording: IntArray
@@ -129,6 +129,7 @@ class CalibrationRows:
     mean_position: FloatArray
     torque_nm: FloatArray
     diameter_mm: FloatArray
+    grip: IntArray
 
     def where(self, rows: IntArray | BoolArray) -> Self:
         """Return some of the frames."""

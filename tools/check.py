@@ -1,6 +1,8 @@
 """What each part of a configuration is, or what is wrong with it; every file that it names is opened."""
 
 import math
+import os
+import stat
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
 
 # Raises UserError for an emulator of a configuration that cannot be started; the emulators are no affair of this room.
 CheckEmulators = Callable[[tuple["EmulatorConfig", ...], Path], object]
+
+
+# Linux: Documentation/admin-guide/devices.txt.
+_MEMORY_DEVICES = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,7 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
         with parts.of("skin"):
             parts.texts["skin"] = _skin(config.skin)
     robot = _check_rig(config, parts)
+    _check_paths(config, parts)
     # What cannot be opened yet counts as what it is configured to be.
     files = {name: fingertip.calibration for name, fingertip in config.fingertips.items()}
     files |= {COMBINED: config.combined.calibration} if config.combined is not None else {}
@@ -161,11 +168,36 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "UrSettings | None":
     return None
 
 
+def _check_paths(config: "DaemonConfig", parts: Parts) -> None:
+    """Check that ports are none of files, and the recordings' folder no file; what does not exist may come."""
+    from shearloop.daemon.config import SerialDevice
+
+    for key, section in config.walk():
+        if isinstance(section, SerialDevice) and section.path is not None and (kind := _no_port(section.path)):
+            parts.mistakes[key] = f"`{key}.path: {section.path}` is {kind}; name a serial port: `shearloop ports`"
+    if (recording := config.recording) is not None:
+        exists = next((path for path in (recording.folder, *recording.folder.parents) if path.exists()), None)
+        if exists is not None and not exists.is_dir():
+            parts.mistakes["recording"] = f"`recording.folder: {recording.folder}`: {exists} is a file; name a folder"
+
+
+def _no_port(path: Path) -> str:
+    """Return what a path is instead of a serial port, or an empty string, also where nothing exists."""
+    try:
+        status = path.stat()
+    except OSError:
+        return ""
+    if not stat.S_ISCHR(status.st_mode):
+        return "a folder" if stat.S_ISDIR(status.st_mode) else "a file"
+    # Character devices without a terminal: /dev/null, /dev/zero and their kind.
+    return "no serial port" if os.major(status.st_rdev) == _MEMORY_DEVICES else ""
+
+
 def _clients(curve: "CurveConfig") -> str:
     from shearloop.daemon.messaging.keys import check_allowed_clients, load_server_keys
 
     load_server_keys(curve.server_key)
-    return ", ".join(sorted(check_allowed_clients(curve.clients).values()))
+    return ", ".join(sorted(check_allowed_clients(curve.clients).names.values()))
 
 
 def _skin(config: "SkinConfig") -> str:

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from shearloop.drivers import ranges
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.hosts import why_no_host
 
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
@@ -197,7 +198,7 @@ class UrSettings(_Checked):
     watchdog_hz: Annotated[float, Field(ge=1, le=150)] = 10.0
     """The robot ends its program when it receives nothing for 1/watchdog_hz."""
     command_timeout_s: _Deadline = 0.1
-    """A wrist speed holds for this long after it was decided; then the wrist stops."""
+    """A wrist speed holds for this long after its decision, and after the robot's last state; then the wrist stops."""
     silence_timeout_s: _Deadline = 0.1
     """Other motion stops when the daemon sends nothing for this long."""
     state_timeout_s: _Deadline = 0.25
@@ -213,12 +214,8 @@ class UrSettings(_Checked):
 
     def __post_init__(self) -> None:
         """Refuse a host that is none, and rates that contradict each other."""
-        if not self.host.strip():
-            raise ValueError("host is empty; give the robot's address")
-        try:
-            self.host.encode("idna")
-        except UnicodeError:
-            raise ValueError("host is no name or address of a computer; give the robot's address") from None
+        if reason := why_no_host(self.host):
+            raise ValueError(f"host {reason}; give the robot's address")
         if self.rate_hz < 3 * self.watchdog_hz:
             raise ValueError(
                 f"rate_hz ({self.rate_hz:g}) must be at least three times watchdog_hz ({self.watchdog_hz:g}), "

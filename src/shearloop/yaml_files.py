@@ -248,13 +248,18 @@ def _mistakes(
         # A list counts only its valid entries, so that mistakes within it make it too short as well.
         if details["type"] == "too_short" and any(one["loc"][:-1][: len(location)] == location for one in first):
             continue
-        kind, key, line = details["type"], "", 1
-        if kind != "invalid_key":
-            key, line = _place(location, content, root, missing=kind == "missing")
+        kind = details["type"]
+        key, line = _place(location, content, root, missing=kind == "missing")
+        wrong_key = kind == "invalid_key" or location[-1:] == ("[key]",)
+        if wrong_key:
+            # Only the key's section has a name.
+            section = location[:-2] if location[-1] == "[key]" else location[:-1]
+            key, _ = _place(section, content, root, missing=False)
         if kind.startswith("union_tag"):
             key += "." + details["ctx"]["discriminator"].strip("'")
         subject = f"{key}: " if key else ""
-        found[f"{where}{f':{line}' if root is not None else ''}: {subject}{_sentence(details, schema)}"] = line
+        sentence = _sentence(details, schema, _written(location, content, root, key=wrong_key))
+        found[f"{where}{f':{line}' if root is not None else ''}: {subject}{sentence}"] = line
     return sorted(found, key=lambda text: found[text]) + (
         [f"{where}: {counted(len(more), 'more mistake')}"] if more else []
     )
@@ -266,10 +271,10 @@ def _place(location: Sequence[int | str], content: object, node: yaml.Node | Non
     for number, part in enumerate(location):
         child: yaml.Node | None = None
         if isinstance(content, Mapping) and part in content:
+            if isinstance(node, yaml.MappingNode):
+                name, child = _pair(content, part, node)
+                line = name.start_mark.line + 1
             content = content[part]
-            for name, value in node.value if isinstance(node, yaml.MappingNode) else ():
-                if name.value == str(part):
-                    line, child = name.start_mark.line + 1, value
         elif isinstance(content, list | tuple) and isinstance(part, int) and part < len(content):
             content = content[part]
             if isinstance(node, yaml.SequenceNode):
@@ -282,10 +287,40 @@ def _place(location: Sequence[int | str], content: object, node: yaml.Node | Non
     return key.lstrip("."), line
 
 
-def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
+def _pair(content: Mapping[Any, object], key: int | str, node: yaml.MappingNode) -> tuple[yaml.Node, yaml.Node]:
+    """Return the nodes of a key and of its value; keys are unique, so that they stand in the content's order."""
+    name, value = node.value[list(content).index(key)]
+    return name, value
+
+
+def _written(location: Sequence[int | str], content: object, node: yaml.Node | None, *, key: bool) -> str:
+    """Return the value at a location as it is written in the file, or its key; else an empty text."""
+    name = node
+    for part in location:
+        if isinstance(content, Mapping) and part in content and isinstance(node, yaml.MappingNode):
+            name, node = _pair(content, part, node)
+            content = content[part]
+        elif isinstance(content, list) and isinstance(part, int) and isinstance(node, yaml.SequenceNode):
+            name = node = node.value[part]
+            content = content[part]
+    wrong = name if key else node
+    return str(wrong.value) if isinstance(wrong, yaml.ScalarNode) else ""
+
+
+def _unquoted(found: object, written: str, what: str) -> str:
+    """Return a sentence on a text that YAML reads as something else, and its cure."""
+    read_as = "true or false" if isinstance(found, bool) else "a number"
+    return f"{what}{written or shown(found)} without quotes is {read_as}, and no text; put it in quotes"
+
+
+def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str = "") -> str:
     location, kind, found = details["loc"], details["type"], details["input"]
-    if kind == "invalid_key":
-        return f"the key {shown(found)} is a number; a name is expected"
+    if kind == "invalid_key" or (kind == "string_type" and location[-1:] == ("[key]",)):
+        if isinstance(found, bool):
+            return _unquoted(found, written, "the key ")
+        return f"the key {written or shown(found)} is a number; a name is expected"
+    if kind == "string_type" and isinstance(found, bool | int | float):
+        return f'{_unquoted(found, written, "")}: "{written or found}"'
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"is not a known key{_known_keys(str(location[-1]), _schema_at(schema, location[:-1], schema))}"
     if kind in ("value_error", "assertion_error"):

@@ -78,7 +78,7 @@ def test_foreign_and_stale_files_are_refused(tmp_path, small):
         Calibration.load(tmp_path / "none.cal")
     for find, new, message in (
         (PAPER_TABLE.digest, f"'{'0' * 64}'", "channel table 000000000000…, expected"),
-        ("format_version: 7", "format_version: 5", "format version 5, expected 7; calibrate again"),
+        ("format_version: 8", "format_version: 5", "format version 5, expected 8; calibrate again"),
     ):
         with pytest.raises(CalibrationError, match=message):
             Calibration.load(edited(small, tmp_path / "stale.cal", find, new))

@@ -197,7 +197,10 @@ class Calibration:
         whole = self.estimator.scale.shape == (m, c) and all(row.shape == (c,) for row in rows)
         if not whole or len(self.validators) not in (0, len(self.sides)):
             raise ValueError(f"it is of {len(self.sides)} sides of {c} channels, and its arrays have other shapes")
-        for model in self.outputs.values():
+        for quantity, model in self.outputs.items():
+            width, found = self.estimator.feature_width(quantity), len(model.regressor.mean_feature)
+            if width not in (None, found):
+                raise ValueError(f"the regressor of the {quantity} has {found} inputs, expected {width}")
             if model.k_range.shape not in ((0,), (2,)):
                 raise ValueError(f"k_range has the shape {model.k_range.shape}, expected two values")
             if model.novelty is not None:

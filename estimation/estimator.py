@@ -236,6 +236,10 @@ class Estimator(ABC):
         )
         return self, regressor, 0.0
 
+    def feature_width(self, quantity: Quantity) -> int | None:  # noqa: ARG002 - estimators with a known width use it
+        """Return the number of inputs of a quantity's regressor, None if the estimator does not tell."""
+        return None
+
     def side_of_features(self, n_features: int) -> IntArray:
         """Return the side (d,) that each of the torque's features comes from: one number where they have no side."""
         return np.zeros(n_features, dtype=np.int64)

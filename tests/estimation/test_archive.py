@@ -211,6 +211,19 @@ def test_an_array_of_another_type_or_shape_is_refused(saved, array, change, tmp_
     assert f"{array}.npy" in seen
 
 
+@pytest.mark.parametrize("change", ["fewer lags", "other channels"])
+def test_arrays_that_fit_each_other_and_not_the_channel_table_are_refused(motion_calibration, change, tmp_path):
+    estimator = motion_calibration.estimator
+    temporal = estimator.temporal
+    if change == "fewer lags":
+        changed = replace(temporal, n_lags=temporal.n_lags - 1)
+    else:
+        changed = replace(temporal, directions=temporal.directions[:, :, :-1].copy())
+    replace(motion_calibration, estimator=replace(estimator, temporal=changed)).save(tmp_path / "x.cal")
+    with pytest.raises(CalibrationError, match="does not describe a calibration of this version"):
+        Calibration.load(tmp_path / "x.cal")
+
+
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
 def test_compressed_and_encrypted_members_are_refused(small, method, tmp_path):
     packed = tmp_path / "packed.cal"

@@ -59,6 +59,8 @@ _DIRECTION_FRAMES = 8
 # An estimate needs this many frames of the grip before its own, 6.5 s. An older part of the memory counts as the oldest
 # of them, so that the memory costs no twist.
 _LEAST_LAGS = 12
+# A longer memory in a file would fill the session's own.
+_MOST_LAGS = 1000
 # Positions drift between recordings, motion does not. So motion alone is preferred unless it leaves more than the first
 # share of the torque's variance unexplained on frames left out and the position lowers the error by the second.
 _MOTION_MAY_LEAVE, _POSITION_MUST_GAIN = 0.5, 0.5
@@ -202,7 +204,16 @@ class MotionRegression(Estimator):
             raise ValueError(f"directions have the shape {directions.shape}, expected {m} sides of {c} channels")
         if quantity == "diameter":
             return m * c
-        return m * int(directions.shape[1]) * (self.temporal.n_lags + self.temporal.uses_position)
+        edges = self.temporal.edges
+        if (
+            edges.ndim != 1
+            or len(edges) < 2
+            or edges[0] < 1
+            or (np.diff(edges) < 1).any()
+            or edges[-1] > _MOST_LAGS + 1
+        ):
+            raise ValueError(f"the memory ends at {edges.tolist()} frames, expected up to {_MOST_LAGS} that rise")
+        return m * int(directions.shape[1]) * (len(edges) - 1 + self.temporal.uses_position)
 
     def position_noise_mm(self, regressor: IntervalRegressor) -> float:
         """Return the diameter's 95 % error from the noise of one frame, where each feature has a noise of 1.

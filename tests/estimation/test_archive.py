@@ -216,7 +216,7 @@ def test_arrays_that_fit_each_other_and_not_the_channel_table_are_refused(motion
     estimator = motion_calibration.estimator
     temporal = estimator.temporal
     if change == "fewer lags":
-        changed = replace(temporal, n_lags=temporal.n_lags - 1)
+        changed = replace(temporal, edges=temporal.edges[:-1])
     else:
         changed = replace(temporal, directions=temporal.directions[:, :, :-1].copy())
     replace(motion_calibration, estimator=replace(estimator, temporal=changed)).save(tmp_path / "x.cal")

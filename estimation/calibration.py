@@ -32,7 +32,7 @@ from shearloop.estimation.values import INLINE, Kind, Measured
 from shearloop.files import open_file, refusing_damage, replace_file
 from shearloop.yaml_files import parse_yaml, shown
 
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"
 _FILE_KIND = "shearloop estimator calibration"

@@ -138,7 +138,8 @@ def _fit_raw(
     estimator = calibration.estimator
     if not estimator.imputes_by_motion:
         estimator = replace(estimator, imputer=ChannelImputer.fit(rows.position, calibration.validators))
-    estimator, regressor, unexplained = estimator.fit_torque(rows.features, rows.torque_nm, bounds, rows.grip)
+    prepared = estimator
+    estimator, regressor, unexplained = prepared.fit_torque(rows.features, rows.torque_nm, bounds, rows.grip)
     # By age within the recordings, so that every part has all tools.
     order = np.argsort(rows.age_s, kind="stable")
     known = rows.where(order[np.isfinite(rows.diameter_mm[order])])
@@ -147,7 +148,7 @@ def _fit_raw(
     law = None
     if len(tools := _tools_of(recordings)) > 1:
         diameters_mm = np.array([np.nan if one.tool_mm is None else one.tool_mm.value for one in recordings])
-        fitted = _fit_tools(estimator, rows, diameters_mm) if enough else None
+        fitted = _fit_tools(prepared, rows, diameters_mm) if enough else None
         if fitted is not None:
             estimator, regressor, law = fitted
         elif unexplained > _TOOLS_MAY_LEAVE:

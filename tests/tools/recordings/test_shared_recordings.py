@@ -23,7 +23,7 @@ from shearloop.estimation.load_delay import find_load_delay, is_filtered, load_d
 from shearloop.estimation.novelty import NoveltyDetector
 from shearloop.studies.charts.fault_sweeps import balanced, judge_level
 from shearloop.studies.charts.stability import select_rows
-from shearloop.tools.evaluate import estimate_series, figures_of
+from shearloop.tools.evaluate import estimate_series, figures_by_load, figures_of
 from shearloop.tools.frame_series import part_of, read_series, series_of
 from shearloop.tools.recordings.matlab_import import find_streams, import_mat, read_stream
 from shearloop.tools.recordings.reader import read_recording
@@ -129,7 +129,7 @@ def test_later_twists(twists, sides, r, rmse_nm):
     figures = figures_of([estimate_series(calibration, part_of(series, HALF - 0.015, 1))])
     assert figures["r"] >= r
     assert figures["rmse_nm"] <= rmse_nm
-    assert 0.90 <= figures["coverage_95"] <= 0.98
+    assert 0.90 <= figures["coverage_95"] <= 0.99
     assert 0.6 <= figures["valid_fraction"] <= 0.75
 
 
@@ -289,22 +289,27 @@ def test_nothing_is_said_of_the_times_of_a_recording_that_does_not_show_them(sha
     assert found is None or found.few_frames
 
 
-def test_a_load_that_one_loop_stamped_early_is_put_right(shared, twists, tmp_path):
+def test_a_load_that_one_loop_stamped_early_is_put_right(shared, tmp_path):
     series = imported(tmp_path / "other.mcap", shared / "recordings/streams/20241202_153632")
     assert load_delay_warning(series) == ""
     early = replace(series, torque_t_s=series.torque_t_s - 2.36)
-    warning = r"the frames move 2\.\d+ ± 0\.\d+ s after the load .*though 57 gripped frames are too few to be sure"
+    warning = r"the frames move 2\.\d+ ± 0\.\d+ s after the load .*though 5\d gripped frames are too few to be sure"
     assert re.match(warning, load_delay_warning(early))
     assert re.match(warning, measure_timing([early]).warnings[0])
-    # The right fingertip of 2 December is the left one of 3 December.
-    calibration = fit("motion_regression", [twists.select_sides(("left",))], "another day")
-    other = imported(tmp_path / "third.mcap", shared / "recordings/streams/20241202_171704").select_sides(("right",))
-    early = replace(other, torque_t_s=other.torque_t_s - 2.82)
-    before, after = (
-        figures_of([estimate_series(calibration, replace(one, sides=("left",)))]) for one in (early, other)
-    )
-    assert before["r"] < 0.1
-    assert after["r"] > 0.9
+    # One twist of an afternoon, judged on one of an hour and a half later: r, and intervals that say something.
+    other = imported(tmp_path / "third.mcap", shared / "recordings/streams/20241202_171704")
+    calibration = fit("motion_regression", [series], "one twist")
+    clocks_s = np.linspace(-0.2, 0.2, 5)
+    found = [
+        figures_by_load([estimate_series(calibration, replace(other, torque_t_s=other.torque_t_s + shift))])["loaded"]
+        | {"r": figures_of([estimate_series(calibration, replace(other, torque_t_s=other.torque_t_s + shift))])["r"]}
+        for shift in clocks_s.tolist()
+    ]
+    assert np.mean([one["r"] for one in found]) >= 0.95
+    assert min(one["coverage_95"] for one in found) >= 0.9
+    assert max(one["winkler_nm"] for one in found) <= 0.045
+    before = replace(other, torque_t_s=other.torque_t_s - 2.7)
+    assert figures_of([estimate_series(calibration, before)])["r"] < 0.6
 
 
 def test_a_clock_that_is_surely_wrong_is_put_right_at_the_import(shared, twists, tmp_path):

@@ -201,6 +201,7 @@ class LoopState(Message):
     """The state of the closed loop: setpoints, the command that was sent, and every reason for holding."""
 
     phase: str = column("", "idle, running, paused, held, done or stopped")
+    run: int = column("", "number of the experiment since the daemon began, from 1; 0 before the first")
     experiment: str = column("", "name of the experiment; empty when there is none")
     step: int = column("", "number of the step, from 1")
     steps: int = column("", "number of steps")
@@ -225,6 +226,8 @@ class LoopState(Message):
     speed_command_rad_per_s: float = column("rad/s", "the commanded wrist speed, before clipping")
     speed_sent_rad_per_s: float = column("rad/s", "the wrist speed that was sent, after clipping")
     response: str = column("", "the safety response")
+    cause: str = column("", "the first of the reasons, which may have caused the others; empty without one")
+    faults: str = column("", "their codes, separated by commas, the cause's first; see faults.md")
     reasons: str = column("", "every reason for holding or stopping, in sentences")
 
 

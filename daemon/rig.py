@@ -18,7 +18,12 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorder import AttachedFile, Recorder
 from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
-from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
+from shearloop.daemon.sensing.fingertip_task import (
+    CombinedFingertips,
+    FingertipPipeline,
+    FingertipStates,
+    FingertipTask,
+)
 from shearloop.daemon.sensing.frame_estimator import (
     COMBINED,
     FrameEstimator,
@@ -172,10 +177,12 @@ def build_sensors(
         pairs = CombinedFingertips(pipeline(COMBINED, combined), period_s)
     tasks: dict[str, Task] = {}
     tareable: dict[str, Tareable] = {}
+    states = FingertipStates(clock, pairs)
     for name, estimator in estimators.items():
         own, tareable[name] = config.fingertips[name], (estimates := pipeline(name, estimator))
         board = EitKit(link(name, own.device), estimator.table.zero_slots, own.frame_period_s, inputs(name))
-        tasks[name] = FingertipTask(board, estimates, publisher, pairs, own.heatmap == "always")
+        states.add(board, estimates)
+        tasks[name] = FingertipTask(board, estimates, publisher, pairs, own.heatmap == "always", states)
     if pairs is not None:
         tareable[COMBINED] = pairs.pipeline
     if config.skin is not None:
@@ -185,7 +192,9 @@ def build_sensors(
     if (cell := config.load_cell) is not None:
         calibration = load_cell_calibration(cell)
         lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL))
-        tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
+        tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(
+            lever, publisher, clock, loop, cell.rate_hz, inputs(LOAD_CELL)
+        )
     return Sensors(tasks, tareable, pairs)
 
 

@@ -355,6 +355,11 @@ class EitKit(SerialSensor[Frame]):
         super().__init__(link, frame_period_s, self._parser.handle, inputs)
 
     @property
+    def parser(self) -> FrameParser:
+        """What turns its bytes into frames."""
+        return self._parser
+
+    @property
     def period_s(self) -> float:
         """The board's measured period, or the configured one until then."""
         return self._parser.clock.period_ns / 1e9

@@ -32,6 +32,7 @@ class InputKind(Enum):
     TARE = "tare"  # a new zero was asked for, or found
     TOOL = "tool"  # the gripped tool changed
     ADAPT = "adapt"  # the gain was corrected by the torques in `data`
+    STATE = "state"  # the state of parser and estimator, in a recording that begins in the middle of a run
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,10 @@ Parse: TypeAlias = Callable[[RawEvent], Sequence[ValueT]]
 
 class InputRecorder(Protocol):
     """Keeps the inputs of one source, so that a replay can repeat them."""
+
+    @property
+    def wants_state(self) -> bool:
+        """Whether what it keeps begins in the middle of a run, and has no state yet."""
 
     def record(self, event: RawEvent) -> None:
         """Keep the next input; never blocks."""
@@ -206,12 +211,15 @@ class SerialSensor(Generic[ValueT]):
         self._parse = parse
         self._inputs = inputs
         self._silence_s = BOOT_S
+        # Values of the last read that `readings` has not yielded yet: the parser is ahead of its reader by these.
+        self.unread = 0
 
     async def readings(self) -> AsyncGenerator[ValueT]:
         """Yield the values of every line, in order and without end, as `batches` does."""
         async with contextlib.aclosing(self.batches()) as batches:
             async for values in batches:
-                for value in values:
+                for number, value in enumerate(values, 1):
+                    self.unread = len(values) - number
                     yield value
 
     async def batches(self) -> AsyncGenerator[Sequence[ValueT]]:

@@ -17,6 +17,7 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
+from shearloop.daemon.sensing.snapshots import record_state, restored
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import (
@@ -86,6 +87,7 @@ class SkinTask:
             config.daq.averaged,
         )
         self.source = SkinCurrentTask(self._skin)
+        self._calibration = calibration
         self._estimator = _estimator(config, calibration)
         self._publisher = publisher
         self._clock = clock
@@ -105,6 +107,9 @@ class SkinTask:
                 self._publish(sample, reading)
                 self._sampled.set()
                 self._sampled.clear()
+                if self._inputs is not None and self._inputs.wants_state and self._skin.is_between_readings:
+                    state = {**self._skin.state, "estimator": self._estimator}
+                    record_state(self._inputs, state, {"calibration": self._calibration}, self._clock.now_ns())
 
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""
@@ -157,6 +162,7 @@ class ReplayedSkin:
     def __init__(self, config: SkinConfig) -> None:
         """Raises BankError for an unusable calibration."""
         calibration = load_calibration(config.calibration)
+        self._calibration = calibration
         self._estimator = _estimator(config, calibration)
         current_a = config.source.current_ma * 1e-3
         daq_period_s = 1.0 / config.daq.rate_hz
@@ -169,6 +175,13 @@ class ReplayedSkin:
             ReplayedInstrument({SCAN: read_scan}) if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
         )
         self._latest: SourceReading | None = None
+
+    def restore(self, text: bytes) -> None:
+        """Continue from a recorded state; raises SnapshotError for one that does not fit."""
+        state = restored(text, {"calibration": self._calibration})
+        self._validator, self._averager = state["validator"], state["averager"]
+        self._latest, self._estimator = state["latest"], state["estimator"]
+        self._daq = state.get("parser", self._daq)
 
     def handle(self, source: str, event: RawEvent) -> list[SkinShear]:
         """Return the messages that a source's event leads to, without processing time."""

@@ -101,6 +101,8 @@ class PolledInstrument(ABC, Generic[ReadingT]):
     inputs: InputRecorder | None = None
     # Its name in messages.
     instrument: ClassVar[str] = ""
+    # A reply is one reading: no reading waits behind another.
+    unread: ClassVar[int] = 0
     _lines: LineSplitter = field(default_factory=partial(LineSplitter, MAX_REPLY_BYTES), init=False)
     _count: int = field(default=0, init=False)
     _errors: Counter[str] = field(default_factory=Counter, init=False)
@@ -417,6 +419,11 @@ class AdcBoard(SerialSensor[Voltages]):
         self.period_s = 1.0 / rate_hz
         self._parser = PairParser(rate_hz, full_scale_v)
         super().__init__(link, self.period_s, self._parser.handle, inputs)
+
+    @property
+    def parser(self) -> PairParser:
+        """What turns its bytes into voltages."""
+        return self._parser
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""

@@ -7,7 +7,11 @@ export OPENBLAS_NUM_THREADS := 1
 # Without bytecode files every test process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install install-dev system-packages demo demo-python docs docs-site test test-fast lint format clean
+# `make CONSTRAINTS=constraints.txt …` installs the versions that the checks run with; without it, the newest allowed.
+CONSTRAINTS ?=
+PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS))
+
+.PHONY: lock coverage install install-dev system-packages demo demo-python docs docs-site test test-fast lint format clean
 
 # Before anything is installed.
 demo-python:
@@ -20,15 +24,15 @@ install-dev: $(VENV)/.installed-dev
 $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.version_info >= (3, 11) or sys.exit(f"Python {v} is too old: shearloop needs 3.11 or later, e.g. `make demo PYTHON=python3.12`.")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[plot,view]'
+	$(PIP_INSTALL) --editable '.[plot,view]'
 	touch $@
 
 $(VENV)/.installed-exports: pyproject.toml $(VENV)/.installed
-	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[export,rerun]'
+	$(PIP_INSTALL) --editable '.[export,rerun]'
 	touch $@
 
 $(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
-	$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]'
+	$(PIP_INSTALL) --editable '.[dev]'
 	touch $@
 
 # Debian packages for the tests of the service and of the live page, which are skipped without them.
@@ -52,15 +56,23 @@ test: install-dev
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \
-	$(addprefix tests/bank/estimation/test_,archive.py regressors.py values.py) \
+	$(addprefix tests/estimation/test_,archive.py regressors.py values.py) \
 	$(wildcard tests/drivers/test_*.py) tests/drivers/shear_skin \
 	$(addprefix tests/drivers/ur/test_,limits.py messages.py settings.py) tests/daemon/messaging \
-	$(addprefix tests/daemon/recording/test_,replay.py schemas.py tools.py) \
-	tests/daemon/cli/test_start.py \
-	$(addprefix tests/daemon/test_cli.py::test_,bash_completes_commands_and_options every_shell_has_its_script) \
-	$(addprefix tests/daemon/test_,config_file.py docgen.py process.py settings.py)
+	$(addprefix tests/tools/recordings/test_,replay.py tools.py) tests/daemon/recorder/test_schemas.py tests/cli/test_docgen.py \
+	tests/cli/test_start.py \
+	$(addprefix tests/cli/test_cli.py::test_,bash_completes_commands_and_options every_shell_has_its_script) \
+	$(addprefix tests/daemon/test_,config_file.py process.py settings.py)
 test-fast: install-dev
 	$(PYTEST) -n 3 --dist loadfile -m 'not real_time' $(PYTEST_ARGS) $(FAST)
+
+# Lines and branches that the tests run in their own process; what runs in processes of its own is not seen.
+coverage: install-dev
+	$(PYTEST) -n 2 --dist loadfile -m 'not real_time' --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(PYTEST_ARGS)
+
+lock: install-dev
+	{ echo '# The versions that the checks run with. `make lock` writes this file from the environment.'; \
+	  $(BIN)/python -m pip freeze --exclude-editable; } >constraints.txt
 
 lint: install-dev
 	$(BIN)/ruff check .
@@ -74,7 +86,7 @@ format: install-dev
 
 # The generated pages.
 docs: $(VENV)/.installed
-	$(BIN)/python -m shearloop.daemon.docgen
+	$(BIN)/python -m shearloop.cli.docgen
 
 # The pages as a site in build/site; every warning is an error. The variable silences an advertisement.
 docs-site: install-dev

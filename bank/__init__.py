@@ -1,4 +1,1 @@
-"""Physics known beforehand: geometry, forward models, banks, matching, calibration.
-
-Pure: arrays in, arrays out. No clock and no I/O but mesh, bank and calibration files.
-"""
+"""The EIT fingertip's physics: channels, mesh, forward models, basis models, bank file, matching. No clock."""

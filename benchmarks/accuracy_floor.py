@@ -17,13 +17,13 @@ import numpy as np
 from benchmarks.common import parser_of, table_head, table_row, write_figures
 from benchmarks.estimator_accuracy import FINGERTIPS, imported_stream
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.defaults import LOADED_NM
-from shearloop.bank.estimation import FrameSeries
-from shearloop.bank.estimation.fingertip_validator import channel_noise, segment_grip
-from shearloop.bank.estimation.load_delay import find_load_delay
-from shearloop.bank.gain import find_twists
-from shearloop.daemon.analysis.frame_series import read_series, series_of
-from shearloop.daemon.recording.reader import read_recording
+from shearloop.estimation import FrameSeries
+from shearloop.estimation.defaults import LOADED_NM
+from shearloop.estimation.fingertip_validator import channel_noise, segment_grip
+from shearloop.estimation.gain import find_twists
+from shearloop.estimation.load_delay import find_load_delay
+from shearloop.tools.frame_series import read_series, series_of
+from shearloop.tools.recordings.reader import read_recording
 
 # Increments, in frames. The least bound over these numbers of directions counts; each direction needs some increments.
 SHORT, LONG = 1, 6

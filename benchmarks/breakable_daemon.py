@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from types import FrameType
 
-from shearloop.daemon.cli import main
+from shearloop.cli import main
 from shearloop.drivers.ur.client import WorkerConnection
 
 BLOCKED_S = 0.5

@@ -25,10 +25,10 @@ import zmq
 
 from benchmarks import common
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.emulators.boards import format_line
+from shearloop.emulators.boards import format_line
+from shearloop.tools.recordings.reader import read_recording
 
 REPEATS = 5
 # Timed frames of a latency, at the board's rate.

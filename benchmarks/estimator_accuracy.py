@@ -17,17 +17,17 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common import parser_of, table_head, table_row, write_figures
-from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.mesh import load_mesh
+from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import FrameSeries, Physics, fit, measure_timing
-from shearloop.bank.estimator_names import DEFAULT, EstimatorName
-from shearloop.daemon.analysis.evaluate import EstimateTrack, Figures, estimate_series, figures_by_load, figures_of
-from shearloop.daemon.analysis.frame_series import part_of, read_series, series_of
-from shearloop.daemon.cli.emulated_calibration import calibrate, record
-from shearloop.daemon.recording.matlab_import import import_mat
-from shearloop.daemon.recording.reader import read_recording
-from shearloop.drivers.emulators.emulated_rig import SIDES
+from shearloop.bank.mesh import load_mesh
+from shearloop.emulators.emulated_rig import SIDES
+from shearloop.estimation import FrameSeries, Physics, fit, measure_timing
+from shearloop.estimation.estimator_names import DEFAULT, EstimatorName
+from shearloop.studies.emulated_calibration import calibrate, record
+from shearloop.tools.evaluate import EstimateTrack, Figures, estimate_series, figures_by_load, figures_of
+from shearloop.tools.frame_series import part_of, read_series, series_of
+from shearloop.tools.recordings.matlab_import import import_mat
+from shearloop.tools.recordings.reader import read_recording
 
 # Columns of the tables: figures of loaded frames, then two of all frames.
 LOADED = {

@@ -22,17 +22,8 @@ import numpy as np
 
 from benchmarks.common import parser_of, table_head, table_row
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.skin.calibration import CalibrationTable, fit_calibration
-from shearloop.bank.skin.characterisation import (
-    PAPER_MEASURED_SENSITIVITY,
-    fit_line,
-    loading,
-    loop,
-    origin_slope,
-    responses,
-)
-from shearloop.bank.skin.finite_strain import FiniteStrainSkin
-from shearloop.bank.skin.membrane import (
+from shearloop.estimation.skin.calibration import CalibrationTable, fit_calibration
+from shearloop.estimation.skin.membrane import (
     GAUGE_FACTOR,
     PAPER_SECTION,
     THICK_SECTION,
@@ -40,7 +31,7 @@ from shearloop.bank.skin.membrane import (
     Section,
     sensitivity_per_n,
 )
-from shearloop.bank.skin.plane_strain import (
+from shearloop.estimation.skin.plane_strain import (
     MESH_112,
     CondensedSkin,
     ContactState,
@@ -53,7 +44,16 @@ from shearloop.bank.skin.plane_strain import (
     states_along,
     unloaded,
 )
-from shearloop.bank.skin.sheet import PLATE_MM, SheetSkin
+from shearloop.studies.skin.characterisation import (
+    PAPER_MEASURED_SENSITIVITY,
+    fit_line,
+    loading,
+    loop,
+    origin_slope,
+    responses,
+)
+from shearloop.studies.skin.finite_strain import FiniteStrainSkin
+from shearloop.studies.skin.sheet import PLATE_MM, SheetSkin
 
 NORMAL_N, AMPLITUDE_N = 1.0, 1.0
 MESHES = {56: MeshSize(3, 4, 6, 2, 2), 112: MESH_112, 448: MESH_112.refined(2)}
@@ -123,7 +123,7 @@ def _error(found: FloatArray, true: FloatArray) -> float:
 
 def draw(found: Sequence[dict[str, Any]], out: Path) -> None:
     """Draw each model's error over its time per step, for an even load and for the plate, and write both."""
-    from shearloop.daemon.analysis.charts import drawing
+    from shearloop.tools import drawing
 
     made = drawing.figure(8.0, 4.6)
     axes = made.subplots()

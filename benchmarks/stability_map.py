@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.common import parser_of, table_head, table_row, write_figures
-from shearloop.daemon.analysis.charts import simulated_loop
 from shearloop.daemon.control.margins import LoopModel, gain_limit, integral_gain
 from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController
 from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.studies.charts import simulated_loop
 
 COMMAND_S = 0.016
 ACTUATION_S = 0.02

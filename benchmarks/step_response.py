@@ -18,19 +18,19 @@ import numpy as np
 
 from benchmarks.common import parser_of, write_figures
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame
-from shearloop.daemon.analysis.charts import simulated_loop as sim
-from shearloop.daemon.analysis.creep import Stretch, fit_creep
-from shearloop.daemon.cli.emulated_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.daemon.control.loop_inputs import Creep
 from shearloop.daemon.control.torque_controller import TorqueController
 from shearloop.daemon.run_summary import BAND
-from shearloop.daemon.synthetic_frames import RigFrames
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.emulators.emulated_rig import SIDES
-from shearloop.drivers.emulators.gripper import Gripper
-from shearloop.drivers.emulators.scene import Joint, Scene, Twin, TwinSettings
+from shearloop.emulators.emulated_rig import SIDES
+from shearloop.emulators.gripper import Gripper
+from shearloop.emulators.scene import Joint, Scene, Twin, TwinSettings
+from shearloop.emulators.synthetic_frames import RigFrames
+from shearloop.estimation import Calibration, EstimatorSession, TactileFrame
+from shearloop.studies.charts import simulated_loop as sim
+from shearloop.studies.emulated_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
+from shearloop.tools.creep import Stretch, fit_creep
 
 TARGET_NM = 0.10
 # The stiffness of possible gels; the emulated rig's is 0.8.

@@ -39,7 +39,7 @@ from benchmarks.common import (
     table_row,
     write_rig_config,
 )
-from shearloop.bank.eit.bank_file import BankDefinition, write_bank
+from shearloop.bank.bank_file import BankDefinition, write_bank
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, TOPICS, decode
 from shearloop.drivers.defaults import FRAME_PERIOD_S, LOAD_CELL_RATE_HZ
@@ -251,7 +251,7 @@ def measure(causes: Sequence[Cause], repeats: int, busy: int) -> dict[str, list[
 
 def draw(causes: Sequence[Cause], found: Mapping[str, Sequence[float]], busy: int, out: Path) -> None:
     """Draw the times of each cause beside its promise, and write them."""
-    from shearloop.daemon.analysis.charts import drawing
+    from shearloop.tools import drawing
 
     made = drawing.figure(8.0, 0.8 + 0.32 * len(causes))
     axes = made.subplots()

@@ -1,1 +1,1 @@
-"""The process: configuration, tasks, estimator, controller, safety, publisher, command line."""
+"""What runs on the robot's PC all day: configuration, tasks, control loop, safety, messages, recorder, live page."""

@@ -20,7 +20,7 @@ from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
-from shearloop.daemon.recording.recorder import Recorder, daemon_identity
+from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, build_rig
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED
@@ -72,12 +72,16 @@ class Daemon:
                 self.recorder = Recorder(config.recording.folder, daemon_identity(config), clock)
                 self.publisher.add_listener(self.recorder.record_message)
                 opened.callback(self.recorder.close)
-            self.health = HealthReporter(self.publisher, self.supervisor, clock)
+            self.health = HealthReporter(self.publisher, self.supervisor, clock, emulated=config.emulated)
             self.sensors, self._rig = build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
+            if self._rig is not None:
+                self.health.tare_refusal = self._rig.control_loop.tare_refusal
             self._experiment: ConfiguredExperiment | None = None
             if config.experiment is not None and self._rig is not None:
                 daemon_end = self._end if config.stop_when_done else None
-                self._experiment = ConfiguredExperiment(config.experiment, self._rig, daemon_end)
+                self._experiment = ConfiguredExperiment(
+                    config.experiment, self._rig, autostart=config.autostart, daemon_end=daemon_end
+                )
             self.commands = Commands(self._rig, self.sensors, self._experiment, self.health, self._end)
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)
@@ -104,8 +108,6 @@ class Daemon:
         """Run until `stop`, then end every task and close the sockets; `on_ready` is called once the tasks run."""
         try:
             await self._run_tasks(on_ready)
-            if self._experiment is not None:
-                self._experiment.close()
             self.health.publish_end(finished=self.finished, summary=self._summary.text)
         finally:
             try:

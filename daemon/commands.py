@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
+from shearloop.daemon.control.experiment_schema import first_motion
 from shearloop.daemon.control.loop_runner import loop_state
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.experiment_files import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig, Sensors
 from shearloop.daemon.supervisor import HealthReporter
+from shearloop.errors import UserError
 
 STOP_DELAY_S = 0.05
 # What `status` shows of `loop.state`.
@@ -33,7 +35,8 @@ class Commands:
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
         named = {"tare": self._tare, STATUS: self._status, STOP: self._stop, "start": self._start}
-        return {**named, "pause": self._pause, "resume": self._resume, "unlock": self._unlock}
+        named |= {"pause": self._pause, "resume": self._resume, "unlock": self._unlock}
+        return {**named, "release": self._release}
 
     def keyless_handlers(self) -> Mapping[str, Handler]:
         """Return the handlers for users of this machine without a key: only `stop` and `status` work."""
@@ -48,8 +51,15 @@ class Commands:
         path = request.get("experiment") or (self.experiment.path if self.experiment is not None else None)
         if not isinstance(path, str | Path):
             raise CommandRefusedError("no experiment is given: name its file, or one in the configuration")
+        rig = required_rig(self.rig)
         try:
-            _refuse_if(await required_rig(self.rig).start(Path(path)))
+            if request.get("ask"):
+                _refuse_if(rig.runner.start_refusal())
+                file = (await rig.experiments.read(Path(path))).file
+                return {"question": f"Start {file.name!r}? {first_motion(file)[0].upper()}{first_motion(file)[1:]}."}
+            _refuse_if(await rig.start(Path(path)))
+        except InvalidExperimentError as error:
+            raise CommandRefusedError(str(error), invalid=True) from error
         except UserError as error:
             raise CommandRefusedError(str(error)) from error
         if self.experiment is not None:
@@ -68,18 +78,25 @@ class Commands:
         _refuse_if(await required_rig(self.rig).runner.unlock())
         return {}
 
+    async def _release(self, request: Request) -> Reply:
+        rig = required_rig(self.rig)
+        _refuse_if(rig.runner.release_refusal())
+        question = rig.control_loop.release_question()
+        if request.get("ask"):
+            return {"question": f"Release? {question[0].upper()}{question[1:]}."}
+        if not request.get("confirmed"):
+            raise CommandRefusedError(f"{question}; confirm it with `shearloop command release --yes`")
+        _refuse_if(await rig.runner.release())
+        return {}
+
     async def _tare(self, request: Request) -> Reply:
         sensors = self.sensors.tareable
         source = request.get("source")
         if source is not None and not (isinstance(source, str) and source in sensors):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(sensors)}")
         names = list(sensors) if source is None else [source]
-        experiment = self.rig.control_loop.running if self.rig is not None else None
-        if experiment is not None:
-            raise CommandRefusedError(
-                f"the experiment {experiment.file.name!r} is running, and a new zero would change its "
-                "torques; stop it first, or give it a step `tare`"
-            )
+        if self.rig is not None:
+            _refuse_if(self.rig.control_loop.tare_refusal(confirmed=bool(request.get("confirmed"))))
         for name in names:
             sensors[name].tare()
         return {"tared": names}
@@ -92,11 +109,12 @@ class Commands:
         return {"tasks": tasks, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
 
     async def _stop(self, request: Request) -> Reply:
-        stopped = self.rig.runner.stop() if self.rig is not None else None
+        spare_daemon = bool(request.get("spare_daemon"))
+        stopped = self.rig.runner.stop(also_idle=spare_daemon) if self.rig is not None else None
         waiting = self.experiment.call_off() if self.experiment is not None else None
         if stopped is not None:
             return {"stopped": stopped}
-        if request.get("spare_daemon"):
+        if spare_daemon:
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
         # Nothing moves, so the daemon itself stops, once the reply is sent.

@@ -1,13 +1,13 @@
 """The daemon's configuration. Units are in the keys; unknown keys are refused; loaded values do not change."""
 
 import os
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, WithJsonSchema, field_validator, model_validator
 
-from shearloop.bank.defaults import BASELINE_FRAMES
-from shearloop.bank.estimator_names import EstimatorName
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.messaging import addresses
@@ -25,6 +25,11 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
     URCAP_PORT,
 )
+from shearloop.drivers.hosts import why_no_host
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, ModelName
+from shearloop.estimation.defaults import BASELINE_FRAMES
+from shearloop.estimation.estimator_names import EstimatorName
+from shearloop.yaml_files import shown
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {
@@ -40,13 +45,38 @@ def _known_transport(address: str) -> str:
         raise ValueError(
             f"must end in a port, a whole number up to {addresses.LARGEST_PORT}, as in tcp://127.0.0.1:7761"
         )
+    if addresses.names_localhost(address):
+        raise ValueError("names localhost, and a socket is bound to an address: write 127.0.0.1 instead of localhost")
+    if (size := addresses.ipc_size(address)) > addresses.LONGEST_IPC:
+        raise ValueError(
+            f"has a path of {size} bytes, and a socket's has at most {addresses.LONGEST_IPC}: choose a shorter one"
+        )
     return address
+
+
+_NAME = r"^[a-z][a-z0-9_-]{0,31}$"
+
+
+def _valid_host(host: str) -> str:
+    if reason := why_no_host(host):
+        raise ValueError(f"{shown(host)} {reason}; give the device's name or address")
+    return host
+
+
+def _valid_name(name: str) -> str:
+    if not re.fullmatch(_NAME, name):
+        near = re.sub(r"[^a-z0-9_-]", "_", name.lower())
+        hint = f"; did you mean {near}?" if re.fullmatch(_NAME, near) else ""
+        form = "a lower-case letter, then up to 31 lower-case letters, digits, - and _"
+        raise ValueError(f"{shown(name)} is no name of a fingertip: a name is {form}{hint}")
+    return name
 
 
 Address = Annotated[str, AfterValidator(_known_transport)]
 # A multimeter's channels are numbered with the slot first, such as 1601.
 Channel = Annotated[int, Field(ge=1, le=9999)]
-FingertipName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")]
+FingertipName = Annotated[str, AfterValidator(_valid_name), WithJsonSchema({"type": "string", "pattern": _NAME})]
+Host = Annotated[str, AfterValidator(_valid_host)]
 
 
 class CurveConfig(ConfigModel):
@@ -106,7 +136,7 @@ class LoadCellConfig(ConfigModel):
 class InstrumentSocket(ConfigModel):
     """An instrument on the network, or a serial one behind a terminal server."""
 
-    host: str = Field(min_length=1, description="name or address")
+    host: Host = Field(description="name or address")
     port: int = Field(ge=1, le=65535, description="TCP port, as set on the instrument or server")
 
 
@@ -179,16 +209,17 @@ class SkinConfig(ConfigModel):
 class GripperSocket(ConfigModel):
     """The gripper behind the URCap's socket."""
 
-    host: str = Field(min_length=1, description="the robot's name or address")
+    host: Host = Field(description="the robot's name or address")
     port: int = Field(URCAP_PORT, ge=1, le=65535, description="TCP port of the URCap")
 
 
 class GripperConfig(ConfigModel):
     """The gripper, on a socket or on Modbus."""
 
+    model: ModelName = Field(DEFAULT_MODEL, description="sets stroke, speeds, forces and counts")
     socket: GripperSocket | None = Field(None, description="through the robot's URCap; else `modbus`")
     modbus: SerialDevice | None = Field(None, description="Modbus RTU by USB; else `socket`")
-    calibration: Path | None = Field(None, description="default: the maker's data")
+    calibration: Path | None = Field(None, description="of `shearloop calibrate gripper`; default: the maker's data")
 
     _one_way_in = either("socket", "modbus")
 
@@ -235,16 +266,34 @@ class DaemonConfig(ConfigModel):
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
     gripper: GripperConfig | None = Field(None, description="the gripper; needs `robot`")
     loop: LoopConfig = Field(LoopConfig(), description="settings of the closed loop")
-    experiment: Path | None = Field(None, description="started once all devices are connected")
+    emulated: bool = Field(False, description="every device is emulated on this computer; a real address is refused")
+    experiment: Path | None = Field(None, description="what `shearloop command start` runs if it names no other")
+    autostart: bool = Field(False, description="start `experiment` once all devices are connected; needs `emulated`")
+    experiments: tuple[Path, ...] = Field(
+        (), validate_default=True, description="folders of the experiments that `start` may name; default: this file's"
+    )
     stop_when_done: bool = Field(False, description="the daemon ends with that experiment: status 0 if done, else 3")
     recording: RecordingConfig | None = Field(None, description="default: no recording")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
     emulators: tuple[EmulatorConfig, ...] = Field((), description="devices to emulate, for demonstrations")
 
+    @field_validator("experiments")
+    @classmethod
+    def _own_folder(cls, folders: tuple[Path, ...], info: ValidationInfo) -> tuple[Path, ...]:
+        if not info.context:
+            return folders
+        own: Path = info.context["folder"]
+        return tuple(Path(os.path.normpath(own / folder)) for folder in folders) or (own,)
+
+    @property
+    def experiment_folders(self) -> tuple[Path, ...]:
+        """The folders of the experiments that a request may name: the configured ones, and that of `experiment`."""
+        return (*self.experiments, *((self.experiment.parent,) if self.experiment is not None else ()))
+
     @model_validator(mode="after")
     def _loop_is_whole(self) -> "DaemonConfig":
-        if not self.fingertips and self.skin is None:
-            raise ValueError("nothing is measured: give `fingertips`, a `skin`, or both")
+        if not self.fingertips and self.skin is None and self.load_cell is None:
+            raise ValueError("nothing is measured: give `fingertips`, a `skin` or a `load_cell`")
         if taken := sorted(TAKEN_NAMES & self.fingertips.keys()):
             text = f"a fingertip cannot be named {taken[0]!r}, as another part of the daemon is"
             raise ValueError(f"{text}: try right or left")
@@ -260,9 +309,30 @@ class DaemonConfig(ConfigModel):
                 raise ValueError(f"`{keys[0]}` and `{keys[1]}` are both {port}; each device needs its own")
         if self.experiment is not None and self.robot is None:
             raise ValueError("an experiment needs a robot: add `robot: ur.yaml`, or take `experiment` out")
+        if self.autostart and not self.emulated:
+            raise ValueError(
+                "`autostart` moves a robot that nobody has just asked to move: it needs `emulated: true`; "
+                "on a real rig take it out, and send `shearloop command start`"
+            )
+        if self.autostart and self.experiment is None:
+            raise ValueError("`autostart` starts no experiment: name one in `experiment`, or take `autostart` out")
+        if self.emulated:
+            for key, device in self._real_devices():
+                raise ValueError(f"`emulated: true` and `{key}: {device}`, a real device: take one of the two out")
         if self.gripper is not None and self.robot is None:
             raise ValueError("a gripper without a robot cannot be driven: add `robot: ur.yaml`, or take `gripper` out")
         return self
+
+    def _real_devices(self) -> Iterator[tuple[str, str]]:
+        """Yield the key and the name of each device that no emulator plays."""
+        for key, section in self.walk():
+            match section:
+                case SerialDevice(serial_number=str(number)):
+                    yield f"{key}.serial_number", number
+                case SerialDevice(path=Path() as path) if _is_hardware(path.resolve()):
+                    yield f"{key}.path", str(path)
+                case InstrumentSocket(host=host) | GripperSocket(host=host) if not addresses.is_loopback_host(host):
+                    yield f"{key}.host", host
 
     def _ports(self) -> dict[str, list[str]]:
         """Return the configuration keys of each serial port and socket."""
@@ -282,6 +352,11 @@ class DaemonConfig(ConfigModel):
         """The configuration keys and addresses that are open to the network."""
         both = {"publish": self.publish, "commands": self.commands}
         return {key: address for key, address in both.items() if not addresses.is_local(address)}
+
+
+def _is_hardware(port: Path) -> bool:
+    """Return whether a port is in /dev, but no pseudo-terminal; one that is not there yet is none."""
+    return port.is_relative_to("/dev") and not port.is_relative_to("/dev/pts")
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:

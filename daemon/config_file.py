@@ -7,7 +7,7 @@ from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.yaml_files import load_model
 
 # No length of a tool, a grip or a lever is smaller.

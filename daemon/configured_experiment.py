@@ -1,7 +1,6 @@
-"""Starts the configured experiment as soon as it can begin, unless the operator starts or stops one first."""
+"""The configuration's experiment: started by the operator, or by itself on an emulated rig, and followed to its end."""
 
 import asyncio
-import os
 from pathlib import Path
 
 import structlog
@@ -14,18 +13,19 @@ START_RETRY_S = 0.5
 
 
 class ConfiguredExperiment:
-    """Starts one experiment automatically and waits for its end."""
+    """Waits for the start and the end of one experiment; starts it only where `autostart` says so."""
 
-    def __init__(self, path: Path, rig: Rig, daemon_end: asyncio.Event | None = None) -> None:
+    def __init__(
+        self, path: Path, rig: Rig, *, autostart: bool = False, daemon_end: asyncio.Event | None = None
+    ) -> None:
         """Take the experiment's file; its end sets `daemon_end`."""
         self.path = path
         self.done = False
         self._rig = rig
         self._daemon_end = daemon_end
         self.has_begun = asyncio.Event()
-        self._crash_marker = CrashMarker()
-        # Until any experiment has begun, or this one is called off. After a crash only the operator starts it.
-        self._awaited = not self._crash_marker.left_behind
+        # Until any experiment has begun, or this one is called off.
+        self._awaited = autostart
 
     @property
     def finished(self) -> bool:
@@ -33,23 +33,14 @@ class ConfiguredExperiment:
         return self.done or self._daemon_end is None
 
     async def run(self) -> None:
-        """Start the experiment once, and return at its end.
-
-        If only the operator may start it, return at once, or at its end where the daemon ends with it.
-        """
+        """Start the experiment once, if it starts by itself, and return at its end, however it began."""
         await self._start_once()
-        if self.has_begun.is_set() or self._daemon_end is not None:
-            await self.wait_for_end()
+        await self.wait_for_end()
         if self._daemon_end is not None:
             self._daemon_end.set()
 
     async def _start_once(self) -> None:
         log, logged = structlog.get_logger().bind(experiment=str(self.path)), ""
-        if self._crash_marker.left_behind and not self.has_begun.is_set():
-            log.warning(
-                "the previous daemon crashed after it had started an experiment: this one waits for "
-                "`shearloop command start`"
-            )
         while self._awaited:
             reason = await self._rig.start(self.path)
             if reason is None:
@@ -72,7 +63,6 @@ class ConfiguredExperiment:
 
     def on_begun(self, path: Path) -> None:
         """Note that an experiment has begun; no other starts automatically afterwards."""
-        self._crash_marker.set()
         self._awaited = False
         if path.resolve() == self.path.resolve():
             self.has_begun.set()
@@ -81,39 +71,3 @@ class ConfiguredExperiment:
         """Cancel the automatic start; return the experiment, or None if it was not awaited."""
         awaited, self._awaited = self._awaited, False
         return self.path if awaited else None
-
-    def close(self) -> None:
-        """Note the daemon's normal end."""
-        self._crash_marker.clear()
-
-
-class CrashMarker:
-    """A file in systemd's runtime folder that exists while an experiment may have moved something.
-
-    systemd restarts a crashed daemon, and the operator's last command is lost with the crash: the marker keeps the new
-    daemon from starting its experiment. Without a runtime folder, as at a terminal, there is no marker.
-    """
-
-    def __init__(self) -> None:
-        # systemd separates several folders with colons; ours is one.
-        folder = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
-        self._path = Path(folder) / "begun" if folder else None
-        self.left_behind = self._path is not None and self._path.exists()
-
-    def set(self) -> None:
-        """Note that an experiment has begun."""
-        if self._path is None:
-            return
-        try:
-            self._path.touch()
-        except OSError as error:
-            structlog.get_logger().warning(
-                "cannot write the crash marker: a daemon restarted after a crash would start its experiment again",
-                path=str(self._path),
-                reason=error.strerror,
-            )
-
-    def clear(self) -> None:
-        """Note the daemon's normal end."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)

@@ -1,7 +1,6 @@
 """Structured logs, and the writer that keeps the event loop from waiting for a terminal."""
 
 import contextlib
-import io
 import logging
 import os
 import queue
@@ -11,11 +10,12 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TextIO, cast
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 import structlog
 
 from shearloop.drivers.connection import LinkEvent
+from shearloop.printable import own_stream, printable
 
 if TYPE_CHECKING:
     from shearloop.daemon.control.control_loop import ControlLoop
@@ -35,10 +35,8 @@ class NonBlockingWriter:
     """
 
     def __init__(self, stream: TextIO, most_waiting: int = MOST_WAITING) -> None:
-        if isinstance(stream, io.TextIOWrapper):
-            # A terminal with another encoding may lack characters such as "…".
-            stream.reconfigure(errors="backslashreplace")
-        self._stream = stream
+        # A terminal with another encoding may lack characters such as "…".
+        self._stream = own_stream(stream)
         self._waiting: queue.Queue[str | None] = queue.Queue(most_waiting)
         self._dropped = False
         # A daemon thread: a blocked write must not keep the process alive.
@@ -105,7 +103,11 @@ def logging_to_stderr(
         processors += [structlog.processors.format_exc_info, structlog.processors.JSONRenderer(ensure_ascii=False)]
     else:
         plain = structlog.dev.plain_traceback
-        processors.append(structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=plain))
+        processors += [
+            structlog.processors.format_exc_info,
+            _without_controls,
+            structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=plain),
+        ]
     if before:
         processors.append(lambda _logger, _name, text: f"{before}{text}")
     with closing(NonBlockingWriter(sys.stderr)) as writer:
@@ -121,6 +123,10 @@ def logging_to_stderr(
             structlog.configure(logger_factory=structlog.WriteLoggerFactory(sys.stderr))
 
 
+def _without_controls(_logger: Any, _name: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+    return {key: printable(value) if isinstance(value, str) else value for key, value in event.items()}
+
+
 @dataclass(frozen=True, slots=True)
 class LinkReporter:
     """Logs the losses and returns of one device, and hands them to the control loop, where there is one."""
@@ -134,3 +140,7 @@ class LinkReporter:
         (log.info if event.up else log.debug if event.repeated else log.warning)(event.sentence)
         if self.loop is not None:
             self.loop.on_link(self.device, event.sentence, up=event.up)
+
+    def on_refusal(self, sentence: str) -> None:
+        """Log refused data as a warning."""
+        structlog.get_logger().bind(device=self.device).warning(sentence)

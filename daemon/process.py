@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import NoReturn
 
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 
 # Compiled code has usually returned after this time.
 RETRY_S = 0.05

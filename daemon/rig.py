@@ -7,17 +7,17 @@ from pathlib import Path
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
-from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.control import experiment_schema
+from shearloop.daemon.control import experiment_check, experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, Tareable, wrench_source
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.experiment_files import ExperimentFiles, read_document, without_mistakes
 from shearloop.daemon.logs import LinkReporter
+from shearloop.daemon.messaging.addresses import is_loopback_host
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.recording.recorder import AttachedFile, Recorder
-from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
+from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.sensing.fingertip_task import (
     CombinedFingertips,
     FingertipPipeline,
@@ -40,11 +40,12 @@ from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.models import MODELS, GripperModel
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
-from shearloop.yaml_files import located, read_yaml
+from shearloop.errors import UserError
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -70,8 +71,14 @@ def make_gripper_client(config: GripperConfig) -> RobotiqClient:
 def gripper_calibration(config: GripperConfig) -> WidthCalibration:
     """Return the gripper's calibration, or the maker's data; raises DriverError if it cannot be used."""
     if config.calibration is None:
-        return WidthCalibration.nominal()
-    return load_device_calibration(config.calibration, WidthCalibration)
+        return WidthCalibration.nominal(config.model)
+    calibration = load_device_calibration(config.calibration, WidthCalibration)
+    if calibration.model != config.model:
+        raise DriverError(
+            f"{config.calibration}: it was measured with a {calibration.model}, and `gripper.model` is {config.model}; "
+            "correct the model, or measure again with `shearloop calibrate gripper --model`"
+        )
+    return calibration
 
 
 def robot_settings(path: Path) -> UrSettings:
@@ -79,6 +86,22 @@ def robot_settings(path: Path) -> UrSettings:
     settings = read_settings(path)
     if reason := missing_library():
         raise DriverError(f"{path}: {reason}")
+    return settings
+
+
+def open_settings(config: DaemonConfig) -> UrSettings | None:
+    """Return the settings of the configured robot, None without one; raises DriverError as `robot_settings` does.
+
+    Raises UserError for a robot elsewhere in a rig that is said to be emulated.
+    """
+    if config.robot is None:
+        return None
+    settings = robot_settings(config.robot)
+    if config.emulated and not is_loopback_host(settings.host):
+        raise UserError(
+            f"{config.robot}: `host: {settings.host}` is not this computer, and the configuration says "
+            "`emulated: true`: take that out for a real robot, or give 127.0.0.1 for an emulated one"
+        )
     return settings
 
 
@@ -123,15 +146,20 @@ class Rig:
     control_loop: ControlLoop
     runner: ControlLoopRunner
     tasks: Mapping[str, Task]
+    experiments: ExperimentFiles
     recorder: Recorder | None
 
     async def start(self, path: Path) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
-        attached = AttachedFile.read(path) if self.recorder is not None else ()
-        file = read_experiment(path)
-        reason = await self.runner.start(file)
+        # While something moves, no file is read.
+        if (reason := self.runner.start_refusal()) is not None:
+            return reason
+        stops_before = self.runner.stop_count
+        experiment = await self.experiments.read(path)
+        reason = await self.runner.start(experiment.file, stops_before)
         if reason is None and self.recorder is not None:
-            self.recorder.record_experiment(file.name, attached, file.tool_mm)
+            attached = (AttachedFile.of(path, experiment.data),)
+            self.recorder.record_experiment(experiment.file.name, attached, experiment.file.tool_mm)
         return reason
 
 
@@ -205,37 +233,48 @@ def build_rig(
     estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     sources = torque_sources(config, estimators, combined)
-    check_experiment(config, sources)
-    if config.robot is None:
+    settings = open_settings(config)
+    check_experiment(config, sources, settings)
+    if settings is None:
         return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
-    settings = robot_settings(config.robot)
     loop = make_loop(config, settings, sources, supervisor.dead)
     gripper = make_gripper(config.gripper, loop, publisher) if config.gripper is not None else None
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)))
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
+    experiments = ExperimentFiles(config.experiment_folders, settings.limits, gripper_model(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
-    return sensors, Rig(loop, runner, {**fingers, "robot": robot, "loop": runner}, recorder)
+    return sensors, Rig(loop, runner, {**fingers, "robot": robot, "loop": runner}, experiments, recorder)
 
 
-def read_experiment(path: Path) -> experiment_schema.ExperimentFile:
-    """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
-    return _without_mistakes(path, experiment_schema.check_steps(_outline(path)))
+def gripper_model(config: DaemonConfig) -> GripperModel | None:
+    """Return the model of the configured gripper, if there is one."""
+    return MODELS[config.gripper.model] if config.gripper is not None else None
 
 
 def check_experiment(
-    config: DaemonConfig, sources: Mapping[str, TorqueSource]
+    config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
 ) -> experiment_schema.ExperimentFile | None:
     """Return the configured experiment, if any; raises UserError if the configured devices cannot run it.
 
-    `sources` are all torques but the robot's.
+    `sources` are all torques but the robot's; `robot` has its limits, where they are known.
     """
     path = config.experiment
     if path is None:
         return None
+    document = read_document(path)
+    return without_mistakes(document, experiment_mistakes(document.content, config, sources, robot))
+
+
+def experiment_mistakes(
+    content: object, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
+) -> list[experiment_schema.Mistake]:
+    """Return each step and key of an experiment's content that its own limits or the devices do not allow."""
     driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
-    file = _outline(path)
-    mistakes = experiment_schema.check_steps(file)
+    file = experiment_schema.outline(content)
+    limits = robot.limits if robot is not None else None
+    mistakes = experiment_check.check_steps(file)
+    mistakes += experiment_check.check_devices(file, limits, gripper_model(config))
     if file.torque_source and file.steps:
         mistakes += _undriven(file.torque_source, driving, config)
     if config.gripper is None:
@@ -245,24 +284,7 @@ def check_experiment(
             for number, step in enumerate(file.steps)
             if isinstance(step, experiment_schema.GripperStep)
         ]
-    return _without_mistakes(path, mistakes + _unadaptable(file, sources))
-
-
-def _outline(path: Path) -> experiment_schema.ExperimentFile:
-    return experiment_schema.outline(read_yaml(path, UserError, experiment_schema.ExperimentFile.what))
-
-
-def _without_mistakes(path: Path, mistakes: Sequence[experiment_schema.Mistake]) -> experiment_schema.ExperimentFile:
-    """Return the experiment of a file; raises UserError with these mistakes, and with those of its keys and values."""
-    lines: list[str] = []
-    try:
-        file = load_yaml_model(path, experiment_schema.ExperimentFile)
-    except UserError as error:
-        lines.append(str(error))
-    lines += located(path, mistakes, UserError)
-    if lines:
-        raise UserError("\n".join(lines))
-    return file
+    return mistakes + _unadaptable(file, sources)
 
 
 def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[experiment_schema.Mistake]:

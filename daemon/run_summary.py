@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.printable import printable
 from shearloop.words import counted, times
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ class RunSummary:
     def _add(self, text: str) -> None:
         self.text = f"{self.text}\n{text}".lstrip("\n")
         if self._out is not None:
-            self._out.write(f"\n{text}\n\n")
+            self._out.write(f"\n{printable(text)}\n\n")
 
 
 def _came_late(reason: str) -> bool:
@@ -249,11 +250,14 @@ def _held(
         if reached_s < np.inf:
             yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point changed, by {name}"
         for t_ns, description in events:
-            after = sources[name].between(t_ns, step.to_ns)
+            # The next disturbance has a line of its own.
+            next_ns = min((other_ns for other_ns, _ in events if other_ns > t_ns), default=None)
+            after = sources[name].between(t_ns, step.to_ns if next_ns is None else next_ns - 1)
             if after.torque_nm.size:
                 worst_nm = np.abs(after.torque_nm - set_nm).max()
                 back_s = recovered_s((after.t_ns - t_ns) / 1e9, after.torque_nm, set_nm)
-                back = "not back by the end" if back_s == np.inf else f"back within ± {BAND:.0%} after {back_s:.1f} s"
+                never = "not back by the end" if next_ns is None else "not back by the next one"
+                back = never if back_s == np.inf else f"back within ± {BAND:.0%} after {back_s:.1f} s"
                 since_s = (t_ns - from_ns) / 1e9
                 yield f"    disturbed after {since_s:.1f} s ({description}): {worst_nm:.3f} N·m off, {back}"
 

@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 
 UNIT = "shearloop.service"
 EXAMPLE = "etc/shearloop/shearloop.yaml"

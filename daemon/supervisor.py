@@ -3,7 +3,7 @@
 import asyncio
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -95,13 +95,17 @@ class Reporter(Protocol):
         """Return the present counters: frames, errors by kind, rate."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class HealthReporter:
     """Collects the supervisor's records and the counters of the `reporters`, and publishes them."""
 
     publisher: Publisher
     supervisor: Supervisor
     clock: Clock
+    # Every device is emulated.
+    emulated: bool = False
+    # Why `tare` is refused now, or None.
+    tare_refusal: Callable[[], str | None] = lambda: None
     reporters: dict[str, Reporter] = field(default_factory=dict)
 
     def tasks(self) -> dict[str, TaskFacts]:
@@ -140,6 +144,8 @@ class HealthReporter:
                 source="daemon",
                 t_mono_ns=self.clock.now_ns(),
                 tasks=self.tasks(),
+                emulated=self.emulated,
+                tare_refusal=self.tare_refusal() or "",
                 loop_lag_s=lag_s,
                 memory_mb=resident_memory_mb(),
                 cpu_percent=100.0 * used_s / passed_s,

@@ -1,1 +1,1 @@
-"""Drivers, one module per device; `shearloop.drivers.emulators` plays the same devices byte for byte."""
+"""Drivers, one module per device; `shearloop.emulators` plays the same devices byte for byte."""

@@ -171,7 +171,7 @@ def _open_error(path: str, error: serial.SerialException) -> DriverError:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.EIO:
             return DeviceNotFoundError(f"There is no serial port {path}; {_available_ports()}.")
         case errno.EACCES | errno.EPERM:
-            return DeviceUnavailableError(f"This user may not open {path}; add the user to the port's group.")
+            return DeviceUnavailableError(f"This user may not open {path}; `shearloop ports` names the cure.")
         case errno.EAGAIN | errno.EBUSY:
             return DeviceUnavailableError(f"{path} is in use by another program; close that first.")
     return DeviceUnavailableError(f"{path} cannot be opened as a serial port: {error}.")
@@ -249,6 +249,9 @@ class LinkObserver(Protocol):
     def on_link_event(self, event: LinkEvent) -> None:
         """React to a change at once; never blocks."""
 
+    def on_refusal(self, sentence: str) -> None:
+        """Take the first refused data of a connection, which goes on; never blocks."""
+
 
 class LinkMonitor:
     """Counts a device's connections, reports each change, and spaces the attempts. No I/O.
@@ -264,12 +267,14 @@ class LinkMonitor:
         self._connected_ns: int | None = None
         self._connections = 0
         self._last_error = ""
+        self._told_refusal = False
         self.latest = LinkEvent(up=False, sentence="It has not been connected yet.", repeated=False)
 
     def connected(self, sentence: str, now_ns: int) -> None:
         """Note a new connection."""
         self._connected_ns = now_ns
         self._connections += 1
+        self._told_refusal = False
         self._notify(LinkEvent(up=True, sentence=sentence, repeated=False))
 
     def failed(self, error: DriverError, now_ns: int) -> float:
@@ -288,6 +293,12 @@ class LinkMonitor:
         self._failures += 1
         self._notify(LinkEvent(up=False, sentence=self._last_error, repeated=repeated))
         return pause_s
+
+    def refused(self, sentence: str) -> None:
+        """Note refused data, and report the first of each connection; later ones are counted by the driver."""
+        if self._observer is not None and not self._told_refusal:
+            self._observer.on_refusal(sentence)
+        self._told_refusal = True
 
     def diagnostics(self, *, connected: bool) -> dict[str, bool | int | str]:
         """Return the connection's part of `health`; counts are since the process began."""

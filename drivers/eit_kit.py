@@ -3,7 +3,8 @@
 The board sends a line per frame: values with four decimals, each followed by `, `, then a newline. L electrodes have
 L² values (v), some of them channels (c). The board computes each from 10-bit samples as floor(√(mean of (sample −
 512)²)) × 2.2 V / 1024 (`read_signal` of the EIT-kit's open-source firmware), hence the steps of 2.2/1024 V. It writes 0
-where the measuring pair touches a driven electrode. Values are below 10 V, so a line has cells of eight bytes.
+where the measuring pair touches a driven electrode, and where a channel has less signal than one step: that channel is
+dead in this frame. Values are below 10 V, so a line has cells of eight bytes.
 """
 
 import math
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.drivers.refused_lines import refusal_sentence
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
 
 CELL_BYTES = len(b"0.1234, ")
@@ -72,22 +74,27 @@ class FrameErrorKind(Enum):
     NOT_A_NUMBER = "a value that is not written as 0.1234: bytes were lost or changed"
     NAN = "a value that is NaN: the board divided by zero, restart it so that it calibrates again"
     OUT_OF_RANGE = f"a value above the ADC's {ADC_REFERENCE_V} V: bytes were changed"
-    ZERO_CHANNEL = "a channel that reads exactly 0: an electrode is shorted, or values are out of place"
     NONZERO_SLOT = "a value where the pair touches a driven electrode and 0 belongs: a different injection pattern"
 
 
 @dataclass(frozen=True, slots=True)
 class FrameError:
-    """A rejected line: the reason, the first bad value (counted from 0) if known, and its text."""
+    """A rejected line: the reason, its beginning or its first bad value, and that one's position, counted from 0.
+
+    `count` tells how many values there are.
+    """
 
     kind: FrameErrorKind
     excerpt: bytes
     position: int | None = None
+    count: str = ""
 
     def __str__(self) -> str:
-        """Return the sentence for health and log."""
-        where = "" if self.position is None else f" at value {self.position + 1}"
-        return f"rejected {self.kind.value} (read {self.excerpt.decode('ascii', 'backslashreplace')!r}{where})"
+        """Return the sentence for health and log: text and reason; for a whole line its sender and the cure too."""
+        if self.position is None or b"," in self.excerpt:
+            return refusal_sentence(self.excerpt, f"{self.kind.value}{self.count}", "EIT-kit")
+        read = repr(self.excerpt)[1:]
+        return f"refused {read} at value {self.position + 1}: {self.kind.value}"
 
 
 # What remains of a line that was under way when the port was opened.
@@ -108,11 +115,9 @@ def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64]
         return _find_error(line, zero_slots.size)
     # The quotient of whole numbers is the float nearest to the decimal.
     values: NDArray[np.float64] = digits @ _STEPS / 10_000
-    zeros = values == 0.0
     for kind, bad in (
         (FrameErrorKind.OUT_OF_RANGE, values > ADC_REFERENCE_V),
-        (FrameErrorKind.NONZERO_SLOT, ~zeros & zero_slots),
-        (FrameErrorKind.ZERO_CHANNEL, zeros & ~zero_slots),
+        (FrameErrorKind.NONZERO_SLOT, (values != 0.0) & zero_slots),
     ):
         if bad.any():
             position = int(bad.argmax())
@@ -123,7 +128,8 @@ def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64]
 def _find_error(line: bytes, n_values: int) -> FrameError:
     *values, rest = line.split(_SEPARATOR)
     if rest or len(values) != n_values:
-        return FrameError(FrameErrorKind.WRONG_COUNT, line[:EXCERPT_BYTES])
+        count = f" ({len(values)} of {n_values} values)"
+        return FrameError(FrameErrorKind.WRONG_COUNT, line[:EXCERPT_BYTES], count=count)
     for position, value in enumerate(values):
         if not _VALUE.fullmatch(value):
             is_nan = value.lower().lstrip(b"-") == b"nan"
@@ -139,7 +145,7 @@ class Frame:
     `channels` (c,) and `raw` (v,) are in volts and line order.
     `t_mid_ns` is the middle of the acquisition, `t_arrival_ns` the arrival of the last byte (monotonic clock).
     `seq` counts frames from 0 across reconnections. `saturated` (c,): the signal exceeds the ADC's range; `dead`
-    (c,): unchanged for DEAD_AFTER_FRAMES, so nothing is connected; `repeated`: the same line as
+    (c,): exactly 0, or unchanged for DEAD_AFTER_FRAMES, so nothing is connected; `repeated`: the same line as
     the frame before, so no new measurement.
     """
 
@@ -263,6 +269,21 @@ class FrameParser:
         self._last_channels = np.full(np.count_nonzero(~zero_slots), np.nan)
         self._equal_readings = np.zeros(len(self._last_channels), np.int64)
 
+    @property
+    def refused(self) -> int:
+        """The number of refused lines since the beginning."""
+        return self.errors.total()
+
+    @property
+    def refusal(self) -> str:
+        """The last refused line, why, and for a whole line who sends such lines and the cure; empty without one."""
+        return "" if self.last_error is None else str(self.last_error)
+
+    @property
+    def unfinished(self) -> bytes:
+        """What has come of the next line."""
+        return self._lines.partial
+
     def handle(self, event: RawEvent) -> list[Frame]:
         """Process a live or recorded event; return the frames that it completes."""
         match event.kind:
@@ -316,7 +337,7 @@ class FrameParser:
             self._equal_readings = np.where(channels == self._last_channels, self._equal_readings + 1, 1)
         self._last_channels = channels
         saturated = channels > FULL_SCALE_SINE_RMS_V
-        dead = self._equal_readings >= DEAD_AFTER_FRAMES
+        dead = (channels == 0.0) | (self._equal_readings >= DEAD_AFTER_FRAMES)
         # Time stays in order when the clock learns a new period.
         self._last_mid_ns = max(sent_ns - TRANSFER_NS - self.clock.period_ns // 2, self._last_mid_ns + 1)
         for array in (channels, values, saturated, dead):
@@ -351,27 +372,21 @@ class EitKit(SerialSensor[Frame]):
         frame_period_s: float = FRAME_PERIOD_S,
         inputs: InputRecorder | None = None,
     ) -> None:
-        self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
-        super().__init__(link, frame_period_s, self._parser.handle, inputs)
-
-    @property
-    def parser(self) -> FrameParser:
-        """What turns its bytes into frames."""
-        return self._parser
+        self._frame_parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
+        super().__init__(link, frame_period_s, self._frame_parser, inputs)
 
     @property
     def period_s(self) -> float:
         """The board's measured period, or the configured one until then."""
-        return self._parser.clock.period_ns / 1e9
+        return self._frame_parser.clock.period_ns / 1e9
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        parser = self._parser
+        parser = self._frame_parser
         return {
             **super().diagnostics(),
             "frames": parser.frames,
             "errors": {kind.name.lower(): count for kind, count in parser.errors.items()},
-            "last_frame_error": "" if parser.last_error is None else str(parser.last_error),
             "expected_hz": 1.0 / self._period_s,
             "measured_hz": 1.0 / self.period_s if parser.clock.learned else None,
         }

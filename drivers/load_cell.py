@@ -53,6 +53,11 @@ class LoadCalibration(CalibrationModel):
         return cls(tare_counts=0.0, scale_n_per_count=1 / LEVER_ARM_M)
 
     @property
+    def takes_torque(self) -> bool:
+        """Whether a line's decimal is a torque in N·m already."""
+        return abs(self.nm_per_count) == 1.0
+
+    @property
     def nm_per_count(self) -> float:
         """The torque of one count, N·m."""
         return self.sign * self.lever_arm_m * self.scale_n_per_count
@@ -73,7 +78,8 @@ class LoadSample:
     raw: the decimal as sent; torque_nm: calibrated; t_mid_ns: the middle of the conversion, t_arrival_ns: the line's
     arrival (both monotonic). `saturated`: at an end of the converter's range. `spike`: beyond
     the cell's capacity, or further from the last good value than the rig can move. `stuck`: the same value for two
-    seconds. `partial`: the first line after opening, which may lack its beginning.
+    seconds. `partial`: the first line after opening, which may lack its beginning. `counts`: beyond the capacity on a
+    board that sends whole numbers, without a calibration; also a spike.
     """
 
     raw: float
@@ -84,6 +90,7 @@ class LoadSample:
     spike: bool = False
     stuck: bool = False
     partial: bool = False
+    counts: bool = False
 
     @property
     def trusted(self) -> bool:
@@ -93,6 +100,8 @@ class LoadSample:
 
 class LoadParser(serial_sensor.LineParser[LoadSample]):
     """Turns the board's bytes into samples."""
+
+    board = "load cell"
 
     def __init__(self, calibration: LoadCalibration, rate_hz: float = LOAD_CELL_RATE_HZ) -> None:
         super().__init__(_DECIMAL, MAX_LINE_BYTES, BAUD_RATE, rate_hz)
@@ -113,10 +122,13 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
         super().restart()
         self._last_raw: float | None = None
         self._repeats = 0
+        # Whether no line since then had a decimal point.
+        self._whole_numbers = True
         self._levels = serial_sensor.StepFilter[tuple[float, int]]()
 
     def _value(self, line: serial_sensor.TimedLine) -> LoadSample:
         raw = float(line.text)
+        self._whole_numbers = self._whole_numbers and b"." not in line.text
         torque_nm = self.calibration.torque_nm(raw)
         self._repeats = self._repeats + 1 if raw == self._last_raw else 1
         self._last_raw = raw
@@ -136,6 +148,7 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
             spike=spike,
             stuck=self._repeats >= self._stuck_after,
             partial=line.partial,
+            counts=spike and self._whole_numbers and self.calibration.takes_torque,
         )
         self.flagged += not sample.trusted
         return sample
@@ -158,14 +171,9 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
         rate_hz: float = LOAD_CELL_RATE_HZ,
         inputs: serial_sensor.InputRecorder | None = None,
     ) -> None:
-        self._parser = LoadParser(calibration, rate_hz)
+        self._load_parser = LoadParser(calibration, rate_hz)
         # A fast board may seem silent to a busy computer; reopening would reset it.
-        super().__init__(link, 1.0 / min(rate_hz, LOAD_CELL_RATE_HZ), self._parser.handle, inputs)
-
-    @property
-    def parser(self) -> LoadParser:
-        """What turns its bytes into samples."""
-        return self._parser
+        super().__init__(link, 1.0 / min(rate_hz, LOAD_CELL_RATE_HZ), self._load_parser, inputs)
 
     def tare(self, raw_at_rest: float) -> None:
         """Make a raw value the zero of the samples to come."""
@@ -173,6 +181,6 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        parser = self._parser
+        parser = self._load_parser
         counts = {"samples": parser.count, "flagged": parser.flagged}
         return {**super().diagnostics(), **counts, "errors": parser.errors}

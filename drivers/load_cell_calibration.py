@@ -16,6 +16,11 @@ UNCALIBRATED = LoadCalibration(tare_counts=0.0, scale_n_per_count=1e-9)
 SAMPLES_PER_STEP = 30
 # The converter settles within four conversions (HX711 data sheet); the mass needs as long to hang still.
 SKIP_SAMPLES = 8
+# Of the readings of a step; more corrupted ones are refused.
+MIN_GOOD_FRACTION = 0.9
+# A corrupted reading is further from the median than the nearer half of all, by this factor: eight standard deviations
+# of Gaussian noise.
+OUTLIER_REACH = 12.0
 # A quiet HX711 at gain 128 shows some hundred counts; ten times that is a loose wire or a swinging mass.
 MAX_NOISE_COUNTS = 5000.0
 # Relative to the measured change, for boards that send N·m.
@@ -25,12 +30,13 @@ MAX_RESIDUAL_FRACTION = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """The reading under one constant load: mean and standard deviation of `n` raw values."""
+    """The reading under one constant load: mean and standard deviation of `n` raw values; `dropped` were corrupted."""
 
     mass_g: float
     mean: float
     std: float
     n: int
+    dropped: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,16 +51,18 @@ class LoadCalibrationResult:
 def measure_level(samples: Sequence[LoadSample], mass_g: float) -> Level:
     """Return the level of SAMPLES_PER_STEP samples under a constant load; those before them are left out.
 
-    Up to a tenth may be corrupted. Raises DeviceCalibrationError if they are saturated, flat or noisy.
+    Up to a tenth may be corrupted: spikes, an end of the range, or far from the others. Raises DeviceCalibrationError
+    for more, and for a flat or a noisy signal.
     """
     samples = samples[-SAMPLES_PER_STEP:]
-    if any(sample.saturated for sample in samples):
+    least = MIN_GOOD_FRACTION * SAMPLES_PER_STEP
+    if sum(sample.saturated for sample in samples) > SAMPLES_PER_STEP - least:
         raise DeviceCalibrationError(
             "The load cell's converter is at the end of its range: take load off the cell, and check that none of "
             "its four wires is loose."
         )
-    good = [sample.raw for sample in samples if not sample.spike and not sample.partial]
-    if len(good) < 0.9 * SAMPLES_PER_STEP:
+    good = _without_outliers([one.raw for one in samples if not (one.saturated or one.spike or one.partial)])
+    if len(good) < least:
         raise DeviceCalibrationError(
             f"Only {len(good)} of the {SAMPLES_PER_STEP} readings needed were good: check the cable, and that "
             "the board sends about 11 lines a second, then measure again."
@@ -70,7 +78,18 @@ def measure_level(samples: Sequence[LoadSample], mass_g: float) -> Level:
             f"The readings scatter by {std:.0f} counts, more than {MAX_NOISE_COUNTS:.0f}: let the mass hang "
             "still, keep the robot off the arm, and check the cell's wires and their shield."
         )
-    return Level(mass_g, mean, std, len(good))
+    return Level(mass_g, mean, std, len(good), len(samples) - len(good))
+
+
+def _without_outliers(raws: list[float]) -> list[float]:
+    """Return the readings that are not far from their median."""
+    if not raws:
+        return raws
+    distances = np.abs(np.array(raws) - np.median(raws))
+    ordered = np.sort(distances)
+    # More than half may be the same after rounding.
+    reach = ordered[len(raws) // 2] or ordered[math.ceil(MIN_GOOD_FRACTION * len(raws)) - 1]
+    return [raw for raw, distance in zip(raws, distances.tolist(), strict=True) if distance <= OUTLIER_REACH * reach]
 
 
 def check_levels(levels: Sequence[Level]) -> None:

@@ -8,18 +8,23 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.errors import DeviceLostError, DriverError
+from shearloop.drivers.refused_lines import BoardKind, refusal_sentence, shown
 
 # Opening the port resets an Uno; its boot loader waits before it starts the sketch.
 BOOT_S = 4.0
 SILENT_PERIODS = 8
+# A board that was waited for in vain is waited for twice as long, up to this factor: its period may be longer than
+# configured. So many values in time end that.
+LONGEST_PATIENCE, PROMPT_VALUES = 16, 20
 # Values in a row that agree with each other and become the new level.
 SETTLE_VALUES = 3
 
 ValueT = TypeVar("ValueT")
+ValueT_co = TypeVar("ValueT_co", covariant=True)
 
 
 class InputKind(Enum):
@@ -44,8 +49,23 @@ class RawEvent:
     data: bytes = b""
 
 
-# Returns the values that an event completes.
-Parse: TypeAlias = Callable[[RawEvent], Sequence[ValueT]]
+class Parser(Protocol[ValueT_co]):
+    """Turns events into values, and knows what it refused."""
+
+    @property
+    def refused(self) -> int:
+        """The number of refused lines since the beginning."""
+
+    @property
+    def refusal(self) -> str:
+        """The last refused line, why, who sends such lines, and the cure; empty without one."""
+
+    @property
+    def unfinished(self) -> bytes:
+        """What has come of the next line."""
+
+    def handle(self, event: RawEvent) -> Sequence[ValueT_co]:
+        """Process a live or recorded event; return the values that it completes."""
 
 
 class InputRecorder(Protocol):
@@ -72,6 +92,11 @@ class LineSplitter:
         self.partial = b""
         self.too_long = 0
         self.too_long_start = b""
+
+    @property
+    def dropping(self) -> bool:
+        """Whether the line under way is too long."""
+        return self._dropping
 
     def restart(self) -> None:
         """Drop a half-received line: the port was reopened."""
@@ -114,6 +139,9 @@ class TimedLine:
 class LineParser(ABC, Generic[ValueT]):
     """Turns the bytes of a board that sends a line for each conversion, in any slices, into values. No I/O."""
 
+    # The board that should send the lines.
+    board: ClassVar[BoardKind]
+
     def __init__(self, pattern: re.Pattern[bytes], max_bytes: int, baud: int, rate_hz: float) -> None:
         """Accept lines that match the pattern, of at most `max_bytes`; the board sends `rate_hz` lines a second."""
         self.count = 0
@@ -124,11 +152,28 @@ class LineParser(ABC, Generic[ValueT]):
         self._last_mid_ns = -(2**63)
         self._first = True
         self._rejected: Counter[str] = Counter()
+        # The last refused line and its kind.
+        self._last_refused: tuple[bytes, str] | None = None
 
     @property
     def errors(self) -> dict[str, int]:
         """The number of rejected lines, by kind."""
-        return dict(self._rejected + Counter({"too long": self._lines.too_long}))
+        return dict(self._rejected)
+
+    @property
+    def refused(self) -> int:
+        """The number of refused lines since the beginning."""
+        return self._rejected.total()
+
+    @property
+    def refusal(self) -> str:
+        """The last refused line, why, who sends such lines, and the cure; empty without one."""
+        return "" if self._last_refused is None else refusal_sentence(*self._last_refused, self.board)
+
+    @property
+    def unfinished(self) -> bytes:
+        """What has come of the next line."""
+        return self._lines.partial
 
     @abstractmethod
     def _value(self, line: TimedLine) -> ValueT | None:
@@ -155,6 +200,7 @@ class LineParser(ABC, Generic[ValueT]):
         for age, text in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
             partial, self._first = self._first, False
             if text is None:
+                self._refuse(self._lines.too_long_start, "too long")
                 continue
             arrived_ns = t_arrival_ns - age * self._period_ns
             t_mid_ns = arrived_ns - (len(text) + 1) * self._byte_ns - self._period_ns // 2
@@ -167,8 +213,12 @@ class LineParser(ABC, Generic[ValueT]):
                     values.append(value)
                     self.count += 1
             elif not partial:
-                self._rejected["not a number" if line.text else "empty"] += 1
+                self._refuse(line.text, "not a number" if line.text else "empty")
         return values
+
+    def _refuse(self, line: bytes, kind: str) -> None:
+        self._rejected[kind] += 1
+        self._last_refused = line, kind
 
 
 class StepFilter(Generic[ValueT]):
@@ -199,20 +249,28 @@ class StepFilter(Generic[ValueT]):
 
 
 class SerialSensor(Generic[ValueT]):
-    """One board behind a link, kept connected, with a parser for its bytes. A silent board counts as lost."""
+    """One board behind a link, kept connected, with a parser for its bytes.
+
+    A board counts as lost when it is silent, and when it sends only lines that are refused.
+    """
 
     # The operator's checklist when nothing comes.
     silence_hint = ""
 
-    def __init__(self, link: Link, period_s: float, parse: Parse[ValueT], inputs: InputRecorder | None = None) -> None:
+    def __init__(
+        self, link: Link, period_s: float, parser: Parser[ValueT], inputs: InputRecorder | None = None
+    ) -> None:
         """Use the link, not yet open, of a board with a line every `period_s`; `inputs` keeps every parser input."""
         self._link = link
         self._period_s = period_s
-        self._parse = parse
+        self._parser = parser
         self._inputs = inputs
         self._silence_s = BOOT_S
         # Values of the last read that `readings` has not yielded yet: the parser is ahead of its reader by these.
         self.unread = 0
+        self._patience = 1
+        self._prompt_values = 0
+        self._value_ns = 0
 
     async def readings(self) -> AsyncGenerator[ValueT]:
         """Yield the values of every line, in order and without end, as `batches` does."""
@@ -234,29 +292,55 @@ class SerialSensor(Generic[ValueT]):
                     port = self._link.port or await self._open()
                     received = await port.read(self._silence_s)
                     if received is None:
+                        self._patience = min(2 * self._patience, LONGEST_PATIENCE)
                         raise DeviceLostError(
                             f"{port.path} is open but has sent nothing for {self._silence_s:.1f} s; {self.silence_hint}"
                         )
+                    values = self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
+                    self._check_use(port, received.t_arrival_ns, useful=bool(values))
                 except DriverError as error:
                     await self._link.lost(error)
                     continue
-                self._silence_s = self._longest_silence_s
-                yield self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
+                self._silence_s = self._patience * self._longest_silence_s
+                yield values
+
+    @property
+    def parser(self) -> Parser[ValueT]:
+        """What turns its bytes into values."""
+        return self._parser
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        return self._link.diagnostics()
+        return {**self._link.diagnostics(), "last_refusal": self._parser.refusal}
+
+    def _check_use(self, port: Port, now_ns: int, *, useful: bool) -> None:
+        """Raise DeviceLostError if no value has come for long although bytes come."""
+        waited_s = (now_ns - self._value_ns) / 1e9
+        if not useful:
+            if waited_s > max(BOOT_S, self._silence_s):
+                why = self._parser.refusal or f"no line end in {shown(self._parser.unfinished)}; see its program"
+                raise DeviceLostError(f"{port.path} has sent nothing of use for {waited_s:.1f} s: {why}")
+            return
+        self._value_ns = now_ns
+        self._prompt_values = self._prompt_values + 1 if waited_s < 0.5 * self._longest_silence_s else 0
+        if self._prompt_values >= PROMPT_VALUES:
+            self._patience = 1
 
     def _dispatch(self, kind: InputKind, t_ns: int, data: bytes = b"") -> Sequence[ValueT]:
         event = RawEvent(kind, t_ns, data)
         if self._inputs is not None:
             self._inputs.record(event)
-        return self._parse(event)
+        before = self._parser.refused
+        values = self._parser.handle(event)
+        if self._parser.refused > before:
+            self._link.monitor.refused(self._parser.refusal)
+        return values
 
     async def _open(self) -> Port:
         port = await self._link.open()
-        self._dispatch(InputKind.OPENED, time.monotonic_ns())
-        self._silence_s = max(BOOT_S, self._longest_silence_s)
+        self._value_ns = time.monotonic_ns()
+        self._dispatch(InputKind.OPENED, self._value_ns)
+        self._silence_s = max(BOOT_S, self._patience * self._longest_silence_s)
         await self._on_open(port)
         return port
 

@@ -24,6 +24,9 @@ for _name in ("tests", "benchmarks"):
         _package.__path__ = [str(_ROOT / _name)]
         sys.modules[_name] = _package
 
+# The fixtures that several rooms share.
+pytest_plugins = ["tests.fixtures.physics", "tests.fixtures.daemons", "tests.fixtures.recordings"]
+
 # Before numpy is imported, as the command line and the Makefile do: threads that wait for a busy machine's other
 # processor make a calibration twenty times as slow.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

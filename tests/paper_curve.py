@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.estimation import Calibration
-from shearloop.bank.estimation.estimator import OutputModel
-from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.estimation import Calibration
+from shearloop.estimation.estimator import OutputModel
+from shearloop.estimation.interval_regressor import fit_interval_regressor
 
 Points = tuple[FloatArray, FloatArray]
 

@@ -72,6 +72,10 @@ class LinkEvents(Changes):
     def __init__(self) -> None:
         super().__init__()
         self.events: list[LinkEvent] = []
+        self.refusals: list[str] = []
+
+    def on_refusal(self, sentence: str) -> None:
+        self.refusals.append(sentence)
 
     def on_link_event(self, event: LinkEvent) -> None:
         self.events.append(event)

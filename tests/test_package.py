@@ -14,7 +14,7 @@ import yaml
 import shearloop
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("bank", "daemon", "drivers")
+FOLDERS = ("bank", "cli", "daemon", "drivers", "emulators", "estimation", "studies", "tools")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
@@ -79,3 +79,53 @@ def test_the_pages_become_a_site_without_a_warning(tmp_path):
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert (tmp_path / "site" / "configuration" / "index.html").exists()
+
+
+# Imported names whose distribution is called otherwise.
+DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "typing_extensions": "typing-extensions",
+    "dask": "distributed",
+    "dashboard_client": "ur-rtde",
+    "foxglove": "foxglove-sdk",
+    "grimp": "import-linter",
+    "llvmlite": "numba",
+    "material": "mkdocs-material",
+    "nbformat": "nbclient",
+    "pydantic_core": "pydantic",
+    "rerun": "rerun-sdk",
+    "rtde_control": "ur-rtde",
+    "rtde_receive": "ur-rtde",
+    "script_client": "ur-rtde",
+    "serial": "pyserial",
+    "skfem": "scikit-fem",
+    "yaml": "pyyaml",
+    "zmq": "pyzmq",
+}
+# Only a benchmark that reads a dataset back in an environment of its own imports these.
+FOREIGN = {"lerobot", "torch"}
+
+
+def test_every_import_is_declared():
+    declared = [*PROJECT["dependencies"], *(one for some in PROJECT["optional-dependencies"].values() for one in some)]
+    names = {re.split(r"[<>=;\[ ]", one)[0].lower() for one in declared}
+    imported: dict[str, str] = {}
+    for path in (p for folder in (*FOLDERS, "benchmarks", "tests", "src") for p in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            imported |= {module.split(".")[0]: str(path.relative_to(ROOT)) for module in modules}
+    own = {"shearloop", "benchmarks", "tests", "__future__", *sys.stdlib_module_names, *FOREIGN}
+    undeclared = {
+        name: place
+        for name, place in imported.items()
+        if name not in own and DISTRIBUTIONS.get(name, name).lower() not in names
+    }
+    assert undeclared == {}
+
+
+@pytest.mark.parametrize("record", sorted((ROOT / "docs" / "decisions").glob("*.md")), ids=lambda path: path.stem)
+def test_a_decision_has_a_date_and_a_status(record):
+    assert re.search(
+        r"^Date: \d{4}-\d\d-\d\d\. Status: (accepted|superseded by \d{4})\.", record.read_text(), re.MULTILINE
+    )

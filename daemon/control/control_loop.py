@@ -10,12 +10,13 @@ from types import MappingProxyType
 from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, Hold, StepCommand, TrackTorque
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
+    ApproachStep,
     ExperimentFile,
     ExperimentLimits,
     GripStep,
     IdentifyStep,
     TareStep,
-    first_turn_before_grip,
+    first_motion_before_grip,
 )
 from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
 from shearloop.daemon.control.loop_inputs import (
@@ -31,6 +32,8 @@ from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDe
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import WristController
 
+# A zero that drifted by less than this is taken anew without a question.
+LOADED_NM = 0.05
 # An `adapt` step compares the fingertip with the torques of this time.
 ADAPTED_OVER_S = 600.0
 
@@ -67,6 +70,8 @@ class _GrippedTool:
     origin_rad: float | None = None
     # When the latest grip, release or tare ended, until each torque has been measured since, or should have been.
     unmeasured_since_ns: int | None = None
+    # The largest force of the fingers at the grip.
+    force_n: float | None = None
     # Whether a tool should be between the fingers.
     expected: bool = False
     # A stop has opened the gripper, or why it did not open, until the operator acknowledges it.
@@ -135,6 +140,9 @@ class ControlLoop:
         known = self.inputs.gripper
         if known is None or gripper.t_ns >= known.t_ns:
             self.inputs.gripper = gripper
+            if self.running is None and not (gripper.holding or gripper.moving or gripper.uncertain):
+                # Nothing is between the fingers: the next grip has an angle of its own.
+                self._gripped.origin_rad = self._gripped.force_n = None
 
     def on_link(self, device: str, sentence: str, *, up: bool) -> None:
         """Take the return or the loss of a device, with a sentence."""
@@ -159,7 +167,10 @@ class ControlLoop:
         """Take the end of the present action, and why it failed, if it did."""
         experiment, arm, gripped = self.experiment, self.inputs.arm, self._gripped
         action = experiment.command.action if experiment is not None else None
-        if experiment is None or not experiment.end_action(error) or error:
+        if experiment is None or not experiment.end_action(error):
+            return
+        if error:
+            self.safety.stop(Fault(FaultCode.STEP_FAILED, experiment.stop_reason))
             return
         if isinstance(action, AdaptStep) and action.fingertip == self.wrist.source.name:
             # The stiffness was identified with another gain.
@@ -171,41 +182,119 @@ class ControlLoop:
         gripped.unmeasured_since_ns = arm.t_ns if arm is not None else None
         if isinstance(action, GripStep):
             gripper = self.inputs.gripper
-            gripped.origin_rad = arm.wrist_rad if arm is not None else None
+            gripped.origin_rad, gripped.force_n = arm.wrist_rad if arm is not None else None, action.force_n
             # An unexpected object is watched as well.
             gripped.expected = action.expect_object or (gripper is not None and gripper.holding)
 
     def on_release_ended(self, error: str | None = None) -> None:
         """Take the end of the release after a stop, and why the gripper did not open, if it did not."""
         self._gripped.release_error = error
+        if error is None:
+            self._gripped.origin_rad = self._gripped.force_n = None
+
+    @property
+    def held(self) -> str | None:
+        """What is between the fingers, with its width and the force of the grip, or None."""
+        gripper, force_n = self.inputs.gripper, self._gripped.force_n
+        if "gripper" not in self._watched.required or gripper is None or not gripper.holding:
+            return None
+        force = f"with at most {force_n:g} N" if force_n is not None else "with an unknown force"
+        return f"its fingers hold something {gripper.width_mm:.1f} mm wide, {force}"
+
+    def release_refusal(self) -> str | None:
+        """Return why the operator cannot open the gripper now, or None; the arm is not asked."""
+        if (running := self.running) is not None:
+            return f"the experiment {running.file.name!r} is running; stop it first"
+        if "gripper" not in self._watched.required:
+            return "no gripper is configured"
+        gripper = self.inputs.gripper
+        if gripper is None or "gripper" in self.inputs.lost:
+            return f"the gripper is not connected: {self.inputs.lost.get('gripper', 'it has not answered yet')}"
+        return None
+
+    def release_question(self) -> str:
+        """Return what a release does now, for the operator who confirms it."""
+        gripper = self.inputs.gripper
+        width = f"its fingers are {gripper.width_mm:.1f} mm apart" if gripper is not None else "its width is unknown"
+        what = self.held or f"{width}, and it does not say that it holds something"
+        renewed = "; after its fault the fingers open and close once" if gripper is not None and gripper.fault else ""
+        return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
+
+    def tare_refusal(self, *, confirmed: bool = False) -> str | None:
+        """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
+        if (running := self.running) is not None:
+            return (
+                f"the experiment {running.file.name!r} is running, and a new zero would change its "
+                "torques; stop it first, or give it a step `tare`"
+            )
+        if (held := self.held) is not None:
+            return f"{held}, and its torque would become the zero; open the gripper first (`shearloop command release`)"
+        if confirmed:
+            return None
+        cure = "take the load off, or confirm with `shearloop command tare --yes` that there is none"
+        if (uncertain := self._why_uncertain()) is not None:
+            return f"{uncertain}; {cure}"
+        if (loaded := self._loaded()) is not None:
+            return f"{loaded}, which would become the zero; {cure}"
+        return None
+
+    def _loaded(self) -> str | None:
+        """Return which sensor measures a load that does not come from its drift, or None."""
+        # Fingers that are known to be empty load no fingertip: what it measures is its drift.
+        empty = "gripper" in self._watched.required and self.inputs.gripper is not None
+        for name, latest in self.inputs.torques.items():
+            source = self._sources[name]
+            judged = not source.from_robot and not (empty and source.warm_up_s)
+            if judged and latest.torque_nm is not None and abs(latest.torque_nm) > LOADED_NM:
+                return f"{name} measures {latest.torque_nm:+.3f} N·m"
+        return None
+
+    def start_refusal(self) -> str | None:
+        """Return why no experiment can begin, whichever it is, or None."""
+        if (running := self.running) is not None:
+            return f"the experiment {running.file.name!r} is still running; stop it first"
+        if self.safety.stopped:
+            reasons = " ".join(fault.sentence for fault in self.safety.stop_faults)
+            return f"a stop has not been acknowledged; `shearloop command unlock` does so: {reasons}"
+        return None
 
     def start(self, file: ExperimentFile, t_ns: int) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""
-        if (running := self.running) is not None:
-            return f"the experiment {running.file.name!r} is still running; stop it first"
+        if (reason := self.start_refusal()) is not None:
+            return reason
         if file.torque_source not in self._wrists:
             known = ", ".join(self._wrists)
             return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
-        if self.safety.stopped:
-            return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
         driving = self._sources[file.torque_source]
         watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
         faults = detect_faults(self.inputs, watched, self.config, t_ns)
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
             return " ".join(refusals)
-        number, uncertain = first_turn_before_grip(file), self._why_uncertain()
-        if number is not None and uncertain:
-            turning = f"step {number} ({file.steps[number - 1].do}), which turns the wrist"
-            return f"{uncertain}; put a `grip` or a `release` before {turning}"
+        number, uncertain = first_motion_before_grip(file), self._why_uncertain()
+        if number is not None:
+            step = file.steps[number - 1]
+            straight = isinstance(step, ApproachStep)
+            # The limits watch a turn of a held tool. Nothing watches what a straight move does to it.
+            why = uncertain or (f"the gripper is closed: {self.held}" if straight and self.held else None)
+            if why is not None:
+                motion = f"step {number} ({step.do}), which {'moves the arm' if straight else 'turns the wrist'}"
+                return f"{why}; put a `grip` or a `release` before {motion}"
         self.experiment, self._watched, self.wrist = Experiment(file, t_ns), watched, self._wrists[file.torque_source]
         # What the last experiment knew of the tool may be wrong by now.
         self.wrist.reset()
         # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
         gripper = self.inputs.gripper
         expected = "gripper" not in watched.required or (gripper is not None and gripper.holding)
+        before = self._gripped
+        # The angle since the grip belongs to the grip: a tool that is still held keeps it.
+        still_held = gripper is not None and gripper.holding
         self._gripped = _GrippedTool(
-            unmeasured_since_ns=t_ns, expected=expected, release_error=self._gripped.release_error
+            origin_rad=before.origin_rad if still_held else None,
+            force_n=before.force_n if still_held else None,
+            unmeasured_since_ns=t_ns,
+            expected=expected,
+            release_error=before.release_error,
         )
         return None
 
@@ -217,8 +306,9 @@ class ControlLoop:
         """Continue after `pause`; return None, or why not."""
         return self.experiment.resume() if self.experiment is not None else "no experiment is paused"
 
-    def stop(self, reason: str) -> None:
-        """End the experiment and stand still."""
+    def stop(self, reason: str, fault: Fault) -> None:
+        """End the experiment, if one runs, and stand still until the operator acknowledges the stop."""
+        self.safety.stop(fault)
         if self.experiment is not None:
             self.experiment.stop(reason)
 
@@ -254,6 +344,8 @@ class ControlLoop:
             found.append(Fault(FaultCode.NOT_RELEASED, gripped.release_error))
         if running is None:
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
+            if self.safety.stopped and self.held is not None:
+                found.append(Fault(FaultCode.TOOL_GRIPPED, self.held))
             if arm is not None and arm.enabled_by_start:
                 found = [fault for fault in found if fault.code is not FaultCode.ROBOT_BLOCKED]
             return self._ended(self.safety.report(found))
@@ -286,17 +378,20 @@ class ControlLoop:
         command = experiment.command
         # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now.
         if _turns(command) and not gripped.expected and (uncertain := self._why_uncertain()):
-            experiment.fail(f"{uncertain}; put a `grip` or a `release` before it")
+            self._fail(experiment, f"{uncertain}; put a `grip` or a `release` before it")
         awaited = self._awaited_torques(experiment, t_ns)
         still = held or awaited is not None or experiment.phase is ExperimentPhase.PAUSED
         limit_nm = experiment.limits.torque_nm
         if isinstance(command.wrist, TrackTorque) and not still and not wrist.tracks(command.wrist, limit_nm):
             reason = wrist.close_loop(command.wrist, t_ns, wrist_rad, limit_nm)
             if reason:
-                experiment.fail(reason)
+                self._fail(experiment, reason)
         if not experiment.running:
-            return self._ended(decision)
+            return self._ended(self.safety.report(decision.faults))
         action = command.action if command.action is not None and not still and experiment.begin_action() else None
+        if isinstance(action, TareStep) and (reason := self.held or self._why_uncertain()):
+            self._fail(experiment, f"{reason}; put a `release` before it")
+            return self._ended(self.safety.report(decision.faults))
         if isinstance(action, IdentifyStep):
             wrist.begin_identification(action, limit_nm)
             action = None
@@ -307,7 +402,7 @@ class ControlLoop:
             if excitation.done:
                 self.on_action_ended(excitation.failure)
                 if not experiment.running:
-                    return self._ended(decision)
+                    return self._ended(self.safety.report(decision.faults))
         else:
             velocity = wrist.turn(command.wrist, t_ns, wrist_rad, origin_rad)
         phase = "held" if held else experiment.phase.value
@@ -334,6 +429,11 @@ class ControlLoop:
             self._gripped.unmeasured_since_ns = None
             return None
         return f"waiting for the first torque of {', '.join(awaited)}{f': {reason}' if reason else ''}"
+
+    def _fail(self, experiment: Experiment, reason: str) -> None:
+        """End an experiment whose step cannot be done; the stop waits for the operator as every other."""
+        experiment.fail(reason)
+        self.safety.stop(Fault(FaultCode.STEP_FAILED, experiment.stop_reason))
 
     def _forget_tool(self) -> None:
         self.wrist.reset()

@@ -290,21 +290,22 @@ def _twist(step: steps.TwistStep) -> StepProgram:
 
 
 def _hold_torque(step: steps.HoldTorqueStep) -> StepProgram:
-    track = TrackTorque(step.torque_nm, step.ramp_nm_per_s)
-    tolerance_nm = max(TORQUE_TOLERANCE * abs(step.torque_nm), 1e-3)
+    torque_nm = step.signed_torque_nm
+    track = TrackTorque(torque_nm, step.ramp_nm_per_s)
+    tolerance_nm = max(TORQUE_TOLERANCE * abs(torque_nm), 1e-3)
     while True:
-        view = yield StepCommand(track, activity=f"bringing the torque to {step.torque_nm:+.3f} N·m")
-        if view.torque_nm is not None and abs(view.torque_nm - step.torque_nm) <= tolerance_nm:
+        view = yield StepCommand(track, activity=f"bringing the torque to {torque_nm:+.3f} N·m")
+        if view.torque_nm is not None and abs(view.torque_nm - torque_nm) <= tolerance_nm:
             break
-    yield from _wait(track, step.hold_s, view.elapsed_s, f"holding {step.torque_nm:+.3f} N·m", 1)
+    yield from _wait(track, step.hold_s, view.elapsed_s, f"holding {torque_nm:+.3f} N·m", 1)
 
 
 def _tighten(step: steps.TightenStep) -> StepProgram:
-    sign = -1.0 if step.direction == "clockwise" else 1.0
     start_rad = (yield StepCommand(activity="reading the wrist's angle")).wrist_rad
+    velocity = ConstantVelocity(steps.SIGNS[step.direction] * step.speed_rad_per_s)
     while True:
         activity = f"turning {step.direction} until {step.until_torque_nm:.3f} N·m or {step.until_angle_rad:.2f} rad"
-        view = yield StepCommand(ConstantVelocity(sign * step.speed_rad_per_s), activity=activity)
+        view = yield StepCommand(velocity, activity=activity)
         if view.torque_nm is not None and abs(view.torque_nm) >= step.until_torque_nm:
             return
         if abs(view.wrist_rad - start_rad) >= step.until_angle_rad:

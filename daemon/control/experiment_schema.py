@@ -1,14 +1,16 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema, model_validator
 
 from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
+from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S
 from shearloop.yaml_files import shown
 
 MOST_ANGLES = 1000
@@ -52,6 +54,12 @@ Angles = Annotated[
 ]
 
 
+# What some gripper has; the configured model's own ranges are checked with its configuration.
+FingerWidth = Annotated[float, Field(ge=0, le=LARGEST_STROKE_MM)]
+FingerSpeed = Annotated[float, Field(ge=SPEEDS_MM_S[0], le=SPEEDS_MM_S[1])]
+FingerForce = Annotated[float, Field(ge=FORCES_N[0], le=FORCES_N[1])]
+
+
 class ExperimentLimits(ConfigModel):
     """Limits of all steps; a step's limits can only be tighter."""
 
@@ -85,15 +93,16 @@ class GripStep(_Step):
     """Close to a width, or onto an object in between."""
 
     do: Literal["grip"]
-    width_mm: float = Field(0.0, ge=0, le=140, description="width to close to")
-    speed_mm_per_s: float = Field(60.0, ge=30, le=250, description="speed of the fingers")
-    force_n: float = Field(20.0, ge=10, le=125, description="largest force of the fingers")
+    width_mm: FingerWidth = Field(0.0, description="width to close to")
+    speed_mm_per_s: FingerSpeed = Field(60.0, description="speed of the fingers")
+    force_n: FingerForce = Field(20.0, description="largest force of the fingers")
     expect_object: bool = Field(True, description="closing on nothing is an error")
 
 
 def opening(width_mm: float, speed_mm_per_s: float) -> GripStep:
     """Return the step that opens the gripper, with its least force."""
-    content = {"width_mm": width_mm, "speed_mm_per_s": speed_mm_per_s, "force_n": 10.0, "expect_object": False}
+    least_n = FORCES_N[0]
+    content = {"width_mm": width_mm, "speed_mm_per_s": speed_mm_per_s, "force_n": least_n, "expect_object": False}
     return GripStep.model_validate({"do": "grip", **content})
 
 
@@ -138,13 +147,36 @@ class TurnToStep(_Step):
     speed_rad_per_s: ranges.WristSpeed = Field(0.4, description="speed of the wrist")
 
 
+# Of a turn, for an eye that faces the gripper.
+Direction = Literal["clockwise", "counterclockwise"]
+# One convention for every number of a file, and for recorded angles and torques.
+SIGNS: Mapping[Direction, int] = {"clockwise": -1, "counterclockwise": 1}
+
+
+def direction_of(number: float) -> Direction | None:
+    """Return the direction of an angle or a torque; None for 0."""
+    return None if number == 0 else "clockwise" if number < 0 else "counterclockwise"
+
+
 class HoldTorqueStep(_Step):
     """Ramp the torque to a set point, and hold it in closed loop."""
 
     do: Literal["hold_torque"]
     torque_nm: ranges.TorqueSetpoint = Field(description="the set point; counterclockwise is positive")
+    direction: Direction | None = Field(None, description="of the torque, which then has no sign")
     ramp_nm_per_s: float = Field(0.05, gt=0, le=1, description="rise of the set point")
     hold_s: ranges.Seconds = Field(10.0, description="time at the set point")
+
+    @model_validator(mode="after")
+    def _one_sign(self) -> "HoldTorqueStep":
+        if self.direction is not None and self.torque_nm < 0:
+            raise ValueError(f"with `direction`, torque_nm has no sign: write {-self.torque_nm:g}")
+        return self
+
+    @property
+    def signed_torque_nm(self) -> float:
+        """The set point; counterclockwise is positive."""
+        return self.torque_nm if self.direction is None else SIGNS[self.direction] * self.torque_nm
 
 
 class TightenStep(_Step):
@@ -154,14 +186,14 @@ class TightenStep(_Step):
     until_torque_nm: ranges.TorqueLimit = Field(description="the turn ends at this torque")
     until_angle_rad: ranges.Turn = Field(description="the turn ends at this angle")
     speed_rad_per_s: ranges.WristSpeed = Field(0.05, description="speed of the wrist")
-    direction: Literal["clockwise", "counterclockwise"] = Field("clockwise", description="direction of the turn")
+    direction: Direction = Field(description="of the turn: the thread's, seen by an eye that faces the gripper")
 
 
 class ReleaseStep(_Step):
     """Open the gripper."""
 
     do: Literal["release"]
-    width_mm: float = Field(140.0, ge=0, le=140, description="width to open to")
+    width_mm: FingerWidth = Field(LARGEST_STROKE_MM, description="width to open to; a smaller gripper opens fully")
 
 
 class WaitStep(_Step):
@@ -190,7 +222,7 @@ class ExperimentFile(ConfigModel):
         "right", description="torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
     )
     limits: ExperimentLimits = Field(ExperimentLimits(), description="limits of all steps")
-    tool_mm: float | None = Field(None, gt=0, lt=140, description="diameter of the tool, for recordings")
+    tool_mm: float | None = Field(None, gt=0, lt=LARGEST_STROKE_MM, description="diameter of the tool, for recordings")
     slices: Literal["torque", "diameter"] | None = Field(
         None,
         description="kind of slice that `recording export --format slices` makes of each held angle; none by default",
@@ -207,14 +239,48 @@ class ExperimentFile(ConfigModel):
         return ExperimentLimits.model_construct(torque_nm=torque_nm, angle_rad=angle_rad)
 
 
-def first_turn_before_grip(file: ExperimentFile) -> int | None:
-    """Return the number, from 1, of the first step that turns the wrist before any grip or release, or None."""
+def first_motion_before_grip(file: ExperimentFile) -> int | None:
+    """Return the number, from 1, of the first step that moves the arm before any grip or release, or None."""
     for number, step in enumerate(file.steps, 1):
         if isinstance(step, GripperStep):
             return None
-        if isinstance(step, TwistingStep | TurnToStep):
+        if isinstance(step, TwistingStep | TurnToStep | ApproachStep):
             return number
     return None
+
+
+def first_motion(file: ExperimentFile) -> str:
+    """Return the first motion of an experiment as a sentence, for the operator who starts it."""
+    for number, step in enumerate(file.steps, 1):
+        if (motion := motion_of(step)) is not None:
+            return f"the first motion is step {number} of {len(file.steps)} ({step.do}): {motion}"
+    return "no step moves anything"
+
+
+def motion_of(step: Step) -> str | None:
+    """Return what moves in a step, as a sentence, or None."""
+    match step:
+        case ApproachStep(along_tool_m=float(distance_m)):
+            return f"the arm moves {1e3 * distance_m:+.0f} mm along the tool's axis, at {step.speed_m_per_s:g} m/s"
+        case ApproachStep(pose_m_rad=tuple(pose)):
+            x, y, z = (f"{1e3 * value:.0f}" for value in pose[:3])
+            return f"the arm moves to x {x}, y {y}, z {z} mm, at {step.speed_m_per_s:g} m/s"
+        case GripStep():
+            return f"the fingers close to {step.width_mm:g} mm, or onto a tool with at most {step.force_n:g} N"
+        case ReleaseStep():
+            return f"the fingers open to {step.width_mm:g} mm, and a tool in them drops"
+        case TurnToStep():
+            return f"the wrist turns to {step.angle_rad:g} rad, at {step.speed_rad_per_s:g} rad/s"
+        case TwistStep():
+            return f"the wrist twists to {step.angles_rad[0]:g} rad, at {step.speed_rad_per_s:g} rad/s"
+        case IdentifyStep():
+            return f"the wrist turns to and fro, by at most {step.amplitude_rad:g} rad"
+        case HoldTorqueStep():
+            return f"the wrist turns until the torque is {step.torque_nm:+g} N·m"
+        case TightenStep():
+            return f"the wrist turns {step.direction}, at {step.speed_rad_per_s:g} rad/s"
+        case _:
+            return None
 
 
 # A location in an experiment's file, and what is wrong there.
@@ -254,41 +320,6 @@ def _outlined(content: object) -> Step:
         return step
 
 
-def check_steps(file: ExperimentFile) -> list[Mistake]:
-    """Return each step that exceeds its limits or its timeout, and the first `hold_torque` on an unidentified tool."""
-    found: list[Mistake] = []
-    identified = False
-    for number, step in enumerate(file.steps):
-        limits, needs = file.limits_of(step), demand(step)
-        torque = needs.torque_nm, limits.torque_nm, "N·m", "torque_nm"
-        for value, limit, unit, key in (torque, (needs.angle_rad, limits.angle_rad, "rad", "angle_rad")):
-            if value >= limit:
-                asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
-                found.append((("steps", number), f"{asks}; raise limits.{key}, or ask for less"))
-        if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
-            asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
-            found.append((("steps", number), f"{asks}; raise timeout_s"))
-        match step:
-            case IdentifyStep():
-                identified = True
-            case _ if _forgets_tool(step, file.torque_source):
-                identified = False
-            case HoldTorqueStep() if not identified:
-                cure = "put an `identify` step before it, after the last `tare`, `grip`, `release` or `adapt`"
-                found.append((("steps", number), f"hold_torque needs an identified tool; {cure}"))
-                # One sentence is enough.
-                identified = True
-    return found
-
-
-def _forgets_tool(step: Step, torque_source: str) -> bool:
-    """Return whether an identification is invalid afterwards: a new grip, zero, or gain of the driving torque."""
-    match step:
-        case AdaptStep(fingertip=fingertip):
-            return fingertip == torque_source
-    return isinstance(step, TareStep | GripperStep)
-
-
 class Demand(NamedTuple):
     """The largest torque (N·m) and angle from the grip (rad) of a step, and its times.
 
@@ -321,6 +352,8 @@ def demand(step: Step) -> Demand:
             return Demand(stands_s=wait_s)
         case TareStep():
             return Demand(moves_s=6.0)
+        case ApproachStep(along_tool_m=float() as distance_m):
+            return Demand(moves_s=1.0 + abs(distance_m) / step.speed_m_per_s)
         case ApproachStep() | GripStep() | ReleaseStep() | AdaptStep() | TurnToStep():
             return Demand(moves_s=3.0)
         case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | WaitStep():

@@ -5,21 +5,23 @@ import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
-from shearloop.bank.confidence import TWO_SIDED_95
-from shearloop.bank.estimation import Measured, combine
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.loop_inputs import GripperStatus
-from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
+from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM
+from shearloop.errors import ActionError
+from shearloop.estimation import Measured, combine
+from shearloop.estimation.confidence import TWO_SIDED_95
 
-OPENING = opening(140.0, 100.0)
+# Every model opens as wide as it can, and as gently.
+OPENING = opening(LARGEST_STROKE_MM, 100.0)
 # The fingers' own stop may lie this far before the widest target.
 OPEN_WITHIN_MM = 10.0
 # A release or halt is retried for longer than a reconnection takes.
@@ -51,9 +53,10 @@ class GripperTask:
         await self.gripper.activate()
         sent = await self.gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
         state = await self.gripper.finish(sent)
+        widest_mm = min(target.width_mm, self.gripper.model.stroke_mm)
         # The loop needs the state before the end of the action.
         self.control_loop.on_gripper(_status(state))
-        if state.object is ObjectStatus.CONTACT_OPENING and state.width_mm < target.width_mm - OPEN_WITHIN_MM:
+        if state.object is ObjectStatus.CONTACT_OPENING and state.width_mm < widest_mm - OPEN_WITHIN_MM:
             stopped = f"the fingers met something as they opened, and stopped at {state.width_mm:.1f} mm"
             raise ActionError(f"{stopped}; clear their way")
         if target.expect_object and state.diameter_mm is None:
@@ -63,6 +66,11 @@ class GripperTask:
     async def release(self) -> None:
         """Open wide; raises DriverError and ActionError."""
         await _tried(lambda: self.grip(OPENING))
+
+    async def open_by_operator(self) -> None:
+        """Open wide, also after a fault, once the operator says that a tool may drop; raises as `release` does."""
+        await self.unlock()
+        await self.release()
 
     async def halt(self) -> None:
         """Stop the fingers; raises DriverError."""

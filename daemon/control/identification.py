@@ -8,7 +8,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 
 # The grid of the torque's lag behind its stamp.
 _LAG_GRID_S = np.arange(-0.4, 1.0001, 0.02)

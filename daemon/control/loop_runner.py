@@ -1,7 +1,7 @@
 """The task that runs the control loop: robot states in, commands out, 125 times a second; and its messages."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -23,9 +23,8 @@ from shearloop.daemon.control.experiment_schema import (
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.stop_timeline import StopTimeline
-from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
@@ -45,6 +44,7 @@ from shearloop.drivers.ur.messages import (
     tool_axis,
 )
 from shearloop.drivers.ur.settings import Six
+from shearloop.errors import ActionError
 
 WRENCH = "wrench"
 # Without a new state the loop decides after this time, half of the time after which the arm's state is stale.
@@ -68,6 +68,8 @@ LONGEST_TARE_S = 30.0
 # A tare gives up this much before its step is overdue, so that the sensors' reasons are reported.
 GIVES_UP_BEFORE_S = 0.1
 ENDING = "the daemon ends; start it again"
+STOPPED_AT_START = "it was stopped during its start"
+UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
 # The columns of `robot.state` that the robot's state has under the same name.
 _SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s"}
 
@@ -152,25 +154,31 @@ class ControlLoopRunner:
             self._states.publish_stop(self._timeline.end())
             await self._actions.close()
 
-    def stop(self) -> str | None:
-        """End the experiment, also during its start, or the unlocking; return its name, or None."""
+    def stop(self, *, also_idle: bool = False) -> str | None:
+        """End the experiment, also during its start, or the unlocking; return its name, or None.
+
+        The next start waits for `unlock`. `also_idle`: also where nothing moves.
+        """
         self._stop_count += 1
-        if (experiment := self._control_loop.running) is None:
-            return "unlock" if self.stop_unlocking() else None
-        self._request_stop("the operator stopped it")
-        return experiment.file.name
+        experiment, unlocking = self._control_loop.running, self.stop_unlocking()
+        stopped = experiment.file.name if experiment is not None else "unlock" if unlocking else None
+        if stopped is not None or also_idle:
+            what = f"{stopped!r} was under way" if stopped is not None else "nothing was under way"
+            self._request_stop("the operator stopped it", Fault(FaultCode.OPERATOR_STOP, what))
+        return stopped
 
     def close(self) -> None:
         """Stop the running experiment at the daemon's end, and start nothing more."""
         self._stop_count, self._closed = self._stop_count + 1, True
         if self._control_loop.running is not None:
-            self._request_stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")
+            ended = "the wrist is stopped, a gripped tool stays gripped"
+            self._request_stop(f"the daemon ended: {ended}", Fault(FaultCode.DAEMON_ENDED, ended))
             # The loop is cancelled before the next state.
             self.decide_now()
 
-    def _request_stop(self, reason: str) -> None:
+    def _request_stop(self, reason: str, fault: Fault) -> None:
         self._timeline.request(self._clock.now_ns())
-        self._control_loop.stop(reason)
+        self._control_loop.stop(reason, fault)
 
     def decide_now(self) -> None:
         """Decide without a new state, at the daemon's end."""
@@ -181,26 +189,53 @@ class ControlLoopRunner:
         except Exception:  # noqa: BLE001 - the robot's process stops the arm as it ends
             structlog.get_logger().exception("the loop crashed at its last decision")
 
-    async def start(self, file: ExperimentFile) -> str | None:
-        """Begin an experiment; return None, or why it cannot begin."""
+    @property
+    def stop_count(self) -> int:
+        """The number of stops so far: one that comes while an experiment is read or starts ends its start."""
+        return self._stop_count
+
+    def start_refusal(self) -> str | None:
+        """Return why no experiment can begin, whichever it is, or None."""
         if self._closed:
             return ENDING
-        stops_before = self._stop_count
-        # While an experiment runs the control loop refuses; a stopped arm must not be enabled on the way.
-        if self._control_loop.running is None:
-            reply = await self._robot.send(Enable())
-            if not reply.accepted:
-                return reply.refusal
-            with suppress(TimeoutError):
-                async with asyncio.timeout(ENABLED_WITHIN_S):
-                    while (state := await self._robot.next_state()).blocked:
-                        pass
-                    self._take_state(state)
-        if self._stop_count != stops_before:
-            return "it was stopped during its start"
         if self._actions.unlocking:
-            return "robot and gripper are being unlocked; wait for the end"
+            return UNLOCKING
+        return self._control_loop.start_refusal()
+
+    async def start(self, file: ExperimentFile, stops_before: int | None = None) -> str | None:
+        """Begin an experiment; return None, or why it cannot begin.
+
+        `stops_before` is the `stop_count` at the request, if the file was read since.
+        """
+        if self._closed:
+            return ENDING
+        stops_before = self._stop_count if stops_before is None else stops_before
+        refusal = None
+        # The control loop refuses while an experiment runs or a stop waits for the operator; a stopped arm must not be
+        # enabled on the way.
+        if self._stop_count == stops_before and self._control_loop.start_refusal() is None:
+            refusal = await self._enable()
+        if self._stop_count != stops_before:
+            if not self._closed:
+                self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
+            return STOPPED_AT_START
+        if refusal:
+            return refusal
+        if self._actions.unlocking:
+            return UNLOCKING
         return self._control_loop.start(file, self._clock.now_ns())
+
+    async def _enable(self) -> str | None:
+        """Let the arm move after a power-up, and take a state that shows it; return None, or why not."""
+        reply = await self._robot.send(Enable())
+        if not reply.accepted:
+            return reply.refusal
+        with suppress(TimeoutError):
+            async with asyncio.timeout(ENABLED_WITHIN_S):
+                while (state := await self._robot.next_state()).blocked:
+                    pass
+                self._take_state(state)
+        return None
 
     async def experiment_ended(self) -> Experiment:
         """Return the present or the next experiment once its end has been published, or another one has begun."""
@@ -237,8 +272,33 @@ class ControlLoopRunner:
         self._control_loop.acknowledge()
         return None
 
+    def release_refusal(self) -> str | None:
+        """Return why the operator cannot open the gripper now, or None.
+
+        The emergency stop, a torque beyond its limit and a stop that waits for `unlock` do not prevent it.
+        """
+        if self._closed:
+            return ENDING
+        if self._actions.unlocking:
+            return UNLOCKING
+        state = self._robot.state
+        if state is not None and not (state.rests and state.motion == "idle"):
+            return "the arm is moving; wait until it stands still, or stop it"
+        return self._control_loop.release_refusal()
+
+    async def release(self) -> str | None:
+        """Open the gripper on the operator's confirmed command; return None, or why not."""
+        if (reason := self.release_refusal()) is not None:
+            return reason
+        try:
+            await self._actions.open_by_operator()
+        except (ActionError, DriverError) as error:
+            return str(error)
+        self._control_loop.on_release_ended()
+        return None
+
     def stop_unlocking(self) -> bool:
-        """End an unlocking, and halt the fingers that it moves; return whether one was under way."""
+        """End an unlocking or a release, and halt the fingers that it moves; return whether one was under way."""
         stopped = self._actions.stop_unlocking()
         if stopped:
             # The robot's process ends its part.
@@ -384,7 +444,7 @@ class ActionExecutor:
 
     @property
     def unlocking(self) -> bool:
-        """Whether robot and gripper are being unlocked."""
+        """Whether robot and gripper are being unlocked, or the gripper is opened for the operator."""
         return self._unlocking is not None and not self._unlocking.done()
 
     def begin(self, action: Action) -> None:
@@ -406,15 +466,29 @@ class ActionExecutor:
 
     async def unlock(self) -> None:
         """Enable robot and gripper while no experiment runs; raises DriverError and ActionError."""
+        await self._by_operator("unlock", "unlocking", self._unlock)
+
+    async def open_by_operator(self) -> None:
+        """Open the gripper while no experiment runs; raises DriverError and ActionError."""
+        await self._by_operator("release", "the release", self._open)
+
+    async def _by_operator(self, command: str, name: str, act: Callable[[], Coroutine[Any, Any, None]]) -> None:
         if self.unlocking:
-            raise ActionError("unlocking is under way")
-        task = self._unlocking = asyncio.create_task(self._unlock(), name="unlock")
+            raise ActionError(UNLOCKING)
+        task = self._unlocking = asyncio.create_task(act(), name=command)
         # Nobody asks for a failure that comes after the caller was cancelled.
         task.add_done_callback(lambda done: done.cancelled() or done.exception())
         await asyncio.wait([task])
         if task.cancelled():
-            raise ActionError("unlocking was stopped; send `unlock` again")
+            raise ActionError(f"{name} was stopped; send `{command}` again")
         task.result()
+
+    async def _open(self) -> None:
+        if self.gripper is None:
+            raise ActionError("no gripper is configured")
+        self.fingers_move = True
+        await self.gripper.open_by_operator()
+        self.fingers_move = False
 
     async def _unlock(self) -> None:
         _accepted(await self.robot.send(Unlock()))

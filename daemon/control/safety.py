@@ -174,6 +174,20 @@ class FaultCode(Enum):
         "a step took longer than it may: {detail}.",
         "Check what delayed it; lengthen `timeout_s` of the step if it is too short.",
     )
+    STEP_FAILED = Rule(
+        _KEEP, "the experiment cannot continue: {detail}.", "Clear the cause, then `shearloop command unlock`."
+    )
+    OPERATOR_STOP = Rule(
+        _KEEP, "the operator stopped it: {detail}.", "`shearloop command unlock` allows the next start."
+    )
+    TOOL_GRIPPED = Rule(
+        Response.NOTE,
+        "the gripper still holds something: {detail}.",
+        "Secure it. Then `shearloop command release --yes` opens the gripper, and what it holds drops.",
+    )
+    DAEMON_ENDED = Rule(
+        _KEEP, "the daemon ended: {detail}.", "Look at the rig, then `shearloop command unlock` allows the next start."
+    )
 
     @property
     def text(self) -> str:
@@ -264,6 +278,12 @@ class SafetyMonitor:
         self._reset_timers()
         return SafetyDecision(Response.NOTE, active) if self._stop is None else self._with_stop(self._stop, active)
 
+    def stop(self, fault: Fault) -> None:
+        """Begin a stop that no input shows, such as an operator's; it keeps the grip, and a stronger one stays."""
+        begun = self._stop or SafetyDecision(Response.STOP_AND_KEEP_GRIP)
+        earlier = (one for one in begun.faults if one.code is not fault.code)
+        self._stop = SafetyDecision(begun.response, (*earlier, fault))
+
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command; a fault that persists stops again at the next judgement."""
         self._stop = None
@@ -273,6 +293,11 @@ class SafetyMonitor:
     def stopped(self) -> bool:
         """Whether a stop waits for the operator."""
         return self._stop is not None
+
+    @property
+    def stop_faults(self) -> tuple[Fault, ...]:
+        """The faults of the stop that waits for the operator; empty without one."""
+        return self._stop.faults if self._stop is not None else ()
 
     def _explain(self, active: tuple[Fault, ...], t_ns: int, *, held: bool) -> tuple[Fault, ...]:
         """Return the faults at t_ns with the explaining one first and its consequences marked; stops are never one."""

@@ -8,6 +8,8 @@ from shearloop.drivers.ur.messages import RobotState
 
 # A standstill that has not been measured by then stays unknown.
 LONGEST_NS = 5_000_000_000
+# The reply to the command is awaited for so long after the decision, if the arm stands earlier.
+REPLY_NS = 500_000_000
 
 
 class StopTimeline:
@@ -18,6 +20,9 @@ class StopTimeline:
         # A stop on its way, and when it was decided (CLOCK_MONOTONIC).
         self._stop: LoopStop | None = None
         self._decided_ns = 0
+        # When the reply came, and the first measurement of the present standstill.
+        self._sent_ns: int | None = None
+        self._stands_ns: int | None = None
 
     @property
     def pending(self) -> bool:
@@ -33,6 +38,7 @@ class StopTimeline:
         measured = [one.t_ns for one in decision.faults if one.t_ns is not None and not one.is_consequence]
         cause_ns = min(measured, default=now_ns) if self._requested_ns is None else self._requested_ns
         self._requested_ns, self._decided_ns = None, now_ns
+        self._sent_ns = self._stands_ns = None
         self._stop = LoopStop(
             source="loop",
             t_mono_ns=cause_ns,
@@ -47,21 +53,29 @@ class StopTimeline:
     def on_sent(self, now_ns: int) -> None:
         """Take the reply of the robot's process to the stop."""
         stop = self._stop
-        if stop is not None and stop.sent_after_s is None:
+        if stop is not None and self._sent_ns is None:
+            self._sent_ns, self._stands_ns = now_ns, None
             self._stop = replace(stop, sent_after_s=(now_ns - stop.t_mono_ns) / 1e9)
 
     def update(self, robot: RobotState | None, now_ns: int) -> LoopStop | None:
-        """Return the whole stop once, when a state after the decision shows the arm at rest, or after `LONGEST_NS`."""
+        """Return the whole stop once, when a state after the command shows the arm at rest, or after `LONGEST_NS`.
+
+        Without a reply to the command, a state after the decision counts.
+        """
         stop, self._requested_ns = self._stop, None
         if stop is None:
             return None
         measured_ns = now_ns if robot is None else robot.t_mono_ns - robot.age_ns
-        if robot is not None and robot.rests and measured_ns >= self._decided_ns:
-            self._stop = None
-            return replace(stop, stands_after_s=(measured_ns - stop.t_mono_ns) / 1e9)
-        return self.end() if now_ns - self._decided_ns > LONGEST_NS else None
+        since_ns = self._decided_ns if self._sent_ns is None else self._sent_ns
+        if robot is not None and measured_ns >= since_ns:
+            self._stands_ns = (self._stands_ns or measured_ns) if robot.rests else None
+        awaits_reply = self._sent_ns is None and now_ns - self._decided_ns <= REPLY_NS
+        known = self._stands_ns is not None and not awaits_reply
+        return self.end() if known or now_ns - self._decided_ns > LONGEST_NS else None
 
     def end(self) -> LoopStop | None:
         """Return what is known of a stop whose standstill is not awaited any longer."""
         stop, self._stop = self._stop, None
-        return stop
+        if stop is None or self._stands_ns is None:
+            return stop
+        return replace(stop, stands_after_s=(self._stands_ns - stop.t_mono_ns) / 1e9)

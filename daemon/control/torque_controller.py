@@ -34,7 +34,7 @@ from statistics import fmean
 import numpy as np
 
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 
 # The ramp does not catch up when the loop was late for longer than this.
 LONGEST_STEP_NS = 50_000_000

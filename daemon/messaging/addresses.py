@@ -2,12 +2,15 @@
 
 import errno
 import ipaddress
+import os
 import socket
 from urllib.parse import urlsplit
 
 PUBLISH_ADDRESS = "tcp://127.0.0.1:7761"
 COMMAND_ADDRESS = "tcp://127.0.0.1:7762"
 LARGEST_PORT = 65535
+# Bytes of a Unix socket's path (unix(7)).
+LONGEST_IPC = 107
 # A running daemon answers within milliseconds.
 COMMAND_TIMEOUT_S = 2.0
 # The robot may have to power up, release its brakes and start its program, and the gripper to activate.
@@ -28,6 +31,14 @@ def is_local(address: str) -> bool:
         return False
 
 
+def is_loopback_host(host: str) -> bool:
+    """Return whether a host's name or address is this computer itself."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
 def has_valid_port(address: str) -> bool:
     """Return whether a tcp address ends in a port, or in `*` for any free port; other addresses need no port.
 
@@ -39,12 +50,22 @@ def has_valid_port(address: str) -> bool:
     return port.isascii() and port.isdecimal() and len(port) <= len(str(LARGEST_PORT)) and int(port) <= LARGEST_PORT
 
 
+def names_localhost(address: str) -> bool:
+    """Return whether a tcp address has the name `localhost`, which a socket cannot be bound to."""
+    return address.startswith("tcp://") and urlsplit(address).hostname == "localhost"
+
+
+def ipc_size(address: str) -> int:
+    """Return the bytes of an ipc address's path; 0 for other addresses."""
+    return len(os.fsencode(address.removeprefix("ipc://"))) if address.startswith("ipc://") else 0
+
+
 def needs_keys(address: str) -> bool:
     """Return whether a client needs keys for an address, because it is on another machine.
 
     A client may use the name `localhost`. A server may not bind to it.
     """
-    return address.startswith("tcp://") and urlsplit(address).hostname != "localhost" and not is_local(address)
+    return address.startswith("tcp://") and not names_localhost(address) and not is_local(address)
 
 
 def probe(path: str) -> int:

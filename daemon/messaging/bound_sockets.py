@@ -16,10 +16,10 @@ from typing import Any
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, is_local, network_refusal, probe
 from shearloop.daemon.messaging.keys import ZAP_DOMAIN, KeyPair
 from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.errors import UserError
 
 # Clients of one socket. Each takes a descriptor and some 50 kB.
 MAX_CONNECTIONS, MIN_CONNECTIONS = 256, 16

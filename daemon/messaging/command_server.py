@@ -38,7 +38,11 @@ Handler: TypeAlias = Callable[[Request], Awaitable[Reply]]
 
 
 class CommandRefusedError(Exception):
-    """A command is refused; the message is the reason that the operator reads."""
+    """A command is refused; the message is the reason that the operator reads, and `facts` are for his program."""
+
+    def __init__(self, reason: str, **facts: bool) -> None:
+        super().__init__(reason)
+        self.facts = facts
 
 
 class RateLimit:
@@ -96,7 +100,7 @@ class RequestExecutor:
         try:
             reply = await self._handlers[name](request)
         except CommandRefusedError as error:
-            return self._refuse(f"{name} refused", str(error), frequent=name == STOP)
+            return {**self._refuse(f"{name} refused", str(error), frequent=name == STOP), **error.facts}
         except Exception as error:
             # A bug in one handler must not stop the server.
             log.exception("command failed", command=name)

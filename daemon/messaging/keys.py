@@ -21,8 +21,8 @@ from zmq.auth.base import Authenticator
 from zmq.auth.certs import load_certificate
 from zmq.utils import z85
 
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
+from shearloop.errors import UserError
 
 # The unit's `SetCredential` gives this value until the server key exists.
 _NO_CREDENTIAL = "none"

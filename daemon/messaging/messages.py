@@ -8,6 +8,7 @@ A message has two ZeroMQ frames: the topic and a msgpack map. Scalars are plain 
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, ClassVar, TypeAlias, TypeVar, dataclass_transform
 
 import msgpack
@@ -68,7 +69,7 @@ class EitFrame(Message):
     frame: int = column("", "number of the frame since the daemon began")
     age_s: float = column("s", "from the middle of the acquisition to the arrival of the last byte")
     saturated: int = column("", "channels at the converter's full scale")
-    dead: int = column("", "channels unchanged for many frames")
+    dead: int = column("", "channels that read 0, or the same for 200 frames")
     repeated: bool = column("", "whether the line equals the one before it exactly")
 
 
@@ -82,7 +83,7 @@ class EitEstimate(Message):
     diameter_mm: float | None = column("mm", "diameter of the tool, from the fingertip alone")
     diameter_low_mm: float | None = column("mm", "lower end of its 95 % interval")
     diameter_high_mm: float | None = column("mm", "upper end of its 95 % interval")
-    k: float | None = column("cm", "k of the best-matching cell; in rad/cm for modulated_gaussian")
+    k: float | None = column("cm or rad/cm", "k of the best-matching cell; in rad/cm for modulated_gaussian")
     sigma: float | None = column("cm", "σ of the best-matching cell")
     score: float | None = column("", "normalised cross-correlation of the best cell, 0 to 1")
     runner_up: float | None = column("", "score of the best cell away from the best one")
@@ -115,8 +116,8 @@ class EitHeatmap(Message):
     """The scores of all cells for one frame, NaN for invalid cells; sent while there is a subscriber, or always."""
 
     scores: NDArray[np.floating] = column("", "score of each cell, k by sigma")
-    k_low: float = column("cm", "first k of the grid; in rad/cm for modulated_gaussian")
-    k_high: float = column("cm", "last k of the grid")
+    k_low: float = column("cm or rad/cm", "first k of the grid; in rad/cm for modulated_gaussian")
+    k_high: float = column("cm or rad/cm", "last k of the grid")
     sigma_low: float = column("cm", "first sigma of the grid")
     sigma_high: float = column("cm", "last sigma of the grid")
     model: str = column("", "basis model of the bank, which defines k and sigma")
@@ -246,6 +247,8 @@ class Health(Message):
     tasks: Mapping[str, Mapping[str, Scalar | Mapping[str, int]]] = column(
         "", "per task: alive, done, restarts, rate_hz, expected_hz, errors by kind, and the latest error in a sentence"
     )
+    emulated: bool = column("", "whether every device is emulated, by `emulated: true` in the configuration")
+    tare_refusal: str = column("", "why `tare` is refused now, in a sentence; empty when it is not")
     loop_lag_s: float = column("s", "how late the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")
     cpu_percent: float = column("%", "of one core since the message before")
@@ -257,6 +260,14 @@ class DaemonEnd(Message):
 
     finished: bool = column("", "whether the experiment of `stop_when_done` is done; true without one")
     summary: str = column("", "summary of the last experiment, in lines; empty without one")
+
+
+@cache
+def units(topic: str) -> Mapping[str, str]:
+    """Return the unit of each key of a topic that has one; empty for an unknown topic."""
+    fields = dataclasses.fields(TOPICS[topic]) if topic in TOPICS else ()
+    envelope = {"timestamp": "s", "t_mono_ns": "ns"} if topic in TOPICS else {}
+    return {**envelope, **{item.name: item.metadata["unit"] for item in fields if item.metadata.get("unit")}}
 
 
 def stale_after_s(topic: str) -> float:

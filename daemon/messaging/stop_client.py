@@ -7,7 +7,7 @@ from typing import Any
 
 import msgpack
 
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 
 # Of the socket's name; a whole name has at most 107 bytes (unix(7)).
 _NAME_BYTES = 80

@@ -8,23 +8,25 @@ from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 
 import numpy as np
+import structlog
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Adaptation, Estimate, Measured, torque_at
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
+from shearloop.errors import ActionError
+from shearloop.estimation import Adaptation, Estimate, Measured, torque_at
 from shearloop.words import counted
 
 # Largest distance in time of a pair of frames, as a share of the frame period.
@@ -295,6 +297,23 @@ class FingertipStates:
             self._combined.record_state(now_ns)
 
 
+class DeadElectrodes:
+    """What the dead channels of the latest frame have in common; each electrode is logged once."""
+
+    def __init__(self) -> None:
+        # Of the latest frame; empty without a dead electrode.
+        self.sentence = ""
+        self._logged: set[str] = set()
+
+    def update(self, source: str, table: ChannelTable, dead: BoolArray) -> None:
+        """Take the (c,) dead channels of a frame."""
+        names = table.name_dead(dead) if dead.any() else []
+        self.sentence = f"dead channels: {', '.join(names)}; press its connector on, and wet the gel" if names else ""
+        if not self._logged.issuperset(names):
+            self._logged.update(names)
+            structlog.get_logger().bind(device=source).warning(self.sentence)
+
+
 @dataclass(frozen=True, slots=True)
 class FingertipTask:
     """Reads one board, estimates from each frame, and publishes both; `combined` also needs the frames.
@@ -308,6 +327,7 @@ class FingertipTask:
     combined: CombinedFingertips | None = None
     always_heatmap: bool = False
     states: FingertipStates | None = None
+    dead_electrodes: DeadElectrodes = field(default_factory=DeadElectrodes)
 
     async def run(self) -> None:
         """Process every frame until cancelled."""
@@ -325,16 +345,18 @@ class FingertipTask:
         if self.combined is not None:
             await self.combined.process_pairs()
         self.publisher.publish(frame_message(self.pipeline.name, frame))
+        self.dead_electrodes.update(self.pipeline.name, self.pipeline.estimator.table, frame.dead)
         if self.always_heatmap or self.publisher.has_subscriber(EitHeatmap.topic):
             await self._publish_heatmap(frame)
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
         board = self.board.diagnostics()
+        errors = (self.dead_electrodes.sentence, str(board["last_refusal"]))
         return {
             **board,
             "rate_hz": board["measured_hz"],
-            "error": board["last_frame_error"] if board["connected"] else board["last_loss"],
+            "error": "; ".join(filter(None, errors)) if board["connected"] else board["last_loss"],
             "estimates": self.pipeline.count,
         }
 

@@ -10,22 +10,22 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.defaults import MAX_GAP_S
-from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import PAPER_TABLE, ChannelTable
-from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
+from shearloop.bank.bank_file import Bank
+from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, TactileFrame
-from shearloop.bank.estimation.bank_match import PaperMatcher
-from shearloop.bank.estimation.estimator import PaperEstimator
-from shearloop.bank.estimation.session import REPEATED_FRAME
+from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.daemon.sensing.skin_task import skin_torque_source
 from shearloop.drivers.eit_kit import Frame
+from shearloop.errors import UserError
+from shearloop.estimation import Calibration, Estimate, EstimatorSession, TactileFrame
+from shearloop.estimation.bank_match import PaperMatcher
+from shearloop.estimation.defaults import MAX_GAP_S
+from shearloop.estimation.estimator import PaperEstimator
+from shearloop.estimation.session import REPEATED_FRAME
 
 # Source of the estimate from several fingertips together.
 COMBINED = "combined"
@@ -101,7 +101,7 @@ class FrameEstimator:
         """
         channels, usable, t_ns = [], [], 0
         for frame in frames:
-            if frame.repeated:
+            if frame.repeated and frame.channels.any():
                 return Estimate(valid=False, reasons=REPEATED_FRAME)
             channels.append(frame.channels)
             usable.append(~(frame.saturated | frame.dead))

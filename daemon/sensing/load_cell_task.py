@@ -20,6 +20,11 @@ LOAD_CELL = "load_cell"
 ZERO_SAMPLES = 22
 # An HX711 settles within four conversions (data sheet, "Output settling time": 400 ms at 10 a second, 50 ms at 80).
 SETTLING_PERIODS = 4
+# Why counts are no torque, and the cure.
+COUNTS_REASON = (
+    "the board sends counts and has no calibration; run `shearloop calibrate load` and name its file as "
+    "`load_cell.calibration`"
+)
 # A zero takes two seconds; with a slower board twice the time of its readings.
 ZERO_TIMEOUT_S = 15.0
 
@@ -49,7 +54,7 @@ class LoadCellTask:
         self._zero_from_ns = self._zero_until_ns = 0
         self._zero_error: str | None = None
         self._sampled = asyncio.Event()
-        self._reason = ""
+        self._latest: LoadSample | None = None
 
     async def run(self) -> None:
         """Publish every sample and pass it on, until cancelled."""
@@ -57,10 +62,10 @@ class LoadCellTask:
             async for sample in samples:
                 message = load_message(sample)
                 self._publisher.publish(message)
-                self._reason = message.reason
+                self._latest = sample
                 if self._loop is not None:
                     torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
-                    self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, self._reason, sample.t_mid_ns, now_ns))
+                    self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, message.reason, sample.t_mid_ns, now_ns))
                 self._take_zero(sample)
                 if self._inputs is not None and self._inputs.wants_state and not self._board.unread:
                     record_state(self._inputs, {"parser": self._board.parser}, {}, self._clock.now_ns())
@@ -95,11 +100,13 @@ class LoadCellTask:
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the board's values for `health`."""
         found = self._board.diagnostics()
-        error = (self._zero_error or "") if found["connected"] else found["last_loss"]
+        counts = COUNTS_REASON if self._latest is not None and self._latest.counts else ""
+        own = self._zero_error or counts or found["last_refusal"]
+        error = own if found["connected"] else found["last_loss"]
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
     def _not_taken(self, within_s: float) -> str:
-        reason = self._reason or "no usable reading came"
+        reason = (_reason(self._latest) if self._latest is not None else "") or "no usable reading came"
         return f"the load cell's zero could not be taken within {within_s:.3g} s: {reason}"
 
     def _take_zero(self, sample: LoadSample) -> None:
@@ -135,9 +142,11 @@ def _reason(sample: LoadSample) -> str:
     """Return why a reading is not trusted, or an empty text."""
     if sample.trusted:
         return ""
+    if sample.counts and not sample.saturated:
+        return COUNTS_REASON
     flags = {
         "at the end of its range": sample.saturated,
-        "further from the last one than the rig can move": sample.spike,
+        "further from the last one than the rig can move": sample.spike and not sample.counts,
         "the same for two seconds": sample.stuck,
         "perhaps the end of a longer line": sample.partial,
     }

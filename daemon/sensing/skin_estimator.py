@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 # scipy.stats would cost the daemon 40 MB and half of its start-up time.
 from scipy.special import chdtri
 
-from shearloop.bank.skin.calibration import DirectionFinder, ForceFollower, SkinCalibration
-from shearloop.bank.skin.membrane import Direction, ShearInterval
 from shearloop.drivers.defaults import DRIFT_PER_HOUR
 from shearloop.drivers.shear_skin.skin import SkinSample
+from shearloop.estimation.skin.calibration import DirectionFinder, ForceFollower, SkinCalibration
+from shearloop.estimation.skin.membrane import Direction, ShearInterval
 
 # A larger deviation of the slack gauge from the calibration makes the zero invalid.
 MAX_DEVIATION = 0.02

@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
-from shearloop.bank.skin.membrane import joule_heating_k
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
@@ -38,6 +35,9 @@ from shearloop.drivers.shear_skin.instruments import (
     read_scan,
 )
 from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, ShearSkin, SkinSample
+from shearloop.errors import UserError
+from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
+from shearloop.estimation.skin.membrane import joule_heating_k
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.
@@ -134,11 +134,11 @@ class SkinTask:
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values of voltages, zero and force for `health`."""
-        zero = self._estimator.zero
+        zero, voltages = self._estimator.zero, self._skin.diagnostics()
         return {
-            **self._skin.diagnostics(),
+            **voltages,
             "valid": self._valid,
-            "error": self._reason,
+            "error": self._reason or str(voltages.get("last_refusal", "")),
             "zero_1_ohm": zero.r1_ohm if zero is not None else None,
             "zero_2_ohm": zero.r2_ohm if zero is not None else None,
             "drift_per_hour": self._estimator.drift_per_hour,

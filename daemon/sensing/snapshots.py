@@ -19,7 +19,7 @@ import structlog
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
 # Whose objects have a state. The bank's are large, and follow from the configuration.
-_ROOMS = ("shearloop.bank.", "shearloop.drivers.", "shearloop.daemon.sensing.")
+_ROOMS = ("shearloop.bank.", "shearloop.estimation.", "shearloop.drivers.", "shearloop.daemon.sensing.")
 _PLAIN = (bool, int, float, str, type(None))
 _CONTAINERS = (list, dict, tuple, deque, Counter)
 # The key of a value that is not plain JSON.

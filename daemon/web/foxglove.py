@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from shearloop.daemon.errors import UserError, require
 from shearloop.daemon.messaging.messages import TOPICS
-from shearloop.daemon.recording import schema
+from shearloop.daemon.recorder import schema
+from shearloop.errors import UserError, require
 
 
 class FoxgloveServer(AbstractContextManager["FoxgloveServer", None]):

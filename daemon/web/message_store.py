@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic_core import to_json
 
-from shearloop.bank.eit.matching import best_match
-from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import MatchingError
+from shearloop.bank.matching import best_match
+from shearloop.bank.models import MODELS
 from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, DaemonEnd, EitEstimate, EitHeatmap
 
 # Pairs of topic and source. A rig has nine topics and two fingertips.
@@ -109,7 +109,8 @@ class MessageStore:
         """Return values that the page draws and does not compute itself."""
         if topic == EitHeatmap.topic:
             self._models[source] = str(content.get("model", ""))
-            return {"peaks": _peaks(content.get("scores"))}
+            known = MODELS.get(self._models[source])
+            return {"peaks": _peaks(content.get("scores")), "k_unit": known.k_unit if known is not None else ""}
         k, sigma = content.get("k"), content.get("sigma")
         if topic == EitEstimate.topic and isinstance(k, float) and isinstance(sigma, float):
             model = self._models.get(source, "")

@@ -24,8 +24,7 @@ import zmq
 import zmq.asyncio
 from aiohttp import WSCloseCode, web
 
-from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.daemon.errors import UserError
+from shearloop.bank.fingertip import Fingertip
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.client import ask, connect
@@ -34,6 +33,7 @@ from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.message_store import MessageStore
+from shearloop.errors import UserError
 
 HOST = "127.0.0.1"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
@@ -44,7 +44,11 @@ SHUTDOWN_S = 1.0
 # A daemon that ends together with the viewer is still shown as ended.
 LAST_MESSAGES_S = 0.1
 # Commands that move something, or change what moves it.
-NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock")
+NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock", "release")
+# Those that the page asks about first, with the daemon's question.
+ASKED = ("start", "release")
+# Those that take long.
+SLOW = ("unlock", "release")
 # Wrong tokens that are compared at once, and then per second.
 WRONG_BURST, WRONG_PER_S = 20.0, 1.0
 # Maximum redraw rate of a page.
@@ -136,9 +140,11 @@ class Bridge:
         finally:
             self._socket.unsubscribe(messages.EitHeatmap.topic)
 
-    async def command(self, name: str) -> dict[str, Any]:
+    async def command(self, name: str, **arguments: bool) -> dict[str, Any]:
         """Return the daemon's reply to a command; raise UserError without a reply."""
-        return await self._request({"command": name}, UNLOCK_TIMEOUT_S if name == "unlock" else COMMAND_TIMEOUT_S)
+        return await self._request(
+            {"command": name, **arguments}, UNLOCK_TIMEOUT_S if name in SLOW else COMMAND_TIMEOUT_S
+        )
 
     async def stop(self) -> dict[str, Any]:
         """Return the daemon's reply to a stop of all motion; simultaneous calls share one request.
@@ -314,7 +320,9 @@ class _Page:
         refusal = self._tokens.refusal(name, request.headers.get("Authorization"), time.monotonic_ns())
         if refusal is not None:
             return self._refuse(*refusal)
-        return await self._reply(name, self._bridge.command(name))
+        # The first press asks, the second one confirms.
+        confirmed = {"confirmed" if "confirmed" in request.query else "ask": True} if name in ASKED else {}
+        return await self._reply(name, self._bridge.command(name, **confirmed))
 
     async def _reply(self, name: str, requested: Awaitable[dict[str, Any]]) -> web.Response:
         try:
@@ -322,7 +330,8 @@ class _Page:
         except UserError as error:
             return self._refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
-        content = {key: reply[key] for key in ("ok", "reason", "stopped", "tared", "experiment") if key in reply}
+        keys = ("ok", "reason", "stopped", "tared", "experiment", "question")
+        content = {key: reply[key] for key in keys if key in reply}
         return web.json_response(content, status=200 if reply.get("ok") else 409)
 
     async def stream(self, request: web.Request) -> web.StreamResponse:

@@ -1,1 +1,1 @@
-"""The Robotiq 2F-140 gripper, over the URCap's socket on the robot's controller or over Modbus RTU on USB."""
+"""The Robotiq grippers 2F-85, 2F-140 and Hand-E: the URCap's socket on the controller, or Modbus RTU on USB."""

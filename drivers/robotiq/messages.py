@@ -1,13 +1,11 @@
-"""Requests to the gripper, its status registers, states and faults (instruction manual of the 2F-140)."""
+"""Requests to the gripper, its status registers, states and faults (instruction manuals of the 2F and the Hand-E)."""
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.robotiq.models import FORCES_N, SPEEDS_MM_S
 
-# The manual's specifications.
-SPEED_MIN_MM_S, SPEED_MAX_MM_S = 30.0, 250.0
-FORCE_MIN_N, FORCE_MAX_N = 10.0, 125.0
 MA_PER_COUNT = 10.0
 # From this fault code on the gripper takes no command before a new activation: a rising edge of ACT.
 FIRST_MAJOR_CODE = 10
@@ -119,11 +117,11 @@ Request = GripperAction | GripperMove
 
 @dataclass(frozen=True, slots=True)
 class GripperCommand:
-    """A target width, a speed, and the largest force."""
+    """A target width, a speed, and the largest force; by default as fast and as gently as the model can."""
 
     width_mm: float
-    speed_mm_s: float = SPEED_MAX_MM_S
-    force_n: float = FORCE_MIN_N
+    speed_mm_s: float = SPEEDS_MM_S[1]
+    force_n: float = FORCES_N[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ import asyncio
 from shearloop.drivers.connection import TcpPort
 from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError, system_reason
+from shearloop.drivers.refused_lines import shown
 from shearloop.drivers.robotiq import messages
 
 # A reply takes some milliseconds; the controller serves the socket with a low priority.
@@ -130,6 +131,9 @@ class SocketClient:
         for line in set_lines(request):
             await self._ask(line)
 
+    def _came_instead(self) -> str:
+        return f", only {shown(self._received)}" if self._received else ""
+
     async def _ask(self, line: str) -> str:
         """Send a line and return the value asked for, or `ack`."""
         connection = self._connection
@@ -146,7 +150,7 @@ class SocketClient:
                 if received is None:
                     raise DeviceLostError(
                         f"The gripper's socket at {self.name} gave no whole answer to {line!r} within "
-                        f"{self._deadline_s:g} s."
+                        f"{self._deadline_s:g} s{self._came_instead()}; check that the URCap runs."
                     )
                 self._received += received.data
         except BaseException:

@@ -24,6 +24,7 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
 )
 from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
+from shearloop.drivers.refused_lines import shown
 from shearloop.drivers.serial_sensor import (
     InputKind,
     InputRecorder,
@@ -184,16 +185,25 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             left_s = (until_ns - monotonic_ns()) / 1e9
             received = await self._port.read(left_s) if left_s > 0 else None
             if received is None:
-                raise DeviceSilentError(
-                    f"{self.instrument} at {self._port.path} has not answered {query!r} within {self.timeout_s:.2g} "
-                    "s; see that it is on, and that baud rate and line end are as configured."
-                )
+                raise DeviceSilentError(self._no_answer(query))
             replies, arrival_ns = split_replies(self._lines, received.data), received.t_arrival_ns
         reply = Reply(replies[0], asked_ns, arrival_ns)
         if self.inputs is not None:
             self.inputs.record(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
             self.inputs.record(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
         return reply
+
+    def _no_answer(self, query: str) -> str:
+        where = f"{self.instrument} at {self._port.path}"
+        if came := self._lines.partial or (self._lines.too_long_start if self._lines.dropping else b""):
+            return (
+                f"{where} answered {query!r} with {shown(came)} and no line end within {self.timeout_s:.2g} s; see "
+                "that baud rate and line end are as configured, and that it is this instrument."
+            )
+        return (
+            f"{where} has not answered {query!r} within {self.timeout_s:.2g} s; see that it is on, and that baud rate "
+            "and line end are as configured."
+        )
 
     async def _check(self) -> None:
         """Raise ProtocolError if the instrument rejected a command."""
@@ -391,6 +401,8 @@ class ScpiScanner(PolledInstrument[Voltages]):
 class PairParser(LineParser[Voltages]):
     """Turns a converter board's bytes into voltages."""
 
+    board = "skin's converter board"
+
     def __init__(self, rate_hz: float = DAQ_RATE_HZ, full_scale_v: float = ADC_FULL_SCALE_V) -> None:
         super().__init__(_PAIR, MAX_PAIR_BYTES, ADC_BAUD, rate_hz)
         self._end_v = _END_OF_RANGE * full_scale_v
@@ -417,17 +429,12 @@ class AdcBoard(SerialSensor[Voltages]):
         inputs: InputRecorder | None = None,
     ) -> None:
         self.period_s = 1.0 / rate_hz
-        self._parser = PairParser(rate_hz, full_scale_v)
-        super().__init__(link, self.period_s, self._parser.handle, inputs)
-
-    @property
-    def parser(self) -> PairParser:
-        """What turns its bytes into voltages."""
-        return self._parser
+        self._pair_parser = PairParser(rate_hz, full_scale_v)
+        super().__init__(link, self.period_s, self._pair_parser, inputs)
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        return {**super().diagnostics(), "lines": self._parser.count, "errors": self._parser.errors}
+        return {**super().diagnostics(), "lines": self._pair_parser.count, "errors": self._pair_parser.errors}
 
 
 Daq: TypeAlias = ScpiScanner | AdcBoard

@@ -13,8 +13,7 @@ from collections.abc import Callable
 import rtde_control
 import script_client
 
-from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge, ScriptReadiness, ask_dashboard
+from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge, ScriptReadiness, command_dashboard
 from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeSample, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_S, guard_script
 from shearloop.drivers.ur.settings import UrSettings
@@ -156,11 +155,9 @@ class UrArm:
         self._script_readiness.command_sent()
         return done
 
-    def ask_dashboard(self, *requests: str) -> None:
-        """Send requests to the dashboard; DriverError if the controller refuses to unlock or does not answer."""
-        answers = ask_dashboard(self._settings.host, 2.5, requests)
-        if requests == ("unlock protective stop",) and answers != ["Protective stop releasing"]:
-            raise DriverError(f"The controller refused: {answers[0]}")
+    def ask_dashboard(self, *requests: str) -> str:
+        """Have the dashboard carry out requests; return and raise as `command_dashboard` does."""
+        return command_dashboard(self._settings.host, 2.5, requests)
 
 
 def _set_timer_slack(slack_ns: int) -> None:

@@ -58,6 +58,8 @@ class Recovery:
         self._timeout_s = timeout_s
         self._asked_ns: dict[str, int] = {}
         self._cleared = self._uploaded = False
+        # The controller's latest refusal of a request that could be done without.
+        self._answered = ""
         # Whether the attempt has succeeded, or why it has ended otherwise.
         self.ready = False
         self.refusal: str | None = None
@@ -75,8 +77,9 @@ class Recovery:
         """Do the step that is due in this cycle, unless the sample is old; return whether the attempt has ended."""
         if self.refusal is None and now_ns > self._deadline_ns:
             self.refusal = (
-                f"The robot did not get ready within {self._timeout_s:g} s (robot mode {sample.robot_mode}, safety "
-                f"mode {sample.safety_mode}, program state {sample.runtime_state}): look at the teach pendant."
+                f"The robot did not get ready within {self._timeout_s:g} s (robot mode: {sample.robot_mode_name}, "
+                f"safety mode: {sample.safety_mode_name}, program: {sample.runtime_name}). {self._answered}Look at the "
+                "teach pendant."
             )
         if self.refusal is None and recent:
             try:
@@ -122,7 +125,9 @@ class Recovery:
             if "unlock protective stop" not in self._asked_ns:
                 self._ask_dashboard(now_ns, "unlock protective stop")
         elif not safe:
-            self.refusal = f"Safety mode {sample.safety_mode} cannot be cured from here: look at the pendant."
+            self.refusal = (
+                f"The safety mode “{sample.safety_mode_name}” cannot be cured from here: look at the pendant."
+            )
         else:
             self._close_popups(now_ns)
             if sample.robot_mode == ROBOT_MODE_POWER_OFF:
@@ -135,8 +140,8 @@ class Recovery:
             self._ask_dashboard(now_ns, "close popup", "close safety popup")
 
     def _ask_dashboard(self, now_ns: int, *requests: str) -> None:
-        if self._is_due(requests[0], now_ns):
-            self._arm.ask_dashboard(*requests)
+        if self._is_due(requests[0], now_ns) and (refused := self._arm.ask_dashboard(*requests)):
+            self._answered = f"{refused}. "
 
     def _is_due(self, step: str, now_ns: int) -> bool:
         """Return whether a step is due, and note that it is taken: the robot may not follow a request at once."""

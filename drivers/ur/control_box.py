@@ -5,12 +5,13 @@ check the answer to its protocol request and waits without a limit for a silent 
 """
 
 import math
+import re
 import select
 import socket
 import struct
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,7 +19,27 @@ from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
 
-RTDE_PORT, DASHBOARD_PORT = 30004, 29999
+RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
+# The services behind the ports, as PolyScope's menu names them.
+SERVICES: Final = {RTDE_PORT: "RTDE", SCRIPT_PORT: "Real-Time Client", DASHBOARD_PORT: "Dashboard Server"}
+# From this version on an e-Series serves only what is enabled.
+FIRST_WITH_SERVICES: Final = (5, 10)
+SERVICES_MENU: Final = "Settings → Security → Services"
+REMOTE_CURE: Final = (
+    "switch it to remote control, top right on the teach pendant (enable that first under Settings → System → Remote "
+    "Control)"
+)
+# The dashboard's answer to a request that it carries out (UR's page "Dashboard Server e-Series").
+_CARRIED_OUT: Final = {
+    "unlock protective stop": "Protective stop releasing",
+    "power on": "Powering on",
+    "brake release": "Brake releasing",
+    "stop": "Stopped",
+    "close popup": "closing popup",
+    "close safety popup": "closing safety popup",
+}
+# Without these the arm does not get ready.
+_INDISPENSABLE: Final = ("unlock protective stop", "power on", "brake release")
 SCRIPT_READY: Final = 1
 HEADER: Final = struct.Struct(">HB")
 _PROTOCOL, _CONTROLLER_VERSION, _OUTPUTS, _INPUTS, _START, _DATA = b"VvOISU"
@@ -141,6 +162,79 @@ def ask_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> lis
     return answers
 
 
+def command_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> str:
+    """Have the dashboard server carry out requests; return its refusal of one that can be done without, else nothing.
+
+    Raises DriverError with the controller's own words where it refuses an indispensable one, or any in local control,
+    and where it is absent or silent.
+    """
+    answers = ask_dashboard(host, timeout_s, requests)
+    refused = {
+        request: answer
+        for request, answer in zip(requests, answers, strict=True)
+        if answer.lower() != _CARRIED_OUT[request].lower()
+    }
+    if not refused:
+        return ""
+    request = next((one for one in refused if one in _INDISPENSABLE), next(iter(refused)))
+    said = f"The controller answered “{refused[request]}” to `{request}`"
+    (remote,) = ask_dashboard(host, timeout_s, ("is in remote control",))
+    if remote.lower() == "false":
+        raise DriverError(f"The robot is in local control: {REMOTE_CURE}. {said}.")
+    if request in _INDISPENSABLE:
+        raise DriverError(f"{said}: look at the teach pendant, then unlock again.")
+    return said
+
+
+def probe_ports(host: str, timeout_s: float) -> dict[int, str]:
+    """Return why each of the controller's ports cannot be reached; empty texts for those that are open."""
+    found: dict[int, str] = {}
+    for port in SERVICES:
+        try:
+            with socket.create_connection((host, port), timeout_s):
+                found[port] = ""
+        except TimeoutError:
+            # Nobody is there; each further port would take as long.
+            return {**dict.fromkeys(SERVICES, "no answer"), **found}
+        except OSError as error:
+            found[port] = system_reason(error)
+    return found
+
+
+def check_ports(host: str, timeout_s: float) -> None:
+    """Raise RobotLostError, with the menu, where a controller is there and does not serve every port that is needed."""
+    found = probe_ports(host, timeout_s)
+    closed = [port for port, reason in found.items() if reason]
+    if closed and len(closed) < len(found):
+        raise RobotLostError("unreachable", closed_ports_sentence(host, closed, _known_version(host, timeout_s)))
+
+
+def closed_ports_sentence(host: str, closed: Sequence[int], version: tuple[int, ...]) -> str:
+    """Return which ports are closed at a controller of this version, empty if unknown, and where to open them."""
+    names = " and ".join(f"{port} ({SERVICES[port]})" for port in closed)
+    refuses = f"The controller at {host} does not serve {'port' if len(closed) == 1 else 'the ports'} {names}"
+    enable = f"enable {' and '.join(SERVICES[port] for port in closed)} under {SERVICES_MENU}"
+    if not version:
+        older = "a CB3 or an older version always serves them: look for a firewall"
+        return f"{refuses}; on an e-Series from PolyScope 5.10 on, {enable} ({older})."
+    if version >= FIRST_WITH_SERVICES:
+        return f"{refuses}; {enable}."
+    series = "a CB3" if version[0] == 3 else f"PolyScope {'.'.join(map(str, version))}"
+    return f"{refuses}; {series} has no menu for them: wait until it has started, and look for a firewall between."
+
+
+def _known_version(host: str, timeout_s: float) -> tuple[int, ...]:
+    """Return the major and minor version that the dashboard server or RTDE tells; empty where neither does."""
+    with suppress(DriverError):
+        (answer,) = ask_dashboard(host, timeout_s, ("PolyscopeVersion",))
+        if found := re.search(r"(\d+)\.(\d+)", answer):
+            return int(found[1]), int(found[2])
+    with suppress(DriverError):
+        major, minor, *_ = probe_controller(host, timeout_s).split(".")
+        return int(major), int(minor)
+    return ()
+
+
 @contextmanager
 def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None]:
     """Turn a failed or unanswered exchange with the controller into a RobotLostError."""
@@ -153,15 +247,31 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
         raise RobotLostError(
             "unreachable",
             f"No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its "
-            "network (Settings → System → Network at the teach pendant).",
+            f"network (Settings → System → Network at the teach pendant){_all_refused_hint(error)}.",
         ) from error
 
 
 @contextmanager
 def _connected(host: str, port: int, timeout_s: float, activity: str) -> Iterator[socket.socket]:
     """Connect to a port of the controller until the end of the block."""
-    with explain_failure(host, timeout_s, activity), socket.create_connection((host, port), timeout_s) as connection:
-        yield connection
+    with explain_failure(host, timeout_s, activity):
+        try:
+            connection = socket.create_connection((host, port), timeout_s)
+        except ConnectionRefusedError as error:
+            closed = [number for number, reason in probe_ports(host, timeout_s).items() if reason]
+            if len(closed) == len(SERVICES):
+                raise
+            # Without asking for the version, which needs the same ports.
+            raise RobotLostError("unreachable", closed_ports_sentence(host, closed or [port], ())) from error
+        with connection:
+            yield connection
+
+
+def _all_refused_hint(error: Exception) -> str:
+    # Something at that address answers, so that it is no matter of the cable.
+    if not isinstance(error, ConnectionRefusedError):
+        return ""
+    return f", and on an e-Series from PolyScope 5.10 on that its services are enabled ({SERVICES_MENU})"
 
 
 def registers_in_use(host: str) -> RobotLostError:

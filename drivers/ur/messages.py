@@ -41,6 +41,37 @@ SAFETY_PROTECTIVE_STOP: Final = 3
 SAFETY_EMERGENCY_STOPS: Final = (6, 7)
 
 
+# UR's RTDE guide, "Robot Mode", "Safety Mode" and "Runtime State".
+ROBOT_MODES: Final = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "confirm safety",
+    2: "booting",
+    3: "power off",
+    4: "power on",
+    5: "idle",
+    6: "backdrive",
+    7: "running",
+    8: "updating",
+}
+SAFETY_MODES: Final = {
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "system emergency stop",
+    7: "robot emergency stop",
+    8: "violation",
+    9: "fault",
+    10: "validate joint",
+    11: "undefined",
+    12: "automatic mode safeguard stop",
+    13: "three-position enabling stop",
+}
+RUNTIME_STATES: Final = {0: "stopping", 1: "stopped", 2: "playing", 3: "pausing", 4: "paused", 5: "resuming"}
+
+
 class RobotLostError(DeviceLostError):
     """The robot cannot be driven, or its worker has to be replaced; `kind` says why."""
 
@@ -165,6 +196,21 @@ class RtdeSample(RtdeOutputs):
     def program_paused(self) -> bool:
         """Whether a program is paused, or is pausing or resuming."""
         return self.runtime_state not in (RUNTIME_STOPPING, RUNTIME_STOPPED, RUNTIME_PLAYING)
+
+    @property
+    def robot_mode_name(self) -> str:
+        """The robot mode in words."""
+        return ROBOT_MODES.get(self.robot_mode, f"unknown mode {self.robot_mode}")
+
+    @property
+    def safety_mode_name(self) -> str:
+        """The safety mode in words."""
+        return SAFETY_MODES.get(self.safety_mode, f"unknown mode {self.safety_mode}")
+
+    @property
+    def runtime_name(self) -> str:
+        """The state of the program in words."""
+        return RUNTIME_STATES.get(self.runtime_state, f"unknown state {self.runtime_state}")
 
     @property
     def protective_stop(self) -> bool:

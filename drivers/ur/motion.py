@@ -126,7 +126,7 @@ class MotionExecutor:
             case WristSpeed(), _Move():
                 return "A linear move is under way: stop it."
             case MoveLinear(pose), _ if outside := self._settings.limits.workspace.why_outside(pose[:3]):
-                return f"The linear move's end at {outside}."
+                return f"The linear move would end at {outside}; nothing moves."
             case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:
                 return "A linear move needs a speed and an acceleration above 0."
             case MoveLinear(), motion if isinstance(motion, _Move | _Braking) or not sample.rests:
@@ -373,9 +373,10 @@ def why_unfit(sample: RtdeSample, settings: UrSettings) -> str:
     if sample.emergency_stop:
         return "Emergency stop: make the cell safe, release the button, then unlock."
     if sample.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
-        return _SAFETY.get(sample.safety_mode, f"The robot's safety system is in mode {sample.safety_mode}.")
+        other = f"The robot's safety system is in the mode “{sample.safety_mode_name}”: look at the teach pendant."
+        return _SAFETY.get(sample.safety_mode, other)
     if sample.robot_mode != ROBOT_MODE_RUNNING:
-        return f"The arm is not powered and released (robot mode {sample.robot_mode}): unlock to power it."
+        return f"The arm is not powered and released (robot mode: {sample.robot_mode_name}): unlock to power it."
     if sample.program_paused:
         return (
             "A program on the robot is paused, and goes on with what it did when it is resumed: stop it at the teach "
@@ -394,6 +395,12 @@ _SAFETY = {
     5: "A safeguard stop holds the robot: close the safeguard, then unlock.",
     8: "The robot's safety system reports a violation: restart it at the teach pendant.",
     9: "The robot's safety system reports a fault: restart the controller.",
+    10: "The robot validates a joint: follow the teach pendant, and restart the robot.",
+    12: "A safeguard stop of the automatic mode holds the robot: close the safeguard, reset it, then unlock.",
+    13: (
+        "The three-position enabling device holds the robot: hold it in its middle position, or select the automatic "
+        "mode, then unlock."
+    ),
 }
 
 

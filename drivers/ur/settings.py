@@ -12,6 +12,7 @@ from pydantic import Field
 
 from shearloop.drivers import ranges
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.hosts import why_no_host
 
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
@@ -144,7 +145,7 @@ class Workspace(_Checked):
             lowest, highest = low + self.margin_m, high - self.margin_m
             if not lowest <= value <= highest:
                 box = f"{lowest:g} to {highest:g} m with its margin"
-                return f"{axis} = {value:g} m is outside the robot's workspace, {box}"
+                return f"{axis} = {value:g} m, outside the robot's workspace, which is {box}"
         return ""
 
 
@@ -213,12 +214,8 @@ class UrSettings(_Checked):
 
     def __post_init__(self) -> None:
         """Refuse a host that is none, and rates that contradict each other."""
-        if not self.host.strip():
-            raise ValueError("host is empty; give the robot's address")
-        try:
-            self.host.encode("idna")
-        except UnicodeError:
-            raise ValueError("host is no name or address of a computer; give the robot's address") from None
+        if reason := why_no_host(self.host):
+            raise ValueError(f"host {reason}; give the robot's address")
         if self.rate_hz < 3 * self.watchdog_hz:
             raise ValueError(
                 f"rate_hz ({self.rate_hz:g}) must be at least three times watchdog_hz ({self.watchdog_hz:g}), "

@@ -17,7 +17,14 @@ from typing import TYPE_CHECKING, NoReturn
 
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.control_box import ask_dashboard, probe_controller, registers_in_use, untested_sentence
+from shearloop.drivers.ur.control_box import (
+    REMOTE_CURE,
+    ask_dashboard,
+    check_ports,
+    probe_controller,
+    registers_in_use,
+    untested_sentence,
+)
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.motion import why_unfit
 from shearloop.drivers.ur.settings import UrSettings
@@ -120,6 +127,7 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     host = settings.host
     try:
         pipe.send(messages.WorkerPhase("greeting the controller"))
+        check_ports(host, settings.connect_timeout_s / 8)
         version = probe_controller(host, settings.connect_timeout_s / 4)
         # To a silent dashboard, ur-rtde says "Operation canceled".
         ask_dashboard(host, settings.connect_timeout_s / 4, ("PolyscopeVersion",))
@@ -130,11 +138,7 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
         if "already in use" in text:
             raise registers_in_use(host) from error
         if "remote control" in text:
-            raise RobotLostError(
-                "local-control",
-                f"The robot at {host} is in local control: switch it to remote control, top right on the teach "
-                "pendant.",
-            ) from error
+            raise RobotLostError("local-control", f"The robot at {host} is in local control: {REMOTE_CURE}.") from error
         raise RobotLostError(
             "unreachable", f"The connection to the robot at {host} failed: ur-rtde says “{text.strip()}”."
         ) from error

@@ -30,27 +30,20 @@ Follow a running daemon, with `for` or `async for`:
             print(message["torque_nm"])
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from shearloop.faces import importer
 
 if TYPE_CHECKING:
-    from shearloop.bank.eit.bank_file import Bank
-    from shearloop.bank.eit.pruned_matching import PrunedMatcher as Matcher
-    from shearloop.bank.estimation import (
-        Calibration,
-        Estimate,
-        EstimatorSession,
-        FrameSeries,
-        Physics,
-        TactileFrame,
-        fit,
-    )
-    from shearloop.daemon.analysis.evaluate import estimate_series, figures_by_load
-    from shearloop.daemon.analysis.frame_series import read_series
-    from shearloop.daemon.cli.emulated_calibration import emulate_recordings
+    from shearloop.bank.bank_file import Bank
+    from shearloop.bank.pruned_matching import PrunedMatcher as Matcher
     from shearloop.daemon.messaging.client import Subscriber
     from shearloop.daemon.messaging.keys import ClientKeys
-    from shearloop.daemon.recording.tables import read
+    from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
+    from shearloop.studies.emulated_calibration import emulate_recordings
+    from shearloop.tools.evaluate import estimate_series, figures_by_load
+    from shearloop.tools.frame_series import read_series
+    from shearloop.tools.recordings.tables import read
 
 __all__ = [
     "Bank",
@@ -71,32 +64,22 @@ __all__ = [
     "read_series",
 ]
 
-# Imported on first use: the command line answers at once.
 _HOMES = {
-    "Bank": "shearloop.bank.eit.bank_file:Bank",
-    "Calibration": "shearloop.bank.estimation:Calibration",
+    "Bank": "shearloop.bank.bank_file:Bank",
+    "Calibration": "shearloop.estimation:Calibration",
     "ClientKeys": "shearloop.daemon.messaging.keys:ClientKeys",
-    "Estimate": "shearloop.bank.estimation:Estimate",
-    "EstimatorSession": "shearloop.bank.estimation:EstimatorSession",
-    "FrameSeries": "shearloop.bank.estimation:FrameSeries",
-    "Matcher": "shearloop.bank.eit.pruned_matching:PrunedMatcher",
-    "Physics": "shearloop.bank.estimation:Physics",
+    "Estimate": "shearloop.estimation:Estimate",
+    "EstimatorSession": "shearloop.estimation:EstimatorSession",
+    "FrameSeries": "shearloop.estimation:FrameSeries",
+    "Matcher": "shearloop.bank.pruned_matching:PrunedMatcher",
+    "Physics": "shearloop.estimation:Physics",
     "Subscriber": "shearloop.daemon.messaging.client:Subscriber",
-    "TactileFrame": "shearloop.bank.estimation:TactileFrame",
-    "emulate_recordings": "shearloop.daemon.cli.emulated_calibration:emulate_recordings",
-    "estimate_series": "shearloop.daemon.analysis.evaluate:estimate_series",
-    "figures_by_load": "shearloop.daemon.analysis.evaluate:figures_by_load",
-    "fit": "shearloop.bank.estimation:fit",
-    "read": "shearloop.daemon.recording.tables:read",
-    "read_series": "shearloop.daemon.analysis.frame_series:read_series",
+    "TactileFrame": "shearloop.estimation:TactileFrame",
+    "emulate_recordings": "shearloop.studies.emulated_calibration:emulate_recordings",
+    "estimate_series": "shearloop.tools.evaluate:estimate_series",
+    "figures_by_load": "shearloop.tools.evaluate:figures_by_load",
+    "fit": "shearloop.estimation:fit",
+    "read": "shearloop.tools.recordings.tables:read",
+    "read_series": "shearloop.tools.frame_series:read_series",
 }
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'shearloop' has no attribute {name!r}")
-    module, _, attribute = _HOMES[name].partition(":")
-    value = getattr(importlib.import_module(module), attribute)
-    globals()[name] = value
-    return value
+__getattr__ = importer(__name__, globals(), _HOMES)

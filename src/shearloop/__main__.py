@@ -2,6 +2,6 @@
 
 import sys
 
-from shearloop.daemon.cli import main
+from shearloop.cli import main
 
 sys.exit(main())

@@ -58,10 +58,33 @@ def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str,
 
 def open_file(path: Path) -> BinaryIO:
     """Open a file to read; raises OSError, also for a device or a pipe, which may have no end."""
-    mode = path.stat().st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+    # Opening a device can already change something.
+    _refuse_device(path.stat())
+    # It may be another file by now, and the opening of a pipe waits for a writer.
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        _refuse_device(os.fstat(handle))
+        return os.fdopen(handle, "rb")
+    except OSError:
+        os.close(handle)
+        raise
+
+
+def _refuse_device(status: os.stat_result) -> None:
+    if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
         raise OSError(errno.EINVAL, "it is a device or a pipe; name a file")
-    return path.open("rb")
+
+
+def read_file(path: Path, most_bytes: int) -> bytes:
+    """Return a whole file that is expected to be small; raises OSError, also for a larger one or a device.
+
+    A file of the kernel, such as /proc/kmsg, is empty: it has no size, and some have no end.
+    """
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most_bytes:
+            raise OSError(errno.EFBIG, f"it is larger than {most_bytes >> 10} kB; is it another file?")
+        return file.read(size)
 
 
 def sync_directory(directory: Path) -> None:

@@ -6,17 +6,17 @@ allowed: …; did you mean …?`.
 
 import math
 import re
-import stat
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from shearloop.files import replace_file
+from shearloop.files import read_file, replace_file
 from shearloop.units import unit_hint, unit_of
 from shearloop.words import counted
 
@@ -26,7 +26,7 @@ _LONGEST_VALUE = 60
 # Of Linux.
 _LONGEST_NAME, _LONGEST_PATH = 255, 4096
 # Bounds on what a file may cost: its bytes, its values with every alias written out, and its mistakes that are shown.
-_MOST_BYTES, _MOST_VALUES, _MOST_MISTAKES = 1 << 17, 20_000, 100
+MOST_BYTES, _MOST_VALUES, _MOST_MISTAKES = 1 << 17, 20_000, 100
 
 
 class _Loader(yaml.SafeLoader):
@@ -90,46 +90,75 @@ _Loader.add_implicit_resolver(
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Document:
+    """The content of one YAML file, with its lines; `raises` is the exception for each mistake."""
+
+    path: Path
+    content: Any
+    raises: type[Exception]
+    _root: yaml.Node | None
+
+    @classmethod
+    def read(cls, path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Self:
+        """Read a file that is neither missing nor empty; `cure` ends the message of a missing one."""
+        if "\0" in str(path) or len(path.name) > _LONGEST_NAME or len(str(path)) > _LONGEST_PATH:
+            raise raises(f"{shown(str(path))}: no {what} has such a name")
+        try:
+            data = read_file(path, MOST_BYTES)
+        except OSError as error:
+            raise raises(f"{path}: the {what} cannot be read: {error.strerror}{cure}") from error
+        return cls.parse(path, data, raises, what)
+
+    @classmethod
+    def parse(cls, path: Path, data: bytes, raises: type[Exception], what: str = "configuration") -> Self:
+        """Parse the bytes of a file, which is not read again."""
+        try:
+            loader = _Loader(data.decode("utf-8"))
+            root = loader.get_single_node()
+            content = loader.construct_document(root) if root is not None else None
+        except UnicodeDecodeError as error:
+            raise raises(f"{path}: the {what} is not UTF-8 text (byte {error.start})") from error
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            where = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
+            raise raises(f"{where}: {_syntax(error)}") from error
+        except yaml.YAMLError as error:
+            raise raises(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
+        except RecursionError as error:
+            raise raises(f"{path}: the {what} is nested too deeply") from error
+        if content is None:
+            raise raises(f"{path}: the {what} is empty")
+        return cls(path, content, raises, root)
+
+    def model(self, model: type[Model]) -> Model:
+        """Return the content as a pydantic model or dataclass; its validators get the file's `folder`."""
+        if not isinstance(self.content, dict):
+            example = next(iter(TypeAdapter(model).json_schema()["properties"]), "key")
+            raise self.raises(f"{self.path}: expected keys and values such as `{example}: …`")
+        try:
+            return _validated(self.content, model, self.path.resolve().parent)
+        except ValidationError as error:
+            raise self.raises("\n".join(_mistakes(error, model, self.content, str(self.path), self._root))) from error
+
+    def located(self, mistakes: Iterable[tuple[tuple[int | str, ...], str]]) -> list[str]:
+        """Return `file:line: key: sentence` for each mistake, given by its location in the content."""
+        found = []
+        for location, sentence in mistakes:
+            key, line = _place(location, self.content, self._root, missing=True)
+            found.append((line, f"{self.path}:{line}: {key}: {sentence}"))
+        return [text for _, text in sorted(found)]
+
+
 def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Any:
     """Return the content of a YAML file that is neither missing nor empty; `cure` ends the message of a missing one."""
-    return _read(path, raises, what, cure)[0]
-
-
-def _read(path: Path, raises: type[Exception], what: str, cure: str) -> tuple[Any, yaml.Node | None]:
-    """Return the content of a YAML file, and the node with its line numbers."""
-    if "\0" in str(path) or len(path.name) > _LONGEST_NAME or len(str(path)) > _LONGEST_PATH:
-        raise raises(f"{shown(str(path))}: no {what} has such a name")
-    try:
-        status = path.stat()
-        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
-            # It may have no end.
-            raise raises(f"{path}: the {what} is a device or a pipe; name a file")
-        if status.st_size > _MOST_BYTES:
-            raise raises(f"{path}: the {what} is larger than {_MOST_BYTES >> 10} kB; is it another file?")
-        loader = _Loader(path.read_text(encoding="utf-8"))
-        root = loader.get_single_node()
-        content = loader.construct_document(root) if root is not None else None
-    except OSError as error:
-        raise raises(f"{path}: the {what} cannot be read: {error.strerror}{cure}") from error
-    except UnicodeDecodeError as error:
-        raise raises(f"{path}: the {what} is not UTF-8 text (byte {error.start})") from error
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        where = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
-        raise raises(f"{where}: {_syntax(error)}") from error
-    except yaml.YAMLError as error:
-        raise raises(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
-    except RecursionError as error:
-        raise raises(f"{path}: the {what} is nested too deeply") from error
-    if content is None:
-        raise raises(f"{path}: the {what} is empty")
-    return content, root
+    return Document.read(path, raises, what, cure).content
 
 
 def parse_yaml(text: bytes) -> Any:
     """Return the content of a YAML text; raises yaml.YAMLError, ValueError or RecursionError."""
-    if len(text) > _MOST_BYTES:
-        raise ValueError(f"its header is larger than {_MOST_BYTES >> 10} kB")
+    if len(text) > MOST_BYTES:
+        raise ValueError(f"its header is larger than {MOST_BYTES >> 10} kB")
     return yaml.load(text.decode(), _Loader)  # noqa: S506 - it is a SafeLoader
 
 
@@ -137,25 +166,7 @@ def load_model(
     path: Path, model: type[Model], raises: type[Exception], what: str = "configuration", cure: str = ""
 ) -> Model:
     """Return a YAML file's content as a pydantic model or dataclass; its validators get the file's `folder`."""
-    content, root = _read(path, raises, what, cure)
-    if not isinstance(content, dict):
-        example = next(iter(TypeAdapter(model).json_schema()["properties"]), "key")
-        # The content stays unsaid: `start` takes any path, and its reply would show a file with a secret.
-        raise raises(f"{path}: expected keys and values such as `{example}: …`")
-    try:
-        return _validated(content, model, path.resolve().parent)
-    except ValidationError as error:
-        raise raises("\n".join(_mistakes(error, model, content, str(path), root))) from error
-
-
-def located(path: Path, mistakes: Iterable[tuple[tuple[int | str, ...], str]], raises: type[Exception]) -> list[str]:
-    """Return `file:line: key: sentence` for each mistake of a YAML file, given by its location in the content."""
-    content, root = _read(path, raises, "configuration", "")
-    found = []
-    for location, sentence in mistakes:
-        key, line = _place(location, content, root, missing=True)
-        found.append((line, f"{path}:{line}: {key}: {sentence}"))
-    return [text for _, text in sorted(found)]
+    return Document.read(path, raises, what, cure).model(model)
 
 
 def validated(content: object, model: type[Model], where: str, raises: type[Exception], *, cure: str = "") -> Model:
@@ -237,13 +248,18 @@ def _mistakes(
         # A list counts only its valid entries, so that mistakes within it make it too short as well.
         if details["type"] == "too_short" and any(one["loc"][:-1][: len(location)] == location for one in first):
             continue
-        kind, key, line = details["type"], "", 1
-        if kind != "invalid_key":
-            key, line = _place(location, content, root, missing=kind == "missing")
+        kind = details["type"]
+        key, line = _place(location, content, root, missing=kind == "missing")
+        wrong_key = kind == "invalid_key" or location[-1:] == ("[key]",)
+        if wrong_key:
+            # Only the key's section has a name.
+            section = location[:-2] if location[-1] == "[key]" else location[:-1]
+            key, _ = _place(section, content, root, missing=False)
         if kind.startswith("union_tag"):
             key += "." + details["ctx"]["discriminator"].strip("'")
         subject = f"{key}: " if key else ""
-        found[f"{where}{f':{line}' if root is not None else ''}: {subject}{_sentence(details, schema)}"] = line
+        sentence = _sentence(details, schema, _written(location, content, root, key=wrong_key))
+        found[f"{where}{f':{line}' if root is not None else ''}: {subject}{sentence}"] = line
     return sorted(found, key=lambda text: found[text]) + (
         [f"{where}: {counted(len(more), 'more mistake')}"] if more else []
     )
@@ -255,10 +271,10 @@ def _place(location: Sequence[int | str], content: object, node: yaml.Node | Non
     for number, part in enumerate(location):
         child: yaml.Node | None = None
         if isinstance(content, Mapping) and part in content:
+            if isinstance(node, yaml.MappingNode):
+                name, child = _pair(content, part, node)
+                line = name.start_mark.line + 1
             content = content[part]
-            for name, value in node.value if isinstance(node, yaml.MappingNode) else ():
-                if name.value == str(part):
-                    line, child = name.start_mark.line + 1, value
         elif isinstance(content, list | tuple) and isinstance(part, int) and part < len(content):
             content = content[part]
             if isinstance(node, yaml.SequenceNode):
@@ -271,10 +287,40 @@ def _place(location: Sequence[int | str], content: object, node: yaml.Node | Non
     return key.lstrip("."), line
 
 
-def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
+def _pair(content: Mapping[Any, object], key: int | str, node: yaml.MappingNode) -> tuple[yaml.Node, yaml.Node]:
+    """Return the nodes of a key and of its value; keys are unique, so that they stand in the content's order."""
+    name, value = node.value[list(content).index(key)]
+    return name, value
+
+
+def _written(location: Sequence[int | str], content: object, node: yaml.Node | None, *, key: bool) -> str:
+    """Return the value at a location as it is written in the file, or its key; else an empty text."""
+    name = node
+    for part in location:
+        if isinstance(content, Mapping) and part in content and isinstance(node, yaml.MappingNode):
+            name, node = _pair(content, part, node)
+            content = content[part]
+        elif isinstance(content, list) and isinstance(part, int) and isinstance(node, yaml.SequenceNode):
+            name = node = node.value[part]
+            content = content[part]
+    wrong = name if key else node
+    return str(wrong.value) if isinstance(wrong, yaml.ScalarNode) else ""
+
+
+def _unquoted(found: object, written: str, what: str) -> str:
+    """Return a sentence on a text that YAML reads as something else, and its cure."""
+    read_as = "true or false" if isinstance(found, bool) else "a number"
+    return f"{what}{written or shown(found)} without quotes is {read_as}, and no text; put it in quotes"
+
+
+def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str = "") -> str:
     location, kind, found = details["loc"], details["type"], details["input"]
-    if kind == "invalid_key":
-        return f"the key {shown(found)} is a number; a name is expected"
+    if kind == "invalid_key" or (kind == "string_type" and location[-1:] == ("[key]",)):
+        if isinstance(found, bool):
+            return _unquoted(found, written, "the key ")
+        return f"the key {written or shown(found)} is a number; a name is expected"
+    if kind == "string_type" and isinstance(found, bool | int | float):
+        return f'{_unquoted(found, written, "")}: "{written or found}"'
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"is not a known key{_known_keys(str(location[-1]), _schema_at(schema, location[:-1], schema))}"
     if kind in ("value_error", "assertion_error"):

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.bank_file import FORMAT_VERSION, Bank, BankDefinition, write_bank
-from shearloop.bank.eit.channels import PAPER_TABLE
+from shearloop.bank.bank_file import FORMAT_VERSION, Bank, BankDefinition, write_bank
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import BankFileError, ModelError
 
 GEOMETRY = "ab" * 32

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.elimination import LANES
-from shearloop.bank.eit.forward import MAX_LEAK, BatchForwardModel, rounding_leaks
-from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.bank.elimination import LANES
 from shearloop.bank.errors import ConductivityError
-from tests.bank.conftest import relative
+from shearloop.bank.forward import MAX_LEAK, BatchForwardModel, rounding_leaks
+from shearloop.bank.models import MODELS, conductivity
+from tests.fixtures.physics import relative
 
 
 @pytest.fixture(scope="module")

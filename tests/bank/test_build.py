@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
-from shearloop.bank.eit.build import build_bank, solve_row
-from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import conductivity
+from shearloop.bank.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
+from shearloop.bank.build import build_bank, solve_row
 from shearloop.bank.errors import BankFileError, ConductivityError, ModelError
+from shearloop.bank.mesh import Mesh
+from shearloop.bank.models import conductivity
 
 MODEL = "gaussian_derivative"
 K, SIGMA = np.linspace(0.4, 9.0, 5), np.linspace(0.3, 1.2, 4)

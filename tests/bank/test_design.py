@@ -10,8 +10,8 @@ import yaml
 from scipy.io import loadmat
 from scipy.stats import spearmanr
 
-from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.eit.design import (
+from shearloop.bank.channels import PAPER_TABLE
+from shearloop.bank.design import (
     ALLOWED,
     DesignChoice,
     DesignStep,
@@ -27,13 +27,13 @@ from shearloop.bank.eit.design import (
     simulated_frames,
     simulated_signals,
 )
-from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
-from shearloop.bank.eit.mesh import load_mesh
-from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import CalibrationError, MatchingError
-from shearloop.daemon.bank_config import FingertipGeometryConfig
+from shearloop.bank.fingertip import Fingertip
+from shearloop.bank.forward import BatchForwardModel, ForwardModel
+from shearloop.bank.mesh import load_mesh
+from shearloop.bank.models import MODELS, conductivity
 from shearloop.daemon.config_file import load_yaml_model
+from shearloop.tools.bank_config import FingertipGeometryConfig
 
 FINGERTIP = Path(__file__).parents[2] / "config" / "fingertips" / "paper.yaml"
 PLACES = [Setting(3.1 + 0.02 * i, 1.3 + 0.04 * i) for i in range(10)]

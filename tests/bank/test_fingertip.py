@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.channels import ChannelTable
-from shearloop.bank.eit.fingertip import ElectrodePlace, RectangularFingertip, RoundFingertip
-from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.mesh import boundary_edges, doubled_areas
-from shearloop.bank.eit.models import conductivity
+from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import GeometryError
+from shearloop.bank.fingertip import ElectrodePlace, RectangularFingertip, RoundFingertip
+from shearloop.bank.forward import ForwardModel
+from shearloop.bank.mesh import boundary_edges, doubled_areas
+from shearloop.bank.models import conductivity
 
 CENTRES = 0.1 + 0.4 * np.arange(8)
 SIDES = {"left": CENTRES, "top": CENTRES, "right": 3.2 - CENTRES, "bottom": 3.2 - CENTRES}

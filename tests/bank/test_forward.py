@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.channels import PAPER_TABLE, smoothed_along_channels
-from shearloop.bank.eit.forward import ForwardModel, assemble, electrode_potentials
-from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.bank.channels import PAPER_TABLE, smoothed_along_channels
 from shearloop.bank.errors import ConductivityError
-from tests.bank.conftest import rectangle, relative
+from shearloop.bank.forward import ForwardModel, assemble, electrode_potentials
+from shearloop.bank.mesh import Mesh
+from shearloop.bank.models import MODELS, conductivity
+from tests.fixtures.physics import rectangle, relative
 
 
 def test_homogeneous_voltages_are_those_of_eidors(paper_forward, eidors):

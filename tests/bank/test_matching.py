@@ -4,9 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher, best_match, signal_above_noise
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import MatchingError
+from shearloop.bank.matching import Matcher, ReferenceMatcher, ZeroLagMatcher, best_match, signal_above_noise
 
 K_GRID, SIGMA_GRID = np.linspace(3.1, 3.4, 7), np.linspace(1.2, 1.9, 8)
 VALID = np.ones((7, 8), dtype=np.bool_)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.mesh import doubled_areas, load_mesh
 from shearloop.bank.errors import GeometryError
+from shearloop.bank.forward import ForwardModel
+from shearloop.bank.mesh import doubled_areas, load_mesh
 
 FIELDS = ("nodes", "triangles", "electrode_edges", "electrode_of_edge", "contact_impedance")
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.models import MODELS, averaging_points, conductivity
 from shearloop.bank.errors import ModelError
+from shearloop.bank.models import MODELS, averaging_points, conductivity
 
 
 def test_the_averaging_points_are_those_of_the_reference(shared):

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
-from shearloop.bank.eit import pruned_matching
-from shearloop.bank.eit.channels import PAPER_TABLE
-from shearloop.bank.eit.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher, unit_magnitudes
-from shearloop.bank.eit.pruned_matching import (
+from shearloop.bank import pruned_matching
+from shearloop.bank.channels import PAPER_TABLE
+from shearloop.bank.errors import MatchingError
+from shearloop.bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher, unit_magnitudes
+from shearloop.bank.pruned_matching import (
     COARSE_RANK,
     ROUNDING,
     AllLagsBounds,
@@ -21,7 +22,6 @@ from shearloop.bank.eit.pruned_matching import (
     PrunedZeroLagMatcher,
     columns,
 )
-from shearloop.bank.errors import MatchingError
 
 SHAPE = (22, 20)
 

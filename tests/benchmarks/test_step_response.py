@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import step_response
 from benchmarks.step_response import estimator_in_the_loop, rig_calibration
-from tests.daemon.emulate_rig.rig import write_rig_bank
+from tests.cli.emulate_rig.rig import write_rig_bank
 
 
 def test_the_step_on_the_rigs_physics_is_held_and_a_screw_ends_at_its_target(tmp_path, monkeypatch):

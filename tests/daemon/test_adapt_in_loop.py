@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from shearloop.daemon.cli.emulated_calibration import calibrate, record
-from tests.daemon.emulate_rig.rig import write_rig_bank
-from tests.daemon.recording.test_replay import replayed
+from shearloop.studies.emulated_calibration import calibrate, record
+from tests.cli.emulate_rig.rig import write_rig_bank
 from tests.daemon.test_closed_loop import SPEED, Watcher, experiment, rig_config, running_rig, started
+from tests.tools.recordings.test_replay import replayed
 
 __all__ = ["rig_config"]
 pytestmark = pytest.mark.real_time

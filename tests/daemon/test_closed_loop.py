@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import yaml
 
-from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.bank_file import Bank
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.run_summary import RunSummary
-from tests.daemon.conftest import ask, robot_at, running_daemon, shearloop
 from tests.emulator_process import own_address
+from tests.fixtures.daemons import ask, robot_at, running_daemon, shearloop
 from tests.paper_curve import paper_curve
 
 pytestmark = pytest.mark.real_time
@@ -24,6 +24,7 @@ pytestmark = pytest.mark.real_time
 HOST = own_address(4)
 SPEED = 8
 SLOW_TWIST = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.02, "hold_s": 60.0}
+BY_ITSELF = {"emulated": True, "autostart": True, "stop_when_done": True}
 Write = Callable[..., Path]
 
 
@@ -63,7 +64,7 @@ def ending_with(rig_config: Path, *steps: Mapping[str, Any]) -> Path:
         yaml.safe_dump({"name": "own", "torque_source": "wrench", "steps": [*map(dict, steps)]})
     )
     content = yaml.safe_load(rig_config.read_text())
-    path.write_text(yaml.safe_dump({**content, "experiment": "own.yaml", "stop_when_done": True}))
+    path.write_text(yaml.safe_dump({**content, **BY_ITSELF, "experiment": "own.yaml"}))
     return path
 
 

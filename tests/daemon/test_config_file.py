@@ -1,5 +1,6 @@
 """Configuration files: every mistake is reported, at once, by file, key and allowed range."""
 
+import os
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +14,7 @@ from pydantic import Field, ValidationError, model_validator
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 from shearloop.yaml_files import read_yaml
 
 
@@ -155,8 +156,15 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
         load_yaml_model(tmp_path / "none.yaml", Outer)
     with pytest.raises(UserError, match="cannot be read: Is a directory"):
         load_yaml_model(tmp_path, Outer)
-    with pytest.raises(UserError, match="null: the configuration is a device or a pipe"):
+    with pytest.raises(UserError, match="null: the configuration cannot be read: it is a device or a pipe"):
         load_yaml_model(Path("/dev/null"), Outer)
+    os.mkfifo(tmp_path / "pipe.yaml")
+    with pytest.raises(UserError, match="cannot be read: it is a device or a pipe"):
+        load_yaml_model(tmp_path / "pipe.yaml", Outer)
+    # Read without a bound, it waits for the kernel's next message.
+    for endless in ("/proc/kmsg", "/proc/self/status"):
+        with pytest.raises(UserError, match=r"the configuration (is empty|cannot be read)"):
+            load_yaml_model(Path(endless), Outer)
     (tmp_path / "latin.yaml").write_bytes(b"mode: sl\xf6w\n")
     with pytest.raises(UserError, match=r"latin\.yaml: the configuration is not UTF-8 text \(byte 8\)"):
         load_yaml_model(tmp_path / "latin.yaml", Outer)

@@ -9,13 +9,13 @@ from typing import Any, get_args, get_type_hints
 import pytest
 import zmq
 
-from shearloop.daemon.cli.emulator_processes import EmulatedDevices
-from shearloop.daemon.cli.terminal import StatusLine, message_json, message_line, print_estimate
+from shearloop.cli.emulator_processes import EmulatedDevices
+from shearloop.cli.terminal import StatusLine, message_json, message_line, print_estimate
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, LoadTorque, Message, decode, encode, wire_map
 from shearloop.daemon.messaging.publisher import LISTENER_FAILED, Publisher
 from shearloop.daemon.run_summary import RunSummary
-from tests.daemon.sample_messages import sample
+from tests.sample_messages import sample
 
 
 def nullable_keys(kind: type[Message]) -> list[str]:

@@ -1,10 +1,12 @@
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import pytest
 
+from shearloop.cli.terminal import message_line
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
 from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, ZERO_TIMEOUT_S, LoadCellTask
@@ -18,6 +20,7 @@ class Board:
     def __init__(self) -> None:
         self.sent: asyncio.Queue[LoadSample] = asyncio.Queue()
         self.tares: list[float] = []
+        self.refusal = ""
         self.published: list[LoadTorque] = []
         # Later than all that a test asks for.
         self._seq = Clock().now_ns() + 10**9
@@ -31,7 +34,7 @@ class Board:
         self.tares.append(raw_at_rest)
 
     def diagnostics(self) -> dict[str, bool | str]:
-        return {"connected": True, "last_loss": ""}
+        return {"connected": True, "last_loss": "", "last_refusal": self.refusal}
 
     async def send(
         self, raw: float, count: int = ZERO_SAMPLES, *, from_ns: int = 0, every_ns: int = 1, **flags: bool
@@ -135,3 +138,23 @@ async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(f
     assert not spoilt.valid
     assert why in spoilt.reason
     assert (good.valid, good.reason) == (True, "")
+
+
+async def test_a_board_that_sends_counts_without_a_calibration_says_so():
+    async with reading() as (task, board):
+        await board.send(165_390.0, 1, spike=True, counts=True)
+        (sample,) = board.published
+        assert not sample.valid
+        assert sample.reason == task.diagnostics()["error"]
+        assert "sends counts" in sample.reason
+        assert "`shearloop calibrate load`" in sample.reason
+        assert "can move" not in sample.reason
+        line = message_line("load.torque", {**asdict(sample), "timestamp": 0.0})
+        assert "N·m" not in line
+        assert sample.reason in line
+
+
+async def test_health_quotes_the_last_refused_line():
+    async with reading() as (task, board):
+        board.refusal = "refused '0,091': not a number"
+        assert task.diagnostics()["error"] == board.refusal

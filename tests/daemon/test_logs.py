@@ -75,7 +75,7 @@ def test_what_a_terminal_has_no_letters_for_is_spelt_and_what_follows_comes_out(
     with closing(NonBlockingWriter(io.TextIOWrapper(taken, encoding="ascii", write_through=True))) as outlet:
         outlet.write("0.10 N·m …\n")
         outlet.write("and on\n")
-    assert taken.getvalue().splitlines() == [rb"0.10 N\xb7m \u2026", b"and on"]
+    assert taken.getvalue().splitlines() == [rb"0.10 N\u00b7m \u2026", b"and on"]
 
 
 def test_the_control_loop_hears_of_a_lost_device_until_it_returns():

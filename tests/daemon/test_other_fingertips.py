@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import yaml
 
-from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.build import build_bank
-from shearloop.bank.estimation import fit
-from shearloop.bank.estimation.estimator import Physics
-from shearloop.daemon.analysis.frame_series import read_series
-from shearloop.daemon.bank_config import load_bank_plan
-from shearloop.daemon.cli.emulated_calibration import write_recordings
-from shearloop.daemon.recording.reader import read_recording
+from shearloop.bank.bank_file import Bank
+from shearloop.bank.build import build_bank
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.emulators.boards import EitKitBoard, format_line
-from tests.daemon.conftest import collector, running_daemon
+from shearloop.emulators.boards import EitKitBoard, format_line
+from shearloop.estimation import fit
+from shearloop.estimation.estimator import Physics
+from shearloop.studies.emulated_calibration import write_recordings
+from shearloop.tools.bank_config import load_bank_plan
+from shearloop.tools.frame_series import read_series
+from shearloop.tools.recordings.reader import read_recording
+from tests.fixtures.daemons import collector, running_daemon
 from tests.running import running
 
 SPEED = 50

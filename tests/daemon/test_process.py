@@ -12,10 +12,10 @@ from functools import partial
 
 import pytest
 
+from shearloop.cli import emulator_processes, main
 from shearloop.daemon import app, process
-from shearloop.daemon.cli import emulator_processes, main
 from shearloop.daemon.process import NICENESS, ending_signals, raise_priority, without_long_collections
-from tests.daemon.conftest import DEADLINE_S
+from tests.fixtures.daemons import DEADLINE_S
 
 
 @pytest.mark.usefixtures("default_signals")

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import yaml
 
+from shearloop.cli.config_schema import MODELS, schema_of
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.config_schema import MODELS, schema_of
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.errors import UserError
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.settings import read_settings
+from shearloop.errors import UserError
 
 ROBOT = Path(__file__).parents[2] / "config" / "ur.yaml"
 # The designs of banks and fingertips move nothing; their meshes have no largest size that we know.
@@ -105,7 +105,7 @@ def test_a_whole_turn_is_a_range_of_a_joint(tmp_path):
         ({"do": "approach", "pose_m_rad": [90, 0.1, 0.4, 0, 3.1, 0]}, "did you mean 0.09, 90 mm in m?"),
         ({"do": "approach", "along_tool_m": 30}, "did you mean 0.03, 30 mm in m?"),
         ({"do": "turn_to", "angle_rad": 360}, "did you mean 6.283, 360 degrees in rad?"),
-        ({"do": "tighten", "until_torque_nm": 120, "until_angle_rad": 1}, "did you mean 0.12, 120 mN·m in N·m?"),
+        ({"do": "hold_torque", "torque_nm": 120}, "did you mean 0.12, 120 mN·m in N·m?"),
         ({"do": "grip", "width_mm": 1e300}, "is too large"),
     ],
 )

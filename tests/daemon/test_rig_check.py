@@ -10,8 +10,8 @@ import yaml
 
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.rig import check_experiment
+from shearloop.errors import UserError
 
 SERIAL = {"device": {"path": "port"}}
 STEPS = [{"do": "tare"}, {"do": "wait", "wait_s": 1}]
@@ -84,7 +84,10 @@ LIMITS = {"torque_nm": 0.2, "angle_rad": 1.0}
             {"do": "hold_torque", "torque_nm": 0.25, "limits": {"torque_nm": 0.3}},
             "asks for 0.25 N·m, and its limit is 0.2 N·m",
         ),
-        ({"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": 2}, "asks for 2 rad, and its limit is 1 rad"),
+        (
+            {"do": "tighten", "direction": "clockwise", "until_torque_nm": 0.1, "until_angle_rad": 2},
+            "asks for 2 rad, and its limit is 1 rad",
+        ),
         (
             {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 20, "timeout_s": 20},
             "stands still for 20 s in all, and its timeout is 20 s; raise timeout_s",

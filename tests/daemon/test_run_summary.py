@@ -62,6 +62,15 @@ def truth_that_falls_at(t_s: float, for_s: float) -> TorqueSeries:
     return TorqueSeries(times * S, torque)
 
 
+def test_a_disturbance_is_told_without_the_next_one():
+    t_s = np.arange(0.0, 44.0, 0.1)
+    fallen = 0.015 * ((t_s >= 20) & (t_s < 21)) + 0.08 * ((t_s >= 30) & (t_s < 33))
+    truth = TorqueSeries(t_s * S, np.where(t_s < 13.0, 0.0, 0.1) - fallen)
+    text = summary_of_hold(truth, [(20 * S, "first"), (30 * S, "second")])
+    assert "(first): 0.015 N·m off, back within ± 10% after" in text
+    assert "(second): 0.080 N·m off, back within ± 10% after" in text
+
+
 def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturbance():
     text = summary_of_hold(truth_that_falls_at(26.0, 5.5), [(26 * S, "kick -0.03")])
     assert "'hold' was done, after 44 s" in text

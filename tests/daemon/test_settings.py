@@ -19,7 +19,8 @@ from tests.daemon.control.test_margins import FOUND
 
 PACKAGE = Path(__file__).parents[2]
 # Simulated devices and plants have properties of their own.
-SIMULATED = ("emulators", "charts", "synthetic")
+SIMULATED = ("charts", "emulated_calibration")
+ROOMS = ("bank", "estimation", "drivers", "daemon", "tools", "studies", "cli")
 
 
 Place = tuple[str, str]
@@ -32,7 +33,7 @@ def module_of(path: Path) -> str:
 @cache
 def trees() -> dict[str, ast.Module]:
     """Return the syntax trees of all modules but the simulated ones."""
-    paths = [path for folder in ("bank", "drivers", "daemon") for path in (PACKAGE / folder).rglob("*.py")]
+    paths = [path for folder in ROOMS for path in (PACKAGE / folder).rglob("*.py")]
     return {
         module_of(path): ast.parse(path.read_text())
         for path in paths
@@ -50,6 +51,7 @@ def constants() -> dict[Place, ast.expr]:
         targets = line.targets if isinstance(line, ast.Assign) else [line.target]
         for target in targets:
             several = isinstance(target, ast.Tuple) and isinstance(line.value, ast.Tuple)
+            several = several and len(target.elts) == len(line.value.elts)
             pairs = zip(target.elts, line.value.elts, strict=True) if several else [(target, line.value)]
             found.update({(module, name.id): value for name, value in pairs if isinstance(name, ast.Name)})
     return found

@@ -8,8 +8,8 @@ import pytest
 
 from shearloop.drivers import connection
 from shearloop.drivers.connection import LinkMonitor, SerialLink, SerialPort, TcpPort, find_port
-from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
+from shearloop.emulators.ports import PtyPort
 from tests.running import DEADLINE_S, LinkEvents, read_exactly
 
 SECOND_NS = 1_000_000_000

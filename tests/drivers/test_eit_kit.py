@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.channels import PAPER_TABLE
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
 from shearloop.drivers.connection import LinkEvent, LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame, FrameErrorKind
-from shearloop.drivers.emulators.boards import EitKitBoard, format_line
+from shearloop.emulators.boards import EitKitBoard, format_line
 from tests.running import DEADLINE_S, LinkEvents, running, take
 
 PERIOD_S = 0.003
@@ -94,7 +94,7 @@ async def test_a_fault_costs_its_own_frame_at_most_and_is_counted(fault, kind, l
     assert_same(frames, lines[:3] + lines[3 + lost :])
     facts = kit.diagnostics()
     assert facts["errors"] == {kind.name.lower(): 1}
-    assert kind.value in str(facts["last_frame_error"])
+    assert kind.value in str(facts["last_refusal"])
 
 
 async def test_a_board_that_fell_silent_is_opened_and_started_again(tmp_path, monkeypatch):

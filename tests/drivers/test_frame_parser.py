@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from shearloop.bank.eit.channels import PAPER_TABLE
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
 from shearloop.drivers.eit_kit import ADC_STEP_V, FULL_SCALE_SINE_RMS_V, Frame, FrameErrorKind, FrameParser
-from shearloop.drivers.emulators.boards import format_line
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.emulators.boards import format_line
 from tests.slices import slices
 
 PERIOD_NS = eit_kit.NOMINAL_PERIOD_NS
@@ -54,7 +54,6 @@ BROKEN = [
     (FrameErrorKind.NOT_A_NUMBER, with_value(CHANNEL, b"-0.1234")),
     (FrameErrorKind.OUT_OF_RANGE, with_value(CHANNEL, b"9.1234")),
     (FrameErrorKind.NOT_A_NUMBER, with_value(CHANNEL, b"10.1234")),
-    (FrameErrorKind.ZERO_CHANNEL, with_value(CHANNEL, b"0.0000")),
     (FrameErrorKind.NONZERO_SLOT, with_value(SLOT, b"0.0021")),
 ]
 
@@ -89,10 +88,23 @@ def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffecte
         assert len(str(parser.last_error)) < 600
 
 
+@pytest.mark.parametrize("silent", [[500], range(56), range(896)])
+def test_a_channel_that_reads_0_is_dead_in_that_frame_and_refuses_no_other(silent):
+    line = noisy(1)[0]
+    line[PAPER_TABLE.line_slots[list(silent)]] = 0.0
+    parser = FrameParser(PAPER_TABLE.zero_slots)
+    before, frame, after = parser.feed(LINES[1] + format_line(line) + LINES[2], 0)
+    assert not parser.errors
+    assert np.flatnonzero(frame.dead).tolist() == list(silent)
+    assert format_line(frame.raw) == format_line(line)
+    assert not before.dead.any()
+    assert not after.dead.any()
+
+
 def test_a_refusal_says_which_value_it_was():
     refusal = eit_kit.read_line(with_value(CHANNEL, b"-0.1234").rstrip(b"\n"), PAPER_TABLE.zero_slots)
     assert refusal.position == CHANNEL
-    assert f"read '-0.1234' at value {CHANNEL + 1}" in str(refusal)
+    assert f"refused '-0.1234' at value {CHANNEL + 1}" in str(refusal)
 
 
 @given(st.data())

@@ -13,6 +13,7 @@ from shearloop.drivers.calibration_files import load_device_calibration, save_ca
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN, PERIOD_NS, STUCK_AFTER, LoadCalibration, LoadParser
+from shearloop.drivers.refused_lines import refusal_sentence
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.slices import slices
 
@@ -198,3 +199,27 @@ def test_a_missing_calibration_file_says_how_to_make_one(tmp_path):
         load_device_calibration(tmp_path / "none.yaml", LoadCalibration)
     with pytest.raises(DeviceCalibrationError, match="cannot be written"):
         save_calibration(tmp_path / "no/such/folder.yaml", TORQUE_LINES)
+
+
+def test_counts_without_a_calibration_are_told_from_a_spike():
+    lines = ["81250", "81310", "81190", "81250"]
+    first, *others = feed_lines(LoadParser(TORQUE_LINES), lines)
+    assert first.counts
+    assert all(one.counts and one.spike and not one.trusted for one in others)
+    calibrated = LoadParser(LoadCalibration(tare_counts=81_250, scale_n_per_count=2.3e-5))
+    assert not any(one.counts for one in feed_lines(calibrated, lines))
+    # The paper's corrupted values have no decimal point.
+    torques = feed_lines(LoadParser(TORQUE_LINES), ["0.0100", "0.0101", "38399996", "0.0102"])
+    assert [one.counts for one in torques] == [False] * 4
+    assert [one.spike for one in torques] == [False, False, True, False]
+
+
+@pytest.mark.parametrize("line", ["0,091", "torque: 0.091", "nan", "", "9" * 40, "\xf8\x80"])
+def test_the_last_refused_line_is_quoted_with_its_reason(line):
+    parser = LoadParser(TORQUE_LINES)
+    assert parser.refusal == ""
+    feed_lines(parser, ["0.1", "1.5.5", line])
+    assert parser.refused == 2
+    kind = "empty" if not line else "too long" if len(line) == 40 else "not a number"
+    sent = line.encode() + b"\r" * (kind == "too long")
+    assert parser.refusal == refusal_sentence(sent, kind, "load cell")

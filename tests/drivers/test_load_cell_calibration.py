@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from shearloop.drivers import load_cell_calibration
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.load_cell import COUNTS_MAX, LoadParser, LoadSample
+from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN, LoadParser, LoadSample
 from shearloop.drivers.load_cell_calibration import (
     STANDARD_GRAVITY,
     Level,
@@ -70,7 +70,8 @@ def test_a_board_that_sends_newton_metres_is_calibrated_the_same_way():
 @pytest.mark.parametrize(
     ("rest", "signal", "reason"),
     [
-        ([*noisy(8000.0)[:-1], *samples([COUNTS_MAX])], [], "end of its range"),
+        ([*noisy(8000.0)[:-4], *samples([COUNTS_MAX] * 4)], [], "end of its range"),
+        ([*samples([1234.0] * (STEP - 1)), *samples([COUNTS_MAX])], [], "never that still"),
         (samples([1234.0] * STEP), [], "never that still"),
         (noisy(8000.0, std=20_000.0), [], "more than 5000"),
         (noisy(8000.0), noisy(8100.0, seed=1), "did not change with 100 g"),
@@ -102,6 +103,36 @@ def test_too_many_corrupted_values_are_refused_and_few_are_left_out():
     raws[20:25] = 9e12
     with pytest.raises(DeviceCalibrationError, match="Only 25 of the 30"):
         measure_level(samples(raws), 0.0)
+
+
+@pytest.mark.parametrize("corrupted", [COUNTS_MAX, COUNTS_MIN, 0.0, 38399996.0, 16.0])
+@pytest.mark.parametrize("often", [1, 3])
+def test_corrupted_readings_are_left_out_of_the_mean_and_counted(corrupted, often):
+    raws = 81_250 + 120 * np.random.default_rng(3).standard_normal(STEP)
+    expected = measure_level(samples(raws), 0.0)
+    assert (expected.n, expected.dropped) == (30, 0)
+    spoilt = raws.copy()
+    spoilt[-10 : -10 + often] = corrupted
+    level = measure_level(samples(spoilt), 0.0)
+    assert (level.n, level.dropped) == (30 - often, often)
+    assert level.mean == pytest.approx(expected.mean, abs=3 * 120 / 30**0.5)
+    assert level.std == pytest.approx(120, rel=0.4)
+    spoilt[-12:-6] = corrupted
+    with pytest.raises(DeviceCalibrationError, match=r"Only 24 of the 30|end of its range"):
+        measure_level(samples(spoilt), 0.0)
+
+
+@given(st.integers(0, 1000), st.sampled_from(["noise", "rounded", "swinging"]))
+def test_no_reading_of_an_intact_signal_is_left_out(seed, kind):
+    random = np.random.default_rng(seed)
+    signals = {
+        "noise": 81_250 + 120 * random.standard_normal(STEP),
+        "rounded": np.round(0.09 + 0.004 * random.standard_normal(STEP), 2),
+        "swinging": 81_250 + 4000 * np.sin(np.arange(STEP)),
+    }
+    # Nine in ten the same are a still converter.
+    if np.unique(signals[kind][-30:], return_counts=True)[1].max() < 27:
+        assert measure_level(samples(signals[kind]), 0.0).n == 30
 
 
 @pytest.mark.parametrize("masses_g", [[], [0.0], [-5.0], [float("nan")], [float("inf")], [100.0, 100.0]])

@@ -1,7 +1,7 @@
 // The buttons: stop needs no token, every motion needs it.
 
 import { ACTIVE } from "./panels.js";
-import { byId, put } from "./text.js";
+import { byId, put, show } from "./text.js";
 
 const KEY = "shearloop-token";
 const TOKEN_NEEDED = "needs the token: open the address that `shearloop view` printed";
@@ -19,6 +19,8 @@ export class Controls {
       if (event.key === "Escape" && !event.repeat) this.stop();
     });
     for (const button of this.buttons()) button.addEventListener("click", () => this.command(button.dataset.command));
+    byId("confirm").addEventListener("click", () => this.confirm());
+    byId("cancel").addEventListener("click", () => this.ask_about(""));
     byId("token-form").addEventListener("submit", (event) => {
       event.preventDefault();
       this.keep(byId("token").value.trim());
@@ -65,16 +67,35 @@ export class Controls {
   }
 
   async stop() {
+    this.ask_about("");
     this.tell("stopping …");
     const reply = await this.ask("stop", {}, STOP_LATE_MS);
     if (reply.ok) this.tell(reply.stopped ? `stopped: ${reply.stopped}` : "stop: nothing was moving");
     else this.tell(`STOP NOT CONFIRMED: ${reply.reason}. Use the emergency stop of the robot.`, "bad");
   }
 
-  async command(name) {
+  // The daemon's question, which `confirm` answers; an empty one is taken away.
+  ask_about(name, question = "") {
+    this.asked = name;
+    put(byId("question-text"), question);
+    put(byId("confirm"), `Yes, ${name}`);
+    show(byId("question"), name !== "");
+  }
+
+  confirm() {
+    const name = this.asked;
+    this.ask_about("");
+    if (name && !this.reasons[name]) this.command(name, "?confirmed");
+  }
+
+  async command(name, query = "") {
+    this.ask_about("");
     this.tell(`${name} …`);
-    const reply = await this.ask(`commands/${name}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
-    if (reply.ok) this.tell(`${name}: done`);
+    const reply = await this.ask(`commands/${name}${query}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
+    if (reply.ok && reply.question) {
+      this.tell("");
+      this.ask_about(name, reply.question);
+    } else if (reply.ok) this.tell(`${name}: done`);
     else this.tell(`${name} was refused: ${reply.reason}`, "bad");
     // Ask again after a wrong token.
     if (reply.status === 403) this.keep("");
@@ -99,11 +120,12 @@ export class Controls {
 // Why each command cannot work now. What the page cannot know, the daemon refuses.
 function refusals(link) {
   const state = link.state();
-  const all = (reason) => ({ tare: reason, start: reason, pause: reason, resume: reason, unlock: reason });
+  const all = (reason) => ({ tare: reason, start: reason, pause: reason, resume: reason, unlock: reason, release: reason });
   if (state !== "live") return all(state === "ended" ? "the daemon has ended" : "nothing answers");
   const loop = link.get("loop.state")?.content;
+  const health = link.get("health")?.content;
   if (!loop) {
-    const waiting = "loop" in (link.get("health")?.content.tasks ?? {});
+    const waiting = "loop" in (health?.tasks ?? {});
     return { ...all(waiting ? "the loop has not begun" : "the configuration has no robot"), tare: "" };
   }
   const { phase, response } = loop;
@@ -112,10 +134,11 @@ function refusals(link) {
   const idle = busy ? "" : "no experiment runs";
   const locked = stopped || link.get("robot.state")?.content.blocked || link.get("gripper.state")?.content.fault;
   return {
-    tare: busy,
+    tare: busy || (health?.tare_refusal ?? ""),
     start: busy || (stopped ? "unlock first" : ""),
     pause: idle || (phase === "paused" ? "it is paused" : ""),
     resume: idle || (phase === "running" ? "nothing is paused" : ""),
     unlock: locked ? "" : "nothing is locked",
+    release: busy || (link.get("gripper.state") ? "" : "no gripper answers"),
   };
 }

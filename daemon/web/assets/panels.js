@@ -5,7 +5,7 @@ import { age, array, byId, interval, number, put, show, warn } from "./text.js";
 
 // Names of the UR controller's modes (RTDE guide).
 const ROBOT_MODES = { "-1": "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off", 4: "power on", 5: "idle", 6: "backdrive", 7: "running", 8: "updating" };
-const SAFETY_MODES = { 1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop", 6: "system emergency stop", 7: "robot emergency stop", 8: "violation", 9: "fault", 10: "validate joint", 11: "undefined" };
+const SAFETY_MODES = { 1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop", 6: "system emergency stop", 7: "robot emergency stop", 8: "violation", 9: "fault", 10: "validate joint", 11: "undefined", 12: "automatic mode safeguard stop", 13: "three-position enabling stop" };
 const MARK_OLD_AFTER_S = 1;
 
 // Phases with a set point.
@@ -129,7 +129,8 @@ export class FingertipPanel {
     this.drawn.map = heatmap;
     if (!heatmap) return;
     const { scores, k_low: kLow, k_high: kHigh, sigma_low: sigmaLow, sigma_high: sigmaHigh } = heatmap.content;
-    drawMap(this.part("map"), { scores: array(scores), k: [kLow, kHigh], sigma: [sigmaLow, sigmaHigh] }, heatmap.peaks);
+    const map = { scores: array(scores), k: [kLow, kHigh], kUnit: heatmap.k_unit, sigma: [sigmaLow, sigmaHigh] };
+    drawMap(this.part("map"), map, heatmap.peaks);
   }
 
   mapText(heatmap, said) {

@@ -137,7 +137,7 @@ function levels(pen, conductivity, high, x0, w, yOf) {
 export function drawMap(canvas, map, peaks) {
   const { pen, width, height } = fitted(canvas);
   const [x0, y0, w, h] = [44, 8, width - 44 - 52, height - 8 - 38];
-  const { scores, k, sigma } = map;
+  const { scores, k, kUnit, sigma } = map;
   const [rows, columns] = scores.shape;
   let [low, high] = [Infinity, -Infinity];
   for (const value of scores.values) {
@@ -151,7 +151,9 @@ export function drawMap(canvas, map, peaks) {
   pen.strokeRect(x0, y0, w, h);
   label(pen, k[1].toFixed(1), x0 - 5, y0 + 6, "right");
   label(pen, k[0].toFixed(1), x0 - 5, y0 + h - 6, "right");
-  label(pen, "k, cm", x0 - 5, y0 + h / 2, "right");
+  // The unit of k is that of the bank's model.
+  label(pen, "k", x0 - 5, y0 + h / 2, "right");
+  if (kUnit) label(pen, kUnit, x0 - 5, y0 + h / 2 + 14, "right");
   label(pen, sigma[0].toFixed(1), x0, y0 + h + 10);
   label(pen, sigma[1].toFixed(1), x0 + w, y0 + h + 10, "right");
   label(pen, "σ, cm", x0 + w / 2, y0 + h + 27, "center");

@@ -154,6 +154,12 @@ class Gripper:
     async def unlock(self) -> None:
         await self.there.wait()
 
+    async def open_by_operator(self) -> None:
+        self.asked.append("open")
+        await self.there.wait()
+        if self.error is not None:
+            raise self.error
+
 
 class Published:
     """What is published, as a list."""
@@ -188,6 +194,7 @@ class Cell:
         clock = StepClock(self.robot.flight)
         self.runner = ControlLoopRunner(self.control_loop, self.robot, self.gripper, {}, self.published, clock)
         self.task: asyncio.Task[None] | None = None
+        self.holding = True
 
     def drive(self) -> None:
         self.task = asyncio.create_task(self.runner.run())
@@ -199,7 +206,9 @@ class Cell:
 
     def sense(self) -> None:
         """Take what the sensors measure before a state of the robot."""
-        self.control_loop.on_gripper(GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False))
+        width_mm = 30.0 if self.holding else 140.0
+        status = GripperStatus(self.robot.flight.now_ns, width_mm, holding=self.holding, moving=False)
+        self.control_loop.on_gripper(status)
 
     async def cycles(self, count: int) -> None:
         for _ in range(count):

@@ -10,7 +10,8 @@ from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import Action, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
-from shearloop.drivers.emulators.scene import Twin, TwinSettings
+from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.emulators.scene import Twin, TwinSettings
 
 TICK_S = 0.008
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
@@ -111,6 +112,11 @@ def started(rig: Rig, *steps: dict[str, Any], **keys: Any) -> Rig:
     file = ExperimentFile.model_validate({"name": "test", "steps": list(steps), **keys})
     assert rig.control_loop.start(file, rig.t_ns) is None
     return rig
+
+
+def stop(rig: Rig) -> None:
+    """Stop as the operator does."""
+    rig.control_loop.stop("the operator stopped it", Fault(FaultCode.OPERATOR_STOP, "'test' was under way"))
 
 
 def phase(rig: Rig) -> ExperimentPhase:

@@ -12,7 +12,7 @@ from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentF
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.loop_runner import loop_state
 from shearloop.daemon.control.safety import FaultCode, Response
-from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, started
+from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, started, stop
 
 
 @pytest.mark.parametrize("drive", ["right", "load_cell"])
@@ -20,8 +20,8 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     rig = started(
         Rig(new_loop()),
         {"do": "approach", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0]},
-        GRIP,
         {"do": "tare"},
+        GRIP,
         {"do": "identify"},
         {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 20},
         {"do": "release"},
@@ -29,7 +29,7 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     )
     rig.run(200)
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
-    assert [type(action) for action in rig.begun] == [ApproachStep, GripStep, TareStep, GripStep]
+    assert [type(action) for action in rig.begun] == [ApproachStep, TareStep, GripStep, GripStep]
     held = np.array(rig.true_nm)[-round(15 / TICK_S) - 110 : -110]
     assert held.mean() == pytest.approx(0.1, abs=0.008)
     assert held.std() < 0.006
@@ -39,7 +39,8 @@ def test_tool_that_was_turned_after_an_experiment_is_identified_again():
     rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.15, "hold_s": 60})
     while not rig.control_loop.experiment.command.hold_number:
         rig.step()
-    rig.control_loop.stop("the operator stopped it")
+    stop(rig)
+    rig.control_loop.acknowledge()
     rig.wrist_rad -= 0.6
     started(rig, {"do": "identify"}, {"do": "wait", "wait_s": 60})
     while rig.control_loop.experiment.step_number == 1 and phase(rig) is ExperimentPhase.RUNNING:
@@ -107,7 +108,7 @@ def test_a_pause_holds_the_wrist_and_is_refused_with_the_reason():
     assert rig.control_loop.resume() is None
     rig.step()
     assert rig.speed > 0.0
-    rig.control_loop.stop("the operator said so")
+    stop(rig)
     assert rig.control_loop.pause() == "no experiment is running"
 
 
@@ -161,7 +162,8 @@ def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(sen
     )
     assert rig.control_loop.experiment is None
     assert refused({"do": "tare"}, GRIP, turning) is None
-    rig.control_loop.stop("")
+    stop(rig)
+    rig.control_loop.acknowledge()
     assert refused({"do": "release"}, turning) is None
 
 

@@ -16,13 +16,8 @@ from shearloop.daemon.control.experiment import (
     StepCommand,
     TrackTorque,
 )
-from shearloop.daemon.control.experiment_schema import (
-    STEP_KINDS,
-    ExperimentFile,
-    ExperimentLimits,
-    check_steps,
-    outline,
-)
+from shearloop.daemon.control.experiment_check import check_steps, reversals
+from shearloop.daemon.control.experiment_schema import STEP_KINDS, ExperimentFile, ExperimentLimits, outline
 
 TICK_NS = 8_000_000
 STIFFNESS_NM_PER_RAD = 0.2
@@ -103,7 +98,11 @@ def test_absolute_angles_are_the_wrists_own():
 
 def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first():
     for angle_rad, reached_rad in ((3.0, 0.5), (0.25, 0.25)):
-        bench = Bench(experiment({"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": angle_rad}))
+        bench = Bench(
+            experiment(
+                {"do": "tighten", "direction": "clockwise", "until_torque_nm": 0.1, "until_angle_rad": angle_rad}
+            )
+        )
         bench.run()
         assert bench.wrist_rad == pytest.approx(-reached_rad, abs=0.002), "clockwise is negative"
 
@@ -178,7 +177,7 @@ SMALLEST: dict[str, dict[str, Any]] = {
     "turn_to": {"angle_rad": 1.0},
     "twist": {"angles_rad": [0.3]},
     "hold_torque": {"torque_nm": 0.1},
-    "tighten": {"until_torque_nm": 0.1, "until_angle_rad": 0.3},
+    "tighten": {"direction": "clockwise", "until_torque_nm": 0.1, "until_angle_rad": 0.3},
     "wait": {"wait_s": 1},
 }
 
@@ -250,3 +249,68 @@ def test_a_steps_limits_change_only_what_they_name(own, torque_nm, angle_rad):
     )
     limits = file.limits_of(file.steps[0])
     assert (limits.torque_nm, limits.angle_rad) == (torque_nm, angle_rad)
+
+
+GRIP, TIGHTEN = {"do": "grip"}, {"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": 2.0}
+HOLD, TWIST = {"do": "hold_torque", "torque_nm": 0.08}, {"do": "twist"}
+CLOCKWISE, COUNTERCLOCKWISE = {"direction": "clockwise"}, {"direction": "counterclockwise"}
+
+
+@pytest.mark.parametrize("direction", ["clockwise", "counterclockwise"])
+def test_the_same_direction_turns_the_same_way_in_every_step(direction):
+    """The sign of an angle, of a torque and of a speed is one: counterclockwise is positive."""
+    sign = -1 if direction == "clockwise" else 1
+    given = {"direction": direction}
+    held = experiment({**HOLD, **given})
+    assert held.command.wrist.torque_nm == sign * 0.08
+    turned = experiment({**TIGHTEN, **given})
+    turned.update(TICK_NS, 0.0, 0.0)
+    assert turned.command.wrist.speed_rad_per_s * sign > 0
+    assert experiment({**HOLD, "torque_nm": sign * 0.08}).command.wrist == held.command.wrist
+
+
+@pytest.mark.parametrize("step", [TIGHTEN, {**HOLD, "torque_nm": -0.08, **CLOCKWISE}])
+def test_a_turn_of_unknown_or_twofold_direction_is_refused(step):
+    with pytest.raises(ValidationError, match="direction"):
+        experiment(step)
+
+
+@pytest.mark.parametrize(
+    ("steps", "found"),
+    [
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, HOLD], [(3, "counterclockwise", 2, "clockwise")]),
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**HOLD, **CLOCKWISE}], []),
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {"do": "release"}, GRIP, HOLD], []),
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**TIGHTEN, **COUNTERCLOCKWISE}], [(3, "counterclockwise", 2, "clockwise")]),
+        ([GRIP, HOLD, {**HOLD, "torque_nm": -0.08}, HOLD], [(3, "clockwise", 2, "counterclockwise"),
+                                                            (4, "counterclockwise", 3, "clockwise")]),
+        # Angles count from the grip: 0.1 rad lies behind a tool that was turned clockwise.
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**TWIST, "angles_rad": [0.1]}], [(3, "counterclockwise", 2, "clockwise")]),
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**TWIST, "angles_rad": [-2.1]}], []),
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**TWIST, "angles_rad": [-1.0]}], []),
+        ([GRIP, {**TWIST, "angles_rad": [0.2], "return_to_start": False}, {**TWIST, "angles_rad": [0.1]}],
+         [(3, "clockwise", 2, "counterclockwise")]),
+        ([GRIP, {**TWIST, "angles_rad": [0.2]}, {**TWIST, "angles_rad": [-0.1]}], []),
+    ],
+)  # fmt: skip
+def test_every_step_that_turns_a_held_tool_back_is_found(steps, found):
+    file = ExperimentFile.model_validate({"name": "one", "steps": steps})
+    assert list(reversals(file)) == found
+
+
+@pytest.mark.parametrize(
+    ("tighten", "hold", "refused"),
+    [
+        (CLOCKWISE, {}, True),
+        (COUNTERCLOCKWISE, {"torque_nm": -0.08}, True),
+        (CLOCKWISE, {"torque_nm": -0.08}, False),
+        (CLOCKWISE, COUNTERCLOCKWISE, False),
+        (COUNTERCLOCKWISE, {}, False),
+    ],
+)
+def test_a_torque_that_undoes_a_tightening_by_its_sign_alone_is_refused(tighten, hold, refused):
+    steps = [GRIP, {"do": "identify"}, {**TIGHTEN, **tighten}, {**HOLD, **hold}]
+    file = ExperimentFile.model_validate({"name": "one", "steps": steps})
+    mistakes = [text for place, text in check_steps(file) if place == ("steps", 3)]
+    assert len(mistakes) == refused
+    assert not refused or f"write `direction: {tighten['direction']}`" in mistakes[0]

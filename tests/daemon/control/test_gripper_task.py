@@ -8,17 +8,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from shearloop.bank.confidence import TWO_SIDED_95
 from shearloop.daemon.control import gripper_task
 from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus
-from shearloop.daemon.errors import ActionError
-from shearloop.daemon.sensing.fingertip_diameters import FingertipDiameters
 from shearloop.drivers.errors import DriverError
-from tests.daemon.conftest import DEADLINE_S
+from shearloop.errors import ActionError
+from shearloop.estimation.confidence import TWO_SIDED_95
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
+from tests.fixtures.daemons import DEADLINE_S
 
 GRIP = GripStep(do="grip", width_mm=0.0, force_n=40.0)
 

@@ -13,8 +13,8 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSample
 from shearloop.daemon.control.safety import Response
-from shearloop.drivers.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
+from shearloop.emulators.scene import Twin, TwinSettings
 from tests.daemon.control.cell import GRIP, Cell, Gripper, driven
 from tests.daemon.control.loop_rig import EIT, new_loop
 from tests.drivers.ur.flight import CYCLE_NS, LIMITS, FakeArm
@@ -33,7 +33,10 @@ STEPS = st.one_of(
         st.floats(0, 1),
     ),
     st.builds(
-        lambda t, a, v: {"do": "tighten", "until_torque_nm": t, "until_angle_rad": a, "speed_rad_per_s": v},
+        lambda to, t, a, v: {
+            "do": "tighten", "direction": to, "until_torque_nm": t, "until_angle_rad": a, "speed_rad_per_s": v
+        },
+        st.sampled_from(["clockwise", "counterclockwise"]),
         st.floats(0.01, 2),
         st.floats(0.01, 6),
         SPEEDS,

@@ -13,10 +13,10 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, along_tool
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
+from shearloop.errors import ActionError
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment, no_tick
 from tests.drivers.ur.flight import SETTINGS
 
@@ -98,9 +98,10 @@ async def test_who_waits_for_an_experiments_end_is_told_of_that_one():
         first = cell.control_loop.experiment
         waiting = asyncio.create_task(cell.runner.experiment_ended())
         await cell.cycles(5)
-        cell.control_loop.stop("the operator said stop")
+        cell.runner.stop()
         # The next one begins before whoever waits has had his turn.
         cell.control_loop.tick(cell.robot.flight.now_ns)
+        cell.control_loop.acknowledge()
         again = {"name": "again", "torque_source": WRENCH, "steps": [{"do": "wait", "wait_s": 60}]}
         assert cell.control_loop.start(ExperimentFile.model_validate(again), cell.robot.flight.now_ns) is None
         async with asyncio.timeout(20):

@@ -106,7 +106,7 @@ HAPPENINGS: dict[str, Callable[[Story], Any]] = {
     "wait long": lambda story: story.go(90),
     "pause": lambda story: story.cell.control_loop.pause(),
     "resume": lambda story: story.cell.control_loop.resume(),
-    "stop": lambda story: story.cell.control_loop.stop("the operator said stop"),
+    "stop": lambda story: story.cell.runner.stop(),
     "protective stop": lambda story: story.protective_stop(),
     "resumed at the pendant": lambda story: story.resumed(),
     "program ends": lambda story: story.arm.end_program(),

@@ -25,7 +25,7 @@ async def gripping() -> AsyncIterator[Cell]:
 async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once():
     async with gripping() as cell:
         assert cell.gripper.asked == ["grip"]
-        cell.control_loop.stop("the operator said stop")
+        cell.runner.stop()
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip", "halt"]
 
@@ -39,9 +39,10 @@ async def test_a_grip_that_has_failed_stops_the_fingers_once(error):
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip", "halt"]
         cell.gripper.error = None
+        cell.control_loop.acknowledge()
         await cell.start(GRIP, {"do": "wait", "wait_s": 60})
         await cell.cycles(20)
-        cell.control_loop.stop("the operator said stop")
+        cell.runner.stop()
         await cell.cycles(20)
         await cell.runner.halt_and_wait()
         assert cell.gripper.asked == ["grip", "halt", "grip"]
@@ -49,7 +50,7 @@ async def test_a_grip_that_has_failed_stops_the_fingers_once(error):
 
 async def test_a_stop_after_a_grip_leaves_the_fingers_alone():
     async with driven(GRIP, {"do": "wait", "wait_s": 60}, cycles=50) as cell:
-        cell.control_loop.stop("the operator said stop")
+        cell.runner.stop()
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip"]
 
@@ -98,7 +99,7 @@ async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch):
             raise DriverError("the gripper does not answer")
 
         monkeypatch.setattr(cell.gripper, "halt", does_not)
-        cell.control_loop.stop("the operator said stop")
+        cell.runner.stop()
         await cell.cycles(20)
         reasons = [one.reasons for one in cell.published.messages if one.topic == "loop.state"]
         assert any("keep clear of them: the gripper does not answer" in one for one in reasons)

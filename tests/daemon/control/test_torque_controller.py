@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.torque_controller import AngleHistory, ControllerReason, JumpDetector, TorqueController
-from shearloop.daemon.errors import UserError
+from shearloop.errors import UserError
 
 from .conftest import Bench
 

@@ -12,15 +12,15 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.cli.command import COMMANDS
+from shearloop.cli.command import COMMANDS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, CommandServer, RequestExecutor
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.errors import UserError
 from tests.running import running
 
 
@@ -135,7 +135,8 @@ def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
 
 async def test_tare_is_refused_during_an_experiment():
     tared: list[str] = []
-    loop = SimpleNamespace(running=SimpleNamespace(file=SimpleNamespace(name="hold")))
+    refusal: list[str | None] = ["the experiment 'hold' is running, and a new zero would change its torques"]
+    loop = SimpleNamespace(tare_refusal=lambda *, confirmed: None if confirmed else refusal[0])
     sensors = {name: SimpleNamespace(tare=partial(tared.append, name)) for name in ("right", "load_cell")}
     commands = Commands(
         rig=SimpleNamespace(control_loop=loop),
@@ -151,7 +152,9 @@ async def test_tare_is_refused_during_an_experiment():
         ):
             await tare(request_)
     assert tared == []
-    loop.running = None
+    assert await tare({"confirmed": True}) == {"tared": ["right", "load_cell"]}
+    tared.clear()
+    refusal[0] = None
     assert await tare({"source": "load_cell"}) == {"tared": ["load_cell"]}
     assert await tare({}) == {"tared": ["right", "load_cell"]}
     assert tared == ["load_cell", "right", "load_cell"]

@@ -16,8 +16,7 @@ import zmq.asyncio
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.cli import main
-from shearloop.daemon.errors import UserError
+from shearloop.cli import main
 from shearloop.daemon.messaging.bound_sockets import MAX_CONNECTIONS, RESERVED_DESCRIPTORS, most_connections
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.command_server import (
@@ -33,7 +32,8 @@ from shearloop.daemon.messaging.stop_client import send_to_stop_socket, stop_nam
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from shearloop.daemon.supervisor import resident_memory_mb
-from tests.daemon.conftest import DEADLINE_S, free_port, running_daemon
+from shearloop.errors import UserError
+from tests.fixtures.daemons import DEADLINE_S, free_port, running_daemon
 from tests.running import running
 
 DESCRIPTORS, CONNECTIONS = 512, 1200

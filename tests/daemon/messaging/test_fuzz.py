@@ -21,7 +21,7 @@ from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.supervisor import resident_memory_mb
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import CommandReply
-from tests.daemon.conftest import running_daemon
+from tests.fixtures.daemons import running_daemon
 
 FRAMES = REQUESTS = 50_000
 DEADLINE_S = 120

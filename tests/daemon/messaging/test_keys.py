@@ -10,7 +10,6 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import has_valid_port, is_local, needs_keys
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.client import Subscriber
@@ -18,7 +17,8 @@ from shearloop.daemon.messaging.keys import ClientKeys, KeyPair, load_key_pair, 
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
-from tests.daemon.conftest import DEADLINE_S, running_daemon
+from shearloop.errors import UserError
+from tests.fixtures.daemons import DEADLINE_S, running_daemon
 
 NETWORK = "tcp://0.0.0.0:*"
 # How long somebody is waited for who is not to be heard.

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from shearloop.daemon.messaging.messages import TOPICS, EitHeatmap, Message, RobotStateMessage, decode, encode, wire_map
-from tests.daemon.sample_messages import sample
+from tests.sample_messages import sample
 
 SCALARS = st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | st.text()
 ARRAYS = hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=3, max_side=8))

@@ -7,12 +7,12 @@ import pytest
 import zmq
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.client import Subscriber, receive_messages
 from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, decode, encode
 from shearloop.daemon.messaging.publisher import MAX_UNKNOWN_TOPICS, Publisher
-from tests.daemon.conftest import DEADLINE_S
-from tests.daemon.sample_messages import sample
+from shearloop.errors import UserError
+from tests.fixtures.daemons import DEADLINE_S
+from tests.sample_messages import sample
 
 Connect = Callable[..., "zmq.Socket[bytes]"]
 

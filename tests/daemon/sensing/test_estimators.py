@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import Calibration, Estimate, FrameSeries, fit
-from shearloop.daemon.cli.check import _torque
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator, open_combined, open_estimator
 from shearloop.drivers.eit_kit import Frame
-from tests.bank.estimation.conftest import IDLE_S, PERIOD_S, twisting
+from shearloop.errors import UserError
+from shearloop.estimation import Calibration, Estimate, FrameSeries, fit
+from shearloop.tools.check import _torque
+from tests.estimation.conftest import IDLE_S, PERIOD_S, twisting
 
 NO_CHANNEL = np.zeros(896, bool)
 NAME = "motion_regression"

@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Estimate
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.loop_inputs import TorqueSample
-from shearloop.daemon.errors import ActionError
 from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
+from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, DeadElectrodes, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.errors import ActionError
+from shearloop.estimation import Estimate
 from tests.running import running
 
 MS = 1_000_000
@@ -53,6 +54,7 @@ class FakeEstimator:
 
     taring = False
     reason = "nothing"
+    table = PAPER_TABLE
     why_no_torque = ""
 
     def __init__(self, fails: int = -1, waits: int = -1) -> None:
@@ -264,3 +266,14 @@ async def test_tare_that_times_out_says_why_its_frames_were_refused():
 
 def test_the_configured_frame_period_is_the_boards():
     assert FingertipConfig.model_fields["frame_period_s"].default == FRAME_PERIOD_S
+
+
+def test_health_and_log_name_the_electrode_whose_channels_are_dead(log):
+    own, electrode = DeadElectrodes(), (PAPER_TABLE.electrodes == 5).any(axis=1)
+    for dead in (NONE, electrode, NONE, electrode):
+        own.update("right", PAPER_TABLE, dead)
+        assert bool(own.sentence) == bool(dead.any())
+    assert "56 channels of electrode 5 (pin 6)" in own.sentence
+    assert log.said == [own.sentence]
+    own.update("right", PAPER_TABLE, np.arange(896) == 500)
+    assert own.sentence == ""

@@ -2,13 +2,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.estimation import Estimate, Measured
-from shearloop.daemon.sensing.fingertip_diameters import (
+from shearloop.daemon.control.fingertip_diameters import (
     STALE_AFTER_NS,
     FingertipDiameters,
     tool_as_bytes,
     tool_from_bytes,
 )
+from shearloop.estimation import Estimate, Measured
 
 
 def estimate(diameter_mm: float, half_width_mm: float) -> Estimate:

@@ -39,6 +39,8 @@ def test_install_and_uninstall(tmp_path, place):
     for name in PLACES.values():
         assert f"write {tmp_path / name}" in said
     assert "shearloop:x:" in (tmp_path / "etc/passwd").read_text()
+    dialout = next(row for row in (tmp_path / "etc/group").read_text().splitlines() if row.startswith("dialout:"))
+    assert "shearloop" in dialout.split(":")[3].split(",")
     recordings = (tmp_path / "var/lib/shearloop/recordings").stat()
     assert recordings.st_mode & 0o777 == 0o750
     assert f"shearloop:x:{recordings.st_uid}:" in (tmp_path / "etc/passwd").read_text()

@@ -12,12 +12,12 @@ import zmq
 
 from shearloop.daemon import supervisor as supervision
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.process import lock_memory
 from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import Supervisor, TaskRecord
-from tests.daemon.conftest import DEADLINE_S, shearloop
+from shearloop.errors import UserError
+from tests.fixtures.daemons import DEADLINE_S, shearloop
 from tests.running import running
 
 

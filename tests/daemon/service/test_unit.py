@@ -125,7 +125,7 @@ def applied(rules: str, device: dict[str, str]) -> dict[str, str]:
                 if key == "GOTO":
                     wanted = value
                 elif sign in ("=", "+=") and key != "LABEL":
-                    given[key] = value.replace("$env{ID_SERIAL_SHORT}", device.get("ENV{ID_SERIAL_SHORT}", ""))
+                    given[key] = re.sub(r"\$(env\{\w+\})", lambda name: device.get(name[1].upper(), ""), value)
     assert not wanted, f"there is no LABEL {wanted}"
     return given
 
@@ -136,6 +136,7 @@ TEENSY = {
     "ENV{ID_BUS}": "usb",
     "ENV{ID_VENDOR_ID}": "16c0",
     "ENV{ID_SERIAL_SHORT}": "12345670",
+    "ENV{ID_PATH}": "pci-0000:00:14.0-usb-0:2:1.0",
 }
 
 
@@ -150,15 +151,17 @@ def test_boards_are_linked_by_serial_number_and_owned_by_the_service(vendor):
     }
 
 
+@pytest.mark.parametrize("vendor", ["16c0", "2341", "2a03", "1a86", "0403"])
+@pytest.mark.parametrize("path", [TEENSY["ENV{ID_PATH}"], ""])
+def test_boards_without_a_serial_number_are_the_services_too_and_linked_by_socket(vendor, path):
+    copy = {"ENV{ID_VENDOR_ID}": vendor, "ENV{ID_SERIAL_SHORT}": "", "ENV{ID_PATH}": path}
+    given = applied(service_file("60-shearloop.rules"), {**TEENSY, **copy})
+    link = {"SYMLINK": f"shearloop/{path}"} if path else {}
+    assert given == {"GROUP": "shearloop", "MODE": "0660", "ENV{ID_MM_DEVICE_IGNORE}": "1", **link}
+
+
 @pytest.mark.parametrize(
-    "other",
-    [
-        {"ACTION": "remove"},
-        {"SUBSYSTEM": "block"},
-        {"ENV{ID_BUS}": "pci"},
-        {"ENV{ID_VENDOR_ID}": "046d"},
-        {"ENV{ID_SERIAL_SHORT}": ""},
-    ],
+    "other", [{"ACTION": "remove"}, {"SUBSYSTEM": "block"}, {"ENV{ID_BUS}": "pci"}, {"ENV{ID_VENDOR_ID}": "046d"}]
 )
 def test_other_devices_are_ignored(other):
     assert applied(service_file("60-shearloop.rules"), {**TEENSY, **other}) == {}

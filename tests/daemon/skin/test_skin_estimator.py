@@ -9,13 +9,13 @@ from random import Random
 import numpy as np
 import pytest
 
-from shearloop.bank.skin.calibration import CalibrationTable, SkinCalibration, fit_calibration, load_calibration
-from shearloop.bank.skin.characterisation import loop
-from shearloop.bank.skin.membrane import Direction
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
-from shearloop.daemon.synthetic_skin import CONTACT_N_PER_MM, REST_OHM, SyntheticSkin
 from shearloop.drivers.defaults import DRIFT_PER_HOUR
 from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
+from shearloop.emulators.synthetic_skin import CONTACT_N_PER_MM, REST_OHM, SyntheticSkin
+from shearloop.estimation.skin.calibration import CalibrationTable, SkinCalibration, fit_calibration, load_calibration
+from shearloop.estimation.skin.membrane import Direction
+from shearloop.studies.skin.characterisation import loop
 
 NOISE = 1e-4
 PERIOD_NS = 100_000_000

@@ -11,10 +11,10 @@ import yaml
 
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.control.loop_runner import tare_all
-from shearloop.daemon.errors import ActionError
-from shearloop.daemon.synthetic_skin import SyntheticSkin
-from shearloop.drivers.emulators.skin import SkinInstruments
-from tests.daemon.conftest import ask, collector, running_daemon
+from shearloop.emulators.skin import SkinInstruments
+from shearloop.emulators.synthetic_skin import SyntheticSkin
+from shearloop.errors import ActionError
+from tests.fixtures.daemons import ask, collector, running_daemon
 from tests.running import running
 
 CALIBRATION = Path(__file__).parents[3] / "config" / "calibrations" / "skin_demo.yaml"
@@ -197,7 +197,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ({}, "nothing is measured: give `fingertips`, a `skin`, or both"),
+        ({}, "nothing is measured: give `fingertips`, a `skin` or a `load_cell`"),
         ({"skin": section({**ADC, **SCANNER})}, "skin.daq: give either scanner or adc, and not both"),
         ({"skin": section({})}, "skin.daq: give either scanner or adc, and not both"),
         ({"skin": section(ADC, source={})}, "skin.source: give either socket or serial"),

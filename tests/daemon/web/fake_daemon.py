@@ -54,7 +54,7 @@ def messages() -> dict[str, dict[str, Any]]:
 
 
 MESSAGES = messages()
-COMMANDS = ("tare", "start", "pause", "resume", "unlock", "stop")
+COMMANDS = ("tare", "start", "pause", "resume", "unlock", "release", "stop")
 
 
 def made(given: Mapping[str, Any]) -> Message:
@@ -102,7 +102,9 @@ async def serve(folder: Path) -> None:
     """Accept every command, or refuse it with the sentence that stands in the file."""
 
     def handler(name: str) -> Callable[[Mapping[str, Any]], Any]:
-        async def handle(_: Mapping[str, Any]) -> dict[str, Any]:
+        async def handle(request: Mapping[str, Any]) -> dict[str, Any]:
+            if request.get("ask"):
+                return {"question": f"Really {name}? The first motion is told."}
             with (folder / "asked").open("a") as asked:
                 asked.write(f"{name}\n")
             refusal = json.loads((folder / "changed").read_text())["refusal"]

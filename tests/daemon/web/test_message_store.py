@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.models import conductivity as conductivity_of_mesh
+from shearloop.bank.models import conductivity as conductivity_of_mesh
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.web.message_store import HEIGHTS, MAX_STREAMS, MessageStore, conductivity_profile, page_json
-from tests.bank.conftest import small_fingertip
+from tests.fixtures.physics import small_fingertip
 
 
 def message(source: str = "right", **content: Any) -> dict[str, Any]:
@@ -154,3 +154,10 @@ def test_k_and_sigma_are_marked_only_where_they_are_heights(model, labels, meani
     assert shown["marks"] == [[2.0 + offsets[label], label] for label in labels]
     assert shown["meaning"].startswith(meaning)
     assert bool(shown["meaning"]) == bool(meaning)
+
+
+@pytest.mark.parametrize(("model", "unit"), [("linear", "cm"), ("modulated_gaussian", "rad/cm"), ("unknown", "")])
+def test_a_heatmap_tells_the_unit_of_k(model, unit):
+    latest = MessageStore(3.6)
+    latest.add("eit.heatmap", message(scores=np.ones((3, 3)), model=model), 1.0)
+    assert batch(latest)["messages"][0]["k_unit"] == unit

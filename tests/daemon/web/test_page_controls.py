@@ -7,7 +7,7 @@ import pytest
 from tests.daemon.web.fake_daemon import MESSAGES, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
-COMMANDS = ("tare", "start", "pause", "resume", "unlock")
+COMMANDS = ("tare", "start", "pause", "resume", "unlock", "release")
 SIZES = {
     "phone": (390, 844),
     "upright tablet": (820, 1180),
@@ -17,12 +17,13 @@ SIZES = {
 }
 # A phase of the loop, with what the robot reports, and the commands that work in it.
 PHASES = [
-    ("idle", {}, {"tare", "start"}),
+    ("idle", {}, {"tare", "start", "release"}),
+    ("idle", {"health": {"tare_refusal": "its fingers hold something"}}, {"start", "release"}),
     ("running", {}, {"pause"}),
     ("paused", {}, {"resume"}),
     ("held", {}, {"pause", "resume"}),
-    ("stopped", {"loop": {"response": "stop and keep grip"}}, {"tare", "unlock"}),
-    ("idle", {"robot": {"blocked": "The robot is in a protective stop."}}, {"tare", "start", "unlock"}),
+    ("stopped", {"loop": {"response": "stop and keep grip"}}, {"tare", "unlock", "release"}),
+    ("idle", {"robot": {"blocked": "The robot is in a protective stop."}}, {"tare", "start", "unlock", "release"}),
 ]
 # Text that is wider than its element, and labels that end outside the screen.
 CUT = """() => [...document.querySelectorAll('button, dt, dd, summary, figcaption, h2, p, .legend span')]
@@ -80,6 +81,10 @@ def test_commands_reach_the_daemon_with_the_token(browsed):
         assert all(name in reasons for name in set(COMMANDS) - enabled)
         for name in sorted(enabled):
             page.click(f"[data-command={name}]")
+            if name in ("start", "release"):
+                browsed.until("#question-text", f"Really {name}? The first motion is told.")
+                assert browsed.daemon.asked == sent, "the first press moves nothing"
+                page.click("#confirm")
             browsed.until("#answer", f"{name}: done")
             sent.append(name)
     assert browsed.daemon.asked == sent
@@ -93,7 +98,7 @@ def test_a_rig_without_a_robot_offers_only_tare(browsed):
     browsed.viewer.kill()
     browsed.daemon.say(loop=None, health={"tasks": {"right": {"alive": True}}})
     browsed.viewer.start()
-    browsed.until("#controls-reason", "start, pause, resume, unlock: the configuration has no robot")
+    browsed.until("#controls-reason", "start, pause, resume, unlock, release: the configuration has no robot")
     assert page.locator("[data-command]:enabled").all_inner_texts() == ["Tare"]
 
 
@@ -113,8 +118,8 @@ def test_the_keyboard_reaches_everything_and_stop_first(browsed):
                 }"""
             )
         )
-    assert [each["name"] for each in reached][:4] == ["stop", "tare", "start", "SUMMARY"]
-    assert all(each["ring"] != "none" for each in reached[:4]), "where the keyboard is can be seen"
+    assert [each["name"] for each in reached][:5] == ["stop", "tare", "start", "release", "SUMMARY"]
+    assert all(each["ring"] != "none" for each in reached[:5]), "where the keyboard is can be seen"
     page.focus("#stop")
     page.keyboard.press("Enter")
     browsed.until("#answer", "stopped: hold 0.10 N·m")

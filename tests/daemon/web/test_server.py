@@ -22,10 +22,8 @@ from aiohttp import web
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.bank_config import FingertipGeometryConfig
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config_file import load_yaml_model
-from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
 from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
@@ -49,8 +47,10 @@ from shearloop.daemon.web.server import (
     serve,
     token_valid,
 )
-from tests.daemon.conftest import DEADLINE_S, free_port, running_daemon, shearloop
-from tests.daemon.sample_messages import sample
+from shearloop.errors import UserError
+from shearloop.tools.bank_config import FingertipGeometryConfig
+from tests.fixtures.daemons import DEADLINE_S, free_port, running_daemon, shearloop
+from tests.sample_messages import sample
 
 TOKEN = "the token of this test, long enough for anybody"  # noqa: S105 - opens nothing but this test's page
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -453,7 +453,7 @@ async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(conf
     async with running_daemon(config(**places, curve=curve)) as daemon:
         async with page_of(places, tmp_path, "ada") as page:
             assert await page.hears()
-            for command in ("tare", "start", "pause", "resume", "unlock"):
+            for command in ("tare", "start", "pause", "resume", "unlock", "release"):
                 assert (await post(page, f"/commands/{command}"))[0] == 403, command
             bearer = {"Authorization": f"Bearer {page.token}"}
             assert await post(page, "/commands/tare", **bearer) == (200, {"ok": True, "tared": ["right"]})

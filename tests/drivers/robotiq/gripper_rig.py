@@ -14,11 +14,11 @@ from unittest.mock import patch
 import pytest
 
 from shearloop.drivers.connection import LinkMonitor
-from shearloop.drivers.emulators.gripper import Gripper, ModbusSlave, UrcapSession
-from shearloop.drivers.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.emulators.gripper import Gripper, ModbusSlave, UrcapSession
+from shearloop.emulators.ports import PtyServer, Server, SocketServer
 from tests.running import LinkEvents
 
 STEP_S = 0.01

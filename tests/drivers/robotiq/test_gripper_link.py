@@ -5,9 +5,9 @@ import contextlib
 
 import pytest
 
-from shearloop.drivers.emulators.gripper import ModbusSlave
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand
+from shearloop.emulators.gripper import ModbusSlave
 from tests.drivers.robotiq.gripper_rig import WAYS, a_rig
 
 # A reply over Modbus has 0.3 s, which a busy computer exceeds.

@@ -3,14 +3,17 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError, ProtocolError
 from shearloop.drivers.robotiq import messages, modbus_client
-from shearloop.drivers.robotiq.gripper import WidthCalibration
-from shearloop.drivers.robotiq.socket_client import readout_of, set_lines, take_answer, value_of
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.models import MODELS
+from shearloop.drivers.robotiq.socket_client import SocketClient, readout_of, set_lines, take_answer, value_of
+from shearloop.emulators.gripper import Fingers
 
 byte = st.integers(0, 255)
 
@@ -126,6 +129,45 @@ def test_gauges_give_the_line_they_were_measured_on_and_its_scatter():
     # A bump of 2 counts in the second of four even points leaves 2² (1 − 1/4 − 1/20), over two degrees of freedom, and
     # tilts the line by 2 · (−5 mm) / 500 mm².
     assert off.std_mm == pytest.approx(2 * (0.7 / 2) ** 0.5 / (220 / 140 + 0.02))
+
+
+@pytest.mark.parametrize("model", sorted(MODELS))
+@pytest.mark.parametrize(("opened", "bow"), [(3.0, 0.0), (13.0, 0.03), (13.0, -0.03)])
+def test_gauges_of_each_model_give_its_stroke_its_first_count_and_its_bow(model, opened, bow):
+    stroke_mm = MODELS[model].stroke_mm
+    fingers = Fingers(MODELS[model], open_counts=opened, bow_mm=bow * stroke_mm)
+    widths = [part * stroke_mm for part in (0.1, 0.3, 0.5, 0.7, 0.9)]
+    found = WidthCalibration.of_gauges([(round(fingers.counts(width)), width) for width in widths], model)
+    errors_mm = [found.width_mm(fingers.counts(part * stroke_mm)) - part * stroke_mm for part in np.linspace(0, 1, 50)]
+    step_mm = stroke_mm / (fingers.closed_counts - opened)
+    assert found.model == model
+    assert np.abs(errors_mm).max() < 2 * step_mm, "a line would be wrong by 3 % of the stroke"
+    assert found.width_std_mm < 1.5 * step_mm
+    assert found.bow_mm == pytest.approx(fingers.bow_mm, abs=step_mm)
+    assert all(abs(found.width_mm(found.counts(width)) - width) <= step_mm for width in widths)
+
+
+def test_few_gauges_cannot_see_a_bow_and_say_so():
+    fingers = Fingers(MODELS["2F-85"], bow_mm=2.0)
+    found = WidthCalibration.of_gauges([(fingers.counts(width), width) for width in (5.0, 80.0)], "2F-85")
+    assert found.width_std_mm > abs(found.width_mm(fingers.counts(42.5)) - 42.5)
+
+
+def test_an_object_that_does_not_fit_between_the_fingers_is_refused():
+    with pytest.raises(DeviceCalibrationError, match="60 mm does not fit between the fingers of a Hand-E"):
+        WidthCalibration.of_gauges([(100.0, 20.0), (3.0, 60.0)], "Hand-E")
+
+
+@pytest.mark.parametrize("model", sorted(MODELS))
+def test_counts_of_speed_and_force_are_those_of_the_model(model):
+    own, gripper = MODELS[model], RobotiqGripper(SocketClient("localhost"), WidthCalibration.nominal(model))
+    for part, counts in ((0.0, 0), (1.0, 255)):
+        asked = messages.GripperCommand(
+            own.stroke_mm * (1 - part), *(low + part * (high - low) for low, high in (own.speed_mm_s, own.force_n))
+        )
+        sent = gripper.request_of(asked)
+        assert (sent.speed, sent.force) == (counts, counts)
+        assert sent.position == (own.closed_counts if part else own.open_counts)
 
 
 @pytest.mark.parametrize(

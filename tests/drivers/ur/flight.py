@@ -71,6 +71,9 @@ class FakeArm:
         self.accepts = True
         self.stops_moves = True
         self.unlockable = self.stoppable = True
+        # The controller's words against a request: of an error, and of an answer that may be ignored.
+        self.refuses: dict[str, str] = {}
+        self.ignores: dict[str, str] = {}
         self.stale_command = False
         self._resumed_target = 0.0
         self._watched = False
@@ -156,8 +159,12 @@ class FakeArm:
         self.note("zero_wrench")
         return True
 
-    def ask_dashboard(self, *requests: str) -> None:
+    def ask_dashboard(self, *requests: str) -> str:
         self.calls.append(requests[0])
+        if requests[0] in self.refuses:
+            raise DriverError(self.refuses[requests[0]])
+        if requests[0] in self.ignores:
+            return self.ignores[requests[0]]
         match requests[0]:
             case "unlock protective stop":
                 if not self.unlockable:
@@ -171,6 +178,7 @@ class FakeArm:
                 if not self.stoppable:
                     raise DriverError("the dashboard does not answer")
                 self.end_program()
+        return ""
 
     def upload(self) -> bool:
         self.calls.append("upload")

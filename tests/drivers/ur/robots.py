@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.connection import LinkMonitor, LinkObserver
-from shearloop.drivers.emulators.ur_robot import Robot
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
 from shearloop.drivers.ur.script import guard_script
 from shearloop.drivers.ur.settings import UrSettings, read_settings
+from shearloop.emulators.ur_robot import Robot
 
 ROOT = Path(__file__).parents[3]
 

@@ -5,9 +5,9 @@ import itertools
 
 import pytest
 
-from shearloop.drivers.emulators.ur_robot import PLAYING, Robot
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, NO_MOTION_S
+from shearloop.emulators.ur_robot import PLAYING, Robot
 from tests.drivers.ur import robots
 from tests.drivers.ur.flight import AT_REST, CYCLE_NS, FakeArm, Flight, flying
 from tests.drivers.ur.robots import DELIVERED, VERSIONS, control_script, do, send

@@ -1,1 +1,0 @@
-"""The EIT fingertip: channels, mesh, forward models, basis models, banks and matching."""

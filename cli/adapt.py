@@ -1,0 +1,50 @@
+"""`shearloop adapt CAL REC… --out NEW`: correct a calibration's gain by twists of known torque."""
+
+import argparse
+from pathlib import Path
+
+from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, load_calibration, time_range
+from shearloop.cli.terminal import print_result
+from shearloop.tools.outputs import check_overwrite
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    add_option(parser, "calibration", Path, "CAL", "made by `shearloop calibrate` on recordings")
+    add_option(parser, "recordings", Path, "REC", "recordings (.mcap) of a grip with a twist or more", nargs="+")
+    add_option(parser, "--out", Path, "NEW", "calibration to write", required=True)
+    add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
+    text = "share of each recording whose twists count, e.g. 0:0.2; earlier frames show the idle fingertip"
+    add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
+    text = "delay of the load cell's timestamps, which is subtracted"
+    add_option(parser, "--load-cell-delay-s", DELAY_S, "S", text, default=0.0)
+    add_option(parser, "--tool-mm", TOOL_MM, "MM", "diameter of the tool, if the recording does not name it")
+    add_json(parser)
+    parser.epilog = (
+        "The gain of each fingertip changes between grips. One twist of known torque corrects most of it; the "
+        "correction is the smaller, the less the twists agree. Use the result for this grip, and CAL for the next one."
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Adapt, write, and print the gains."""
+    from shearloop.bank.bank_file import Bank
+    from shearloop.estimation import Physics
+    from shearloop.estimation.calibration import ARCHIVE_MAGIC
+    from shearloop.tools.calibrate import adapt_to_recordings
+
+    check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
+    physics = Physics(bank=Bank.open(args.bank) if args.bank else None)
+    adapted, correction = adapt_to_recordings(
+        load_calibration(args.calibration), args.recordings, physics,
+        time_range=args.time_range, load_cell_delay_s=args.load_cell_delay_s, tool_mm=args.tool_mm,
+    )  # fmt: skip
+    adapted.save(args.out)
+    factors, errors = correction.factors.tolist(), correction.errors.tolist()
+    names = adapted.sides if len(factors) == len(adapted.sides) else (" and ".join(adapted.sides),)
+    gains = {name: {"gain": gain, "error": error} for name, gain, error in zip(names, factors, errors, strict=True)}
+    sentences = [f"{name}: torque times {one['gain']:.2f} ± {one['error']:.2f}." for name, one in gains.items()]
+    twists = correction.twists
+    sentences.append(f"{twists} twist{'s' * (twists > 1)} of known torque decided. Written to {args.out}.")
+    figures = {"path": str(args.out), "gains": gains, "twists": twists, "gain_spread": correction.spread.between}
+    return print_result(figures, sentences, as_json=args.json)

@@ -1,0 +1,51 @@
+"""`shearloop calibrate creep REC… --calibration CAL`: fit the gel's creep under a held twist."""
+
+import argparse
+from pathlib import Path
+
+from shearloop.cli.options import add_json, add_option, read_judged
+from shearloop.cli.terminal import print_result
+from shearloop.words import counted
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    add_option(parser, "recordings", Path, "REC", "recordings (.mcap) of held twists, best ten", nargs="+")
+    add_option(parser, "--calibration", Path, "CAL", "calibration of the estimator for the loop", required=True)
+    add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
+    add_json(parser)
+    parser.epilog = "Prints the line `creep:` for the fingertip, or for `combined`, in the configuration."
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate every frame, fit, and print the line for the configuration."""
+    from shearloop.bank.bank_file import Bank
+    from shearloop.tools.creep import fit_creep, grips_of
+    from shearloop.tools.evaluate import estimate_series
+    from shearloop.tools.frame_series import check_no_copies
+
+    calibration, named = read_judged(args.calibration, args.recordings)
+    check_no_copies([(str(path), one) for path, one in named])
+    bank = Bank.open(args.bank) if args.bank else None
+    grips = [grip for _, one in named for grip in grips_of(estimate_series(calibration, one, bank))]
+    found = fit_creep(grips)
+    share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)
+    result = {
+        "share": share,
+        "time_s": time_s,
+        "grips": len(grips),
+        "frames": sum(grip.t_s.size for grip in grips),
+        "error_before_nm": found.before_nm,
+        "error_after_nm": found.after_nm,
+        "scale": found.scale,
+        "offset_nm": found.offset_nm,
+    }
+    sentences = [
+        f"creep: {{share: {share:g}, time_s: {time_s:g}}}",
+        f"From {result['frames']} frames of {counted(len(grips), 'grip')}: the estimates, scaled by {found.scale:.3f} "
+        f"and shifted by {1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} "
+        f"mN·m instead of {1e3 * found.before_nm:.1f} (standard deviation).",
+        "The line above does not correct scale and zero. If the scale is far from 1, calibrate the estimator again; if "
+        "the shift is far from 0, tare untouched.",
+    ]
+    return print_result(result, sentences, as_json=args.json)

@@ -1,0 +1,106 @@
+"""`shearloop calibrate gripper`: grips objects of known diameter, to convert counts to millimetres."""
+
+import argparse
+import asyncio
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option, check_calibration_file
+from shearloop.cli.terminal import Operator, print_result
+from shearloop.drivers.defaults import URCAP_PORT
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
+from shearloop.errors import UserError
+from shearloop.words import counted
+
+if TYPE_CHECKING:
+    from shearloop.drivers.robotiq.gripper import RobotiqGripper
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `calibrate gripper`."""
+    parser.epilog = (
+        "The fingers open and close: keep clear of them. Asks for one object after the other, to be held between the "
+        "fingertips, and closes on each after you press Enter. Stop the daemon first: it uses the gripper. Name the "
+        "file as `gripper.calibration` in the configuration."
+    )
+    way = parser.add_mutually_exclusive_group(required=True)
+    way.add_argument("--host", metavar="ADDRESS", help="the robot's controller, for the URCap's socket")
+    way.add_argument("--serial-number", metavar="NUMBER", help="the USB adapter's serial number, for Modbus RTU")
+    way.add_argument("--port", metavar="PATH", help="the USB adapter's port, for Modbus RTU")
+    add_option(parser, "--socket-port", PORT, "PORT", "the URCap's (default: %(default)s)", default=URCAP_PORT)
+    names = ", ".join(MODELS)
+    text = f"{names}; as `gripper.model` in the configuration (default: %(default)s)"
+    parser.add_argument("--model", choices=tuple(MODELS), metavar="MODEL", default=DEFAULT_MODEL, help=text)
+    text = "an object's diameter; give it once per object, of at least two; four over half of the stroke show its bow"
+    add_option(parser, "--diameter-mm", TOOL_MM, "MM", text, action="append", required=True)
+    add_option(parser, "--out", Path, "FILE", "the calibration file to write", required=True)
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Grip each object and write the calibration."""
+    from shearloop.drivers.calibration_files import save_calibration
+    from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
+    from shearloop.drivers.robotiq.modbus_client import ModbusClient
+    from shearloop.drivers.robotiq.socket_client import SocketClient
+
+    if len(set(args.diameter_mm)) < 2:
+        raise UserError("give at least two different --diameter-mm")
+    check_calibration_file(args.out)
+    client: RobotiqClient
+    if args.host is not None:
+        client = SocketClient(args.host, args.socket_port)
+    else:
+        client = ModbusClient(serial_number=args.serial_number, path=args.port)
+    gripper = RobotiqGripper(client, WidthCalibration.nominal(args.model))
+    operator = Operator(stdout_is_for_json=args.json)
+    gauges = asyncio.run(_grip(gripper, args.diameter_mm, operator))
+    calibration = WidthCalibration.of_gauges(gauges, args.model)
+    save_calibration(args.out, calibration)
+    report = {
+        "path": str(args.out),
+        "calibration": calibration.model_dump(mode="json"),
+        "mm_per_count": calibration.mm_per_count,
+        "width_std_mm": calibration.width_std_mm,
+        "gauges": [{"counts": counts, "diameter_mm": diameter_mm} for counts, diameter_mm in gauges],
+    }
+    sentences = [
+        f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm."
+        + (f" The width bows by {calibration.bow_mm:+.1f} mm half-way." if calibration.bow_mm else ""),
+        f"Written to {args.out}.",
+    ]
+    return print_result(report, sentences, as_json=args.json)
+
+
+async def _grip(gripper: "RobotiqGripper", diameters_mm: list[float], operator: Operator) -> list[tuple[float, float]]:
+    with operator:
+        try:
+            await gripper.connect()
+            warning = "The fingers will open and close. Keep clear, take out what they hold, then press Enter."
+            await operator.ask(warning)
+            await gripper.activate(operator_confirmed=True)
+            gauges: list[tuple[float, float]] = []
+            while len(gauges) < len(diameters_mm):
+                diameter_mm = diameters_mm[len(gauges)]
+                await operator.ask(f"Hold the object of {diameter_mm:g} mm between the fingertips, then press Enter.")
+                counts = await _contact(gripper)
+                if counts is None:
+                    print("Refused: the fingers closed without meeting anything.", file=sys.stderr, flush=True)
+                else:
+                    operator.say(f"  {diameter_mm:g} mm: {counted(counts, 'count')}.")
+                    gauges.append((counts, diameter_mm))
+            return gauges
+        finally:
+            await gripper.close()
+
+
+async def _contact(gripper: "RobotiqGripper") -> int | None:
+    """Close and open; return the position of the contact, or None without one."""
+    from shearloop.drivers.robotiq.messages import GripperCommand, ObjectStatus
+
+    stroke_mm, slowest_mm_s = gripper.model.stroke_mm, gripper.model.speed_mm_s[0]
+    # Beyond the fingers' stop: reaching the target is never a contact.
+    closed = await gripper.finish(await gripper.move(GripperCommand(-stroke_mm, slowest_mm_s)))
+    await gripper.finish(await gripper.move(GripperCommand(stroke_mm)))
+    return closed.position_counts if closed.object is ObjectStatus.CONTACT_CLOSING else None

@@ -1,0 +1,85 @@
+"""`shearloop check`: check a configuration and the files it names, or an experiment, and print its plan."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shearloop.cli.options import add_option
+from shearloop.cli.terminal import print_result
+from shearloop.errors import UserError
+
+if TYPE_CHECKING:
+    from shearloop.tools.check import Parts
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `check`."""
+    add_option(parser, "config", Path, "FILE", "a configuration such as config/demo.yaml, or an experiment")
+    text = "check the experiment FILE against the devices of this configuration"
+    add_option(parser, "--config", Path, "RIG", text, dest="rig")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    parser.epilog = (
+        "Prints what an experiment does, step by step, and what is refused. Opens no device; `shearloop doctor CONFIG` "
+        "does."
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Load everything that `run` loads, without opening a device."""
+    from shearloop.yaml_files import read_yaml
+
+    content = read_yaml(args.config, UserError)
+    is_experiment = isinstance(content, dict) and "steps" in content
+    if args.rig is not None and not is_experiment:
+        raise UserError(f"{args.config}: --config names a configuration for an experiment, and this file is none")
+    parts = _check_experiment(args.config, args.rig) if is_experiment else _check_configuration(args.config)
+    plan_lines = [line for plan in parts.plans for line in plan.sentences()]
+    if parts.mistakes:
+        if is_experiment and not args.json:
+            # A rehearsal shows where in the plan the refused steps are.
+            print(*plan_lines, sep="\n", flush=True)
+        raise UserError("\n".join(dict.fromkeys(parts.mistakes.values())))
+    sentences = [*(f"{name}: {text}" for name, text in parts.texts.items()), *plan_lines]
+    plan = parts.plans[0].as_json() if parts.plans else None
+    result = {"config": str(args.config), "parts": parts.texts, "plan": plan}
+    return print_result(result, [*sentences, f"{args.config} is in order"], as_json=args.json)
+
+
+def _check_configuration(path: Path) -> "Parts":
+    """Return the parts of a configuration; the mistakes of an invalid one hide none of its experiment's."""
+    from shearloop.cli.emulator_processes import check_emulators
+    from shearloop.daemon.config import load_daemon_config
+    from shearloop.tools.check import Parts, check_parts
+
+    parts = Parts()
+    with parts.of("configuration"):
+        parts = check_parts(load_daemon_config(path), path, check_emulators)
+    if "configuration" in parts.mistakes:
+        with parts.of("experiment"):
+            _check_named_experiment(path)
+    return parts
+
+
+def _check_experiment(path: Path, rig: Path | None) -> "Parts":
+    """Return the plan of an experiment, alone or on the devices of a configuration."""
+    from shearloop.cli.emulator_processes import check_emulators
+    from shearloop.daemon.config import load_daemon_config
+    from shearloop.tools.check import check_experiment_alone, check_parts
+
+    if rig is None:
+        return check_experiment_alone(path)
+    config = load_daemon_config(rig)
+    if config.robot is None:
+        raise UserError(f"{rig}: an experiment needs a robot: add `robot: ur.yaml`")
+    return check_parts(config.model_copy(update={"experiment": path}), rig, check_emulators)
+
+
+def _check_named_experiment(path: Path) -> None:
+    """Raise UserError for the mistakes of the experiment that an invalid configuration names."""
+    from shearloop.daemon.experiment_files import read_experiment
+    from shearloop.yaml_files import read_yaml
+
+    content = read_yaml(path, UserError)
+    named = content.get("experiment") if isinstance(content, dict) else None
+    if named and isinstance(named, str):
+        read_experiment(path.parent / named)

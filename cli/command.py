@@ -1,0 +1,118 @@
+"""`shearloop command`: send a command to a running daemon."""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys
+from shearloop.daemon.messaging import addresses, stop_client
+
+COMMANDS = {
+    "tare": "set the zero of the torque sensors, with nothing gripped and no experiment running",
+    "status": "show the experiment and the state of each task",
+    "start": "start an experiment",
+    "pause": "hold the arm until `resume`; moving fingers finish their move",
+    "resume": "continue after `pause`",
+    "stop": "stop the experiment and the arm; without an experiment, stop the daemon",
+    "release": "open the gripper, also after a stop: a tool in it drops; needs --yes",
+    "unlock": "allow motion again after a stop, when no person is within reach",
+}
+
+
+EPILOG = """
+examples:
+  shearloop command tare --source right
+  shearloop command start --experiment config/experiments/loosen.yaml
+  shearloop command stop
+  shearloop command release --yes
+
+Exit status: 0 done, 1 refused, 2 no answer. On the daemon's own machine `stop` and
+`status` need no key. `shearloop listen` prints the daemon's messages.
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `command`."""
+    parser.description = "Send a command to a running daemon and print the reply."
+    width = max(map(len, COMMANDS))
+    parser.epilog = "commands:\n" + "".join(f"  {name:<{width}}  {what}\n" for name, what in COMMANDS.items()) + EPILOG
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("name", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
+    parser.add_argument("--source", metavar="NAME", help="for tare: name of the sensor (default: all)")
+    add_option(parser, "--experiment", Path, "FILE", "for start (default: that of the configuration)")
+    parser.add_argument("--yes", action="store_true", help="for release: the tool may drop; for tare: nothing is held")
+    add_connection(parser, addresses.COMMAND_ADDRESS, "the daemon's command address")
+    default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for unlock and release {addresses.UNLOCK_TIMEOUT_S:g} s"
+    add_option(parser, "--timeout", TIMEOUT_S, "S", f"time to wait for the reply (default: {default})")
+    parser.add_argument("--json", action="store_true", help="print the reply as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Send one command and print its reply; status 1 if the daemon refused it."""
+    arguments: dict[str, Any] = {} if args.source is None else {"source": args.source}
+    if args.yes:
+        arguments["confirmed"] = True
+    if args.experiment is not None:
+        # The daemon may run in another folder.
+        arguments["experiment"] = str(args.experiment.resolve())
+    address, keys, request, reply = args.connect, None, {"command": args.name, **arguments}, None
+    timeout_s = args.timeout or addresses.COMMAND_TIMEOUT_S
+    if args.name in ("stop", "status") and args.key is None and not addresses.needs_keys(address):
+        # These two need no key on the daemon's own machine.
+        try:
+            reply = stop_client.send_to_stop_socket(address, request, timeout_s)
+        except TimeoutError:
+            # The daemon may have stopped the motion by now. A second `stop` must not end the daemon.
+            request["spare_daemon"] = True
+    else:
+        keys = client_keys(args)
+    if reply is None:
+        # It imports too much for a `stop` on a busy computer.
+        from shearloop.daemon.messaging.client import send_command
+
+        if args.name in ("unlock", "release") and args.timeout is None:
+            # A missing daemon is reported without the long timeout.
+            send_command(address, {"command": "status"}, addresses.COMMAND_TIMEOUT_S, keys)
+            timeout_s = addresses.UNLOCK_TIMEOUT_S
+        reply = send_command(address, request, timeout_s, keys)
+    accepted = bool(reply.pop("ok", False))
+    if args.json:
+        print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
+    elif accepted:
+        print(*_lines(args.name, reply), sep="\n")
+    else:
+        print(f"shearloop command: {args.name} was refused: {reply.get('reason')}", file=sys.stderr)
+        if reply.get("invalid") and args.experiment is not None:
+            print(_mistakes(args.experiment), file=sys.stderr, end="")
+    return 0 if accepted else 1
+
+
+def _mistakes(experiment: Path) -> str:
+    """Return the mistakes of an experiment, as lines, which the daemon does not tell.
+
+    It may read files that this user may not. Empty if the file is on the daemon's computer only.
+    """
+    from shearloop.daemon.experiment_files import read_experiment
+    from shearloop.errors import UserError
+
+    try:
+        read_experiment(experiment)
+    except UserError as error:
+        return f"{error}\n"
+    return ""
+
+
+def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
+    """Return an accepted reply as text: of `status` the experiment, and the tasks as a table."""
+    if name == "status":
+        from shearloop.cli.terminal import loop_line, table
+        from shearloop.tools.task_row import task_row
+
+        rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
+        loop = [loop_line(reply["loop"]), ""] if "loop" in reply else []
+        return [*loop, *table(("task", "state", "rate", "notes"), rows)]
+    values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
+    return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -1,0 +1,127 @@
+"""`shearloop demo`: run the emulated rig in closed loop, and show it."""
+
+import argparse
+import json
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from shearloop.cli import bank, init
+from shearloop.cli import run as run_command
+from shearloop.cli.emulator_processes import SHEARLOOP, running
+from shearloop.cli.options import add_option
+from shearloop.daemon.process import interrupt_status
+from shearloop.errors import UserError, missing
+from shearloop.tools.outputs import writing
+
+if TYPE_CHECKING:
+    from shearloop.daemon.config import DaemonConfig
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `demo`."""
+    text = "folder for configuration, bank and calibrations, kept for later runs (default: %(default)s)"
+    add_option(parser, "--folder", Path, "DIR", text, default=Path("shearloop-demo"))
+    parser.add_argument("--prepare", action="store_true", help="only write the files; do not run")
+    text = "play this .mat recording on one fingertip, without a robot: k, sigma and the heatmap"
+    add_option(parser, "--recording", Path, "FILE", text)
+    parser.epilog = (
+        "Builds a bank and calibrations, emulates the whole rig, grips a tool, identifies it, holds 0.10 N·m on it and "
+        "lets go. Prints the address of the live page, which needs the extra `view`."
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Prepare the folder, then run the daemon and its page."""
+    folder = args.folder / "config"
+    files = init.packaged_files()
+    init.write_files(folder, {path: content for path, content in files.items() if not (folder / path).exists()})
+    if args.prepare:
+        try:
+            _prepare(folder, args.folder / "run", calibrated=args.recording is None)
+        except KeyboardInterrupt as interrupt:
+            # The demo that has started and ended this process says so.
+            return interrupt_status(interrupt)
+        return 0
+    from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.rig import open_settings
+
+    name = "demo.yaml" if args.recording is None else "fingertip_demo.yaml"
+    played = [] if args.recording is None else ["--recording", str(args.recording)]
+    config = load_daemon_config(folder / name)
+    # Mistakes are found before anything is built and served.
+    open_settings(config)
+    if args.recording is None and not config.autostart:
+        raise UserError(
+            f"{folder / name} starts nothing by itself: it needs `emulated: true` and `autostart: true`; remove it, "
+            "and `shearloop demo` writes it anew"
+        )
+    if args.recording is not None:
+        from shearloop.tools.recordings.matlab_import import read_stream
+
+        read_stream(args.recording)
+    print("The demo starts …", flush=True)
+    # In a process of its own: the daemon would keep the memory of the fits.
+    with running([*SHEARLOOP, "demo", "--prepare", "--folder", str(args.folder), *played]) as process:
+        status = process.wait()
+    if status:
+        return status
+    with page(config):
+        return _call(run_command, str(folder / name), "--show", *played)
+
+
+def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:
+    """Make the bank and, if `calibrated`, the calibrations, where they are missing or outdated."""
+    from shearloop.tools.bank_config import load_bank_plan
+    from shearloop.tools.banks import is_built
+
+    with writing(data, "the folder"):
+        data.mkdir(exist_ok=True)
+    definition, signals = config / "banks" / "demo.yaml", data / "demo.bank"
+    if not is_built(signals, load_bank_plan(definition).definition):
+        duration = "half a minute, or a few minutes on a busy computer"
+        print(f"The first time, a bank and calibrations are made in {data}: {duration}.", flush=True)
+        _call(bank, "build", "--config", str(definition), "--out", str(signals))
+    if calibrated and not _is_calibrated(data, signals):
+        from shearloop.studies.emulated_calibration import calibrate_rig
+
+        calibrate_rig(signals, data)
+
+
+def _is_calibrated(data: Path, signals: Path) -> bool:
+    """Return whether the calibrations are there, newer than the bank, and of this version's format."""
+    from shearloop.bank.errors import CalibrationError
+    from shearloop.estimation import Calibration
+
+    try:
+        paths = [data / name for name in ("rig.cal", "rig-right.cal", "rig-left.cal")]
+        return all(Calibration.load(path) and path.stat().st_mtime >= signals.stat().st_mtime for path in paths)
+    except CalibrationError:
+        return False
+
+
+@contextmanager
+def page(config: "DaemonConfig") -> Iterator[None]:
+    """Serve the live page in a process of its own."""
+    if find_spec("aiohttp") is None:
+        print(missing("aiohttp", "view", "the live page"), flush=True)
+        yield
+        return
+    options = ("--connect", config.publish, "--commands", config.commands, "--port", "0", "--json")
+    with running([*SHEARLOOP, "view", *options], stdout=subprocess.PIPE) as process:
+        # Empty where the page has ended; its own sentence says why.
+        if process.stdout is not None and (line := process.stdout.readline()):
+            print(f"The live page, for a browser of this computer: {json.loads(line)['url_with_token']}", flush=True)
+        yield
+
+
+def _call(command: ModuleType, *arguments: str) -> int:
+    """Run another command in this process and return its exit status."""
+    parser = argparse.ArgumentParser()
+    command.configure(parser)
+    status: int = command.run(parser.parse_args(arguments))
+    return status

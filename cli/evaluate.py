@@ -1,0 +1,136 @@
+"""`shearloop evaluate CAL REC…`: compare estimates with the load cell of recordings, in numbers and as a figure."""
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shearloop.cli.options import add_cluster, add_json, add_option, number, time_range
+from shearloop.cli.terminal import print_result, table
+from shearloop.errors import UserError, missing
+from shearloop.estimation.defaults import LOADED_NM
+from shearloop.tools.outputs import writing
+from shearloop.words import counted
+
+if TYPE_CHECKING:
+    from shearloop.estimation import Calibration
+    from shearloop.tools.evaluate import EstimateTrack, Figures
+
+_FIGURES = (".png", ".svg", ".pdf")
+_MEANINGS = {
+    "n": "frames with a known torque",
+    "rmse_nm": "root mean square error, N·m",
+    "zero_rmse_nm": "the same of an estimate that is always 0",
+    "bias_nm": "mean error, N·m",
+    "coverage_95": "share of the known values within their 95 % intervals",
+    "interval_nm": "median width of these intervals, N·m",
+    "winkler_nm": "mean width plus 40 times the distance of a known value outside; less is better",
+    "valid_fraction": "share of the frames with an estimate",
+    "gain": "mean estimate over mean known torque",
+    "r": "correlation of estimated and known torque",
+    "latency_ms_p50": "time of an estimate, ms, median",
+    "latency_ms_p99": "time of an estimate, ms, 99th percentile",
+    "frames": "frames in all",
+    "diameter_rmse_mm": "root mean square error of the diameter, mm",
+    "diameter_coverage_95": "share of the known diameters within their 95 % intervals",
+    "diameter_interval_mm": "median width of these intervals, mm",
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    add_option(parser, "calibration", Path, "CAL", "made by `shearloop calibrate`")
+    add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices", nargs="+")
+    add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
+    text = "share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
+    add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
+    text = "least known torque of a frame that counts as loaded (default: %(default)s N·m)"
+    add_option(parser, "--loaded-nm", number(0.0, 100.0), "NM", text, default=LOADED_NM)
+    add_option(parser, "--estimates", Path, "FILE.csv", "table to write with known torque and estimate of every frame")
+    add_cluster(parser)
+    add_json(parser)
+    parser.add_argument("--plot", action="store_true", help="draw load cell and estimate over time into --out")
+    add_option(parser, "--out", Path, "FILE", "figure to draw (default with --plot: CAL.png)")
+    parser.epilog = (
+        "Prints each figure with its meaning, for frames with a load, for the others and for all, and why frames have "
+        "no estimate. Errors and intervals are judged on frames with an estimate and a known torque or diameter."
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate, print, and draw on request."""
+    from shearloop.bank.bank_file import Bank
+    from shearloop.cli.options import read_judged
+    from shearloop.estimation.load_delay import load_delay_warning
+    from shearloop.tools.evaluate import (
+        estimate_in_worker,
+        figures_by_load,
+        figures_of,
+        invalid_reasons,
+        write_estimates,
+    )
+    from shearloop.tools.frame_series import check_no_copies, part_of
+    from shearloop.tools.outputs import check_overwrite
+    from shearloop.tools.parallel import open_executor
+
+    if args.out is not None and args.out.suffix not in _FIGURES:
+        raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
+    if args.estimates is not None:
+        check_overwrite(args.estimates, "a table")
+    calibration, named = read_judged(args.calibration, args.recordings)
+    bank = Bank.open(args.bank) if args.bank else None
+    start, stop = args.time_range
+    parts = [part_of(one, start, stop) for _, one in named]
+    check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
+    shared = (calibration, None if bank is None else str(args.bank.resolve()))
+    with open_executor(args.cluster) as pool:
+        # Frames before the part show the idle fingertip, as live.
+        whole = [part_of(one, 0.0, stop) for _, one in named]
+        estimated = list(pool.map(estimate_in_worker, shared, whole))
+    tracks = [track.since(part.first_frame) for track, part in zip(estimated, parts, strict=True)]
+    if args.estimates is not None:
+        with writing(args.estimates, "the estimates"):
+            write_estimates(tracks, [str(path) for path, _ in named], args.estimates)
+    if calibration.assumptions:
+        print(f"{args.calibration} assumes that {calibration.assumption_text}.", file=sys.stderr)
+    for (path, _), part in zip(named, parts, strict=True):
+        if warning := load_delay_warning(part):
+            print(f"Warning: {path.name}: {warning}.", file=sys.stderr)
+    if args.plot or args.out:
+        _draw(tracks, [path for path, _ in named], calibration, args.out or args.calibration.with_suffix(".png"))
+    by_load, figures = figures_by_load(tracks, args.loaded_nm), figures_of(tracks)
+    sentences = [f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less."]
+    sentences += _lines({**by_load, "all": figures})
+    for reason in invalid_reasons(tracks):
+        frames = f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}"
+        sentences.append(f"{frames}: {reason.sentence}")
+    return print_result({**by_load, **figures}, sentences, as_json=args.json)
+
+
+def _lines(columns: "Mapping[str, Figures]") -> list[str]:
+    """Return the figures of each group of frames as a table, with their meanings."""
+    rows = [
+        (name, *(_shown(group[name]) if name in group else "" for group in columns.values()), meaning)
+        for name, meaning in _MEANINGS.items()
+        if any(group.get(name) is not None for group in columns.values())
+    ]
+    return table(("figure", *columns, "meaning"), rows)
+
+
+def _draw(tracks: "Sequence[EstimateTrack]", paths: "Sequence[Path]", calibration: "Calibration", out: Path) -> None:
+    from shearloop.tools.evaluate import draw_tracks
+
+    names = [f"{path.name}, {' and '.join(one.series.sides)}" for path, one in zip(paths, tracks, strict=True)]
+    try:
+        with writing(out, "the figure"):
+            draw_tracks(tracks, names, f"{calibration.estimator.name}, fitted to {calibration.source}", out)
+    except ModuleNotFoundError as error:
+        raise missing(error.name, "plot", "the figure") from error
+    print(f"The figure is in {out}.", file=sys.stderr)
+
+
+def _shown(value: float | None) -> str:
+    if value is None:
+        return "–"
+    return str(value) if isinstance(value, int) else f"{value:.4g}"

@@ -1,0 +1,46 @@
+"""`shearloop init DIR`: write a commented configuration and experiments to start from."""
+
+import argparse
+from importlib import resources
+from pathlib import Path
+
+from shearloop.cli.options import add_option
+from shearloop.errors import UserError
+from shearloop.tools.outputs import writing
+
+# Files and folders of the package's `config`.
+STARTERS = ("rig.yaml", "ur.yaml", "experiments", "banks", "fingertips", "schemas", "foxglove.json")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `init`."""
+    add_option(parser, "folder", Path, "DIR", "folder for the files; created if missing")
+    parser.epilog = (
+        "Writes rig.yaml, ur.yaml, experiments, banks, fingertips and a layout for Foxglove. Existing files are never "
+        "changed."
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the files, and print the next steps."""
+    files = {path: text for path, text in packaged_files().items() if path.parts[0] in STARTERS}
+    if present := [args.folder / path for path in files if (args.folder / path).exists()]:
+        raise UserError(f"{present[0]} exists: nothing was written; choose another folder")
+    write_files(args.folder, files)
+    print(f"{args.folder / 'rig.yaml'}: edit it, then run `shearloop check {args.folder / 'rig.yaml'}`")
+    print(f"{args.folder / 'ur.yaml'}: set the robot's address and every limit")
+    return 0
+
+
+def packaged_files() -> dict[Path, bytes]:
+    """Return the files of the package's `config` by their paths below it."""
+    with resources.as_file(resources.files("shearloop") / "config") as config:
+        return {path.relative_to(config): path.read_bytes() for path in sorted(config.rglob("*")) if path.is_file()}
+
+
+def write_files(folder: Path, files: dict[Path, bytes]) -> None:
+    """Write the files below a folder; raises UserError where that fails."""
+    for path, content in files.items():
+        with writing(folder / path, "the file"):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).write_bytes(content)

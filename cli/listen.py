@@ -1,0 +1,53 @@
+"""`shearloop listen`: print what a daemon publishes."""
+
+import argparse
+import sys
+
+from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, positive
+from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.errors import UserError
+
+EPILOG = """
+examples:
+  shearloop listen eit.estimate load.torque
+  shearloop listen health --count 1 --json
+
+docs/messages.md lists the topics and their keys. Ctrl-C ends it.
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `listen`."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    text = "topics or their first part, such as eit (default: all)"
+    add_option(parser, "topics", str, "TOPIC", text, nargs="*", default=[])
+    add_connection(parser, PUBLISH_ADDRESS, "where the daemon publishes")
+    parser.add_argument("--json", action="store_true", help="one JSON object per line, with arrays")
+    add_option(parser, "--count", positive(int), "N", "stop after N messages")
+    add_option(parser, "--timeout", TIMEOUT_S, "S", "stop with an error after S seconds without a message")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print messages until Ctrl-C, or up to `--count`."""
+    from shearloop.cli.terminal import message_json, message_line
+    from shearloop.daemon.messaging.client import QUIET_S, receive_messages
+    from shearloop.daemon.messaging.messages import TOPICS
+
+    known = {*TOPICS, *(topic.partition(".")[0] for topic in TOPICS)}
+    for topic in args.topics:
+        if topic not in known:
+            raise UserError(f"there is no topic {topic!r}; the topics are {', '.join(TOPICS)}")
+    write = message_json if args.json else message_line
+
+    def print_hint() -> None:
+        nothing = f"shearloop listen: no message came from {args.connect} in {QUIET_S:g} s; waiting"
+        asked = f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?"
+        print(f"{nothing}. Is a daemon running {asked}", file=sys.stderr, flush=True)
+
+    received = receive_messages(args.connect, args.topics, args.timeout, client_keys(args), print_hint)
+    for number, (topic, content) in enumerate(received, start=1):
+        print(write(topic, content), flush=True)
+        if number == args.count:
+            break
+    return 0

@@ -1,0 +1,193 @@
+"""Options that several commands share, and their checks."""
+
+import argparse
+import contextlib
+import math
+import os
+from collections.abc import Callable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shearloop.daemon.messaging.addresses import needs_keys
+from shearloop.errors import UserError
+from shearloop.tools.outputs import check_overwrite
+
+if TYPE_CHECKING:
+    from shearloop.bank.fingertip import Fingertip
+    from shearloop.daemon.messaging.keys import ClientKeys
+    from shearloop.estimation import Calibration, FrameSeries
+
+PAPERS_RECORDINGS = (
+    "The paper's recordings: https://github.com/DhruvTrehan03/Soft-Tactile-Sensing-For-Robotic-Manipulation "
+    "(see docs/recording.md)"
+)
+
+
+def number(low: float, high: float, kind: Callable[[str], float] = float) -> Callable[[str], float]:
+    """Return the type of an option that takes a number from `low` to `high`."""
+    return _number(kind, lambda value: low <= value <= high, f" from {low:g} to {high:g}")
+
+
+def positive(kind: Callable[[str], float] = float, high: float = math.inf) -> Callable[[str], float]:
+    """Return the type of an option that takes a finite number above 0, `high` at the most."""
+    limit = "" if math.isinf(high) else f" and up to {high:g}"
+    return _number(kind, lambda value: 0 < value <= high and value < math.inf, f" above 0{limit}")
+
+
+def _number(kind: Callable[[str], float], accepts: Callable[[float], bool], where: str) -> Callable[[str], float]:
+    def value_of(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not accepts(value):
+            raise argparse.ArgumentTypeError(f"{text} is not a {'whole ' if kind is int else ''}number{where}")
+        return value
+
+    return value_of
+
+
+def time_range(text: str) -> tuple[float, float]:
+    """Return the shares of FROM:TO, as the type of an option."""
+    with contextlib.suppress(ValueError):
+        start, stop = map(float, text.split(":"))
+        if 0 <= start < stop <= 1:
+            return start, stop
+    raise argparse.ArgumentTypeError(f"{text} is not two shares that rise from 0 or more to 1 or less, such as 0.5:1")
+
+
+TIMEOUT_S = positive(high=86_400.0)
+# A larger delay belongs to another recording.
+DELAY_S = number(-600.0, 600.0)
+# What fits between the gripper's fingers.
+TOOL_MM = positive(high=140.0)
+PORT = number(0, 65535, int)
+
+
+def add_option(
+    parser: argparse._ActionsContainer,
+    name: str,
+    kind: Callable[[str], Any],
+    metavar: str | tuple[str, str],
+    text: str,
+    **more: Any,
+) -> None:
+    """Add an option with a value, or a positional argument, to a parser or a group."""
+    parser.add_argument(name, type=kind, metavar=metavar, help=text, **more)
+
+
+def add_action(
+    actions: "argparse._SubParsersAction[Any]", name: str, summary: str, run: Callable[[argparse.Namespace], int]
+) -> argparse.ArgumentParser:
+    """Return the parser of a new action, which `run_action` runs."""
+    parser: argparse.ArgumentParser = actions.add_parser(name, help=summary, description=summary)
+    parser.set_defaults(run_action=run)
+    return parser
+
+
+def run_action(args: argparse.Namespace) -> int:
+    """Run the given action and return the exit status."""
+    status: int = args.run_action(args)
+    return status
+
+
+def add_json(parser: argparse._ActionsContainer) -> None:
+    """Add `--json` to a parser or a group."""
+    parser.add_argument("--json", action="store_true", help="print the result as JSON, and nothing else, on stdout")
+
+
+def add_cluster(parser: argparse.ArgumentParser) -> None:
+    """Add `--cluster`, which runs heavy work on other processes or computers."""
+    text = "run on the Dask scheduler at this address, such as tcp://host:8786; without one on processes here"
+    parser.add_argument("--cluster", type=_address, nargs="?", const="local", metavar="ADDRESS", help=text)
+
+
+def _address(text: str) -> str:
+    if text != "local" and os.path.exists(text):
+        raise argparse.ArgumentTypeError(f"{text} is a file and no address; write `--cluster local`")
+    return text
+
+
+def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) -> None:
+    """Add `--connect`, `--key` and `--server-key`; `purpose` describes the address."""
+    parser.add_argument("--connect", default=default, metavar="ADDRESS", help=f"{purpose} (default: %(default)s)")
+    add_option(parser, "--key", Path, "FILE", "your .key_secret, for a daemon on the network (default: in ~/.config)")
+    add_option(parser, "--server-key", Path, "FILE", "that daemon's .key (default: in ~/.config)")
+
+
+def add_fingertip(parser: argparse.ArgumentParser) -> None:
+    """Add `--fingertip`, which `load_fingertip` reads."""
+    add_option(parser, "--fingertip", Path, "FILE", "the fingertip's dimensions; by default the paper's fingertip")
+
+
+def load_fingertip(path: Path | None) -> "Fingertip":
+    """Return the fingertip of a file, or the paper's; raises UserError for a file that cannot be used."""
+    from shearloop.daemon.config_file import load_yaml_model
+    from shearloop.tools.bank_config import FingertipGeometryConfig
+
+    with resources.as_file(resources.files("shearloop.daemon.web") / "assets" / "fingertip.yaml") as paper:
+        return load_yaml_model(path or paper, FingertipGeometryConfig).fingertip()
+
+
+def user_key_folder() -> Path:
+    """Return the folder of the user's keys."""
+    home = os.environ.get("XDG_CONFIG_HOME")
+    return (Path(home) if home else Path.home() / ".config") / "shearloop"
+
+
+def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
+    """Return the keys for the address, None for an address on this machine; raises UserError for missing keys."""
+    if args.key is None and args.server_key is None and not needs_keys(args.connect):
+        return None
+    from shearloop.daemon.messaging.keys import ClientKeys
+
+    folder = user_key_folder()
+    key = args.key or folder / "client.key_secret"
+    server_key = args.server_key or folder / "server.key"
+    for path, option, cure in (
+        (key, "--key", "make one with `shearloop keys client`"),
+        (server_key, "--server-key", "copy the daemon's server.key there"),
+    ):
+        if not path.exists():
+            raise UserError(
+                f"{args.connect} is not on this machine, and there is no key {path}: {cure}, or give {option}"
+            )
+    return ClientKeys.load(key, server_key)
+
+
+def check_calibration_file(out: Path) -> None:
+    """Raise UserError, before anything is measured, unless `out` can become a calibration file."""
+    if not out.parent.is_dir():
+        raise UserError(f"--out {out} cannot be written: the folder {out.parent} does not exist")
+    check_overwrite(out, "a calibration file")
+
+
+def load_calibration(path: Path) -> "Calibration":
+    """Return the calibration in a file; raises UserError for a recording, and CalibrationError as `load` does."""
+    from shearloop.estimation import Calibration
+
+    if ".mcap" in path.suffixes or path.is_dir():
+        raise UserError(f"{path} is a recording, not a calibration; the calibration comes first, then recordings")
+    return Calibration.load(path)
+
+
+def read_judged(path: Path, recordings: "Sequence[Path]") -> "tuple[Calibration, list[tuple[Path, FrameSeries]]]":
+    """Return a calibration, and the series of the recordings, each with its path, that it is to judge.
+
+    Raises UserError for a recording given twice, and for slices with a calibration of raw frames, or the reverse.
+    """
+    from shearloop.tools.frame_series import check_paths_differ, read_series
+
+    check_paths_differ(recordings)
+    calibration = load_calibration(path)
+    sides = calibration.sides if calibration.kind == "raw" else None
+    named = [(recording, one) for recording in recordings for one in read_series(recording, sides)]
+    kinds = {"raw": "raw frames", "difference": "slices"}
+    other = next((one.kind for _, one in named if one.kind != calibration.kind), None)
+    if other is not None:
+        raise UserError(
+            f"{path} was made from {kinds[calibration.kind]}, and cannot judge {kinds[other]}; "
+            "calibrate on recordings of the same kind"
+        )
+    return calibration, named

@@ -1,0 +1,175 @@
+"""`shearloop recording` and `shearloop import mat`: inspect, repair, export and import recordings."""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shearloop.cli.options import (
+    PAPERS_RECORDINGS,
+    add_action,
+    add_fingertip,
+    add_json,
+    add_option,
+    load_fingertip,
+    run_action,
+)
+from shearloop.cli.terminal import print_result
+from shearloop.errors import UserError
+from shearloop.tools.outputs import check_overwrite, progress_bar, writing
+from shearloop.words import counted
+
+if TYPE_CHECKING:
+    from shearloop.tools.recordings.reader import RecordingSummary
+
+# Exports in one file, and how it begins.
+_SINGLE_FILES = {"mat": ("a MATLAB file", b"MATLAB"), "rrd": ("a file of Rerun", b"RRF")}
+
+run = run_action
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the actions of `recording`, or the formats of `import` to its parser."""
+    if parser.prog.endswith(" import"):
+        formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True)
+        mat = add_action(formats, "mat", "import the paper's MATLAB streams", _import)
+        add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
+        add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
+        add_json(mat)
+        parser.epilog = PAPERS_RECORDINGS
+        return
+    parts = parser.add_subparsers(dest="part", metavar="WHAT", required=True)
+    info = add_action(parts, "info", "show the content of recordings, closed or not", _info)
+    add_option(info, "recordings", Path, "REC", "recordings (.mcap or .mcap.partial)", nargs="+")
+    info.add_argument("--json", action="store_true", help="one JSON object per recording")
+    repair = add_action(parts, "repair", "copy the intact part of a damaged or unclosed one into a new one", _repair)
+    add_option(repair, "recording", Path, "REC", "e.g. NAME.mcap.partial; it is not changed")
+    add_option(repair, "--out", Path, "FILE", "recording to write (default: NAME.mcap, or NAME.repaired.mcap)")
+    add_json(repair)
+    summary = "write a recording as tables, or for MATLAB, Rerun, LeRobot or `reproduce`"
+    export = add_action(parts, "export", summary, _export)
+    add_option(export, "recording", Path, "REC", "a recording (.mcap or .mcap.partial)")
+    choices = ("csv", "parquet", "mat", "rrd", "lerobot", "slices")
+    export.add_argument("--format", choices=choices, default="csv", help="files to write (default: %(default)s)")
+    add_option(export, "--out", Path, "PATH", "folder to write; for mat and rrd a file (default: next to REC)")
+    export.add_argument("--topic", action="append", metavar="TOPIC", help="export only this topic; repeatable")
+    add_fingertip(export)
+    add_json(export)
+
+
+def _info(args: argparse.Namespace) -> int:
+    from shearloop.tools.recordings.reader import summarise
+
+    for path in args.recordings:
+        with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
+            found = summarise(path, progress)
+        print(json.dumps(asdict(found), ensure_ascii=False) if args.json else _summary_text(found))
+    return 0
+
+
+def _summary_text(found: "RecordingSummary") -> str:
+    from shearloop.daemon.recorder.schema import software_version
+
+    lines = [found.path]
+    if found.first_unix_ns is not None:
+        began = datetime.fromtimestamp(found.first_unix_ns / 1e9).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+        lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.size_bytes / 1e6:.2f} MB")
+    lines.append(f"  source   {found.metadata.get('source', 'unknown: not a recording of shearloop')}")
+    lines += [f"  ran      {name}" for name in found.experiments]
+    lines += [f"  tool     {found.tool_mm} mm"] if found.tool_mm is not None else []
+    if software := found.metadata.get("software"):
+        here = "the same code as here" if found.same_code else f"different code from here ({software_version()})"
+        lines.append(f"  made by  shearloop {software}, {here}")
+    for name, topic in found.topics.items():
+        rate = "" if topic.rate_hz is None else f"{topic.rate_hz:8.2f} Hz"
+        plural = " " if topic.messages == 1 else "s"
+        lines.append(f"  {name:<22} {topic.messages:>8} message{plural} {rate}".rstrip())
+    lines += [f"  attached {name}" for name in found.attachments]
+    if not found.closed:
+        cure = f"`shearloop recording repair {found.path}` makes an indexed copy" if found.topics else "None is intact"
+        torn = counted(found.torn_bytes, "byte is", "bytes are")
+        lines.append(f"  It was not closed, or is being written; {torn} incomplete. {cure}.")
+    if found.damaged_chunks:
+        lines.append(f"  {counted(found.damaged_chunks, 'chunk is', 'chunks are')} damaged and left out.")
+    if found.damaged_attachments:
+        lines.append(
+            f"  {counted(found.damaged_attachments, 'attachment is', 'attachments are')} damaged and left out."
+        )
+    if found.lost:
+        lines.append(f"  Lost with them: {_lost_text(found.lost)}.")
+    if found.dropped:
+        dropped = counted(found.dropped, "message was", "messages were")
+        lines.append(f"  {dropped} dropped because the disk was too slow.")
+    return "\n".join(lines)
+
+
+def _repair(args: argparse.Namespace) -> int:
+    from shearloop.tools.recordings.reader import repair
+
+    path = args.recording
+    with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
+        result = repair(path, args.out, progress)
+    lost = [f"{counted(result.torn_bytes, 'incomplete byte')} at the end"] if result.torn_bytes else []
+    lost += [counted(result.damaged_chunks, "damaged chunk")] if result.damaged_chunks else []
+    lost += [counted(result.damaged_attachments, "damaged attachment")] if result.damaged_attachments else []
+    saved = counted(result.messages, "message is", "messages are")
+    sentences = [f"{result.path}: {saved} saved; left out: {' and '.join(lost) or 'nothing'}."]
+    sentences += [f"Lost: {_lost_text(result.lost)}."] if result.lost else []
+    return print_result({**asdict(result), "path": str(result.path)}, sentences, as_json=args.json)
+
+
+def _lost_text(lost: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} of {topic}" for topic, count in lost.items())
+
+
+def _export(args: argparse.Namespace) -> int:
+    from shearloop.daemon.recorder.schema import INPUT
+    from shearloop.tools.recordings.export import export
+    from shearloop.tools.recordings.tables import RecordedTopics
+
+    path, form = args.recording, args.format
+    stem, kind = path.name.partition(".mcap")[0], _SINGLE_FILES.get(form)
+    out = args.out or path.with_name(f"{stem}.{form}" if kind else f"{stem}_{form}")
+    if kind:
+        check_overwrite(out, *kind)
+    counts = RecordedTopics(path).counts
+    unknown = [topic for topic in args.topic or () if topic not in counts]
+    if unknown:
+        raise UserError(f"{path} has no topic {unknown[0]!r}; it has {', '.join(counts)}")
+    topics = args.topic or list(counts)
+    if form in ("rrd", "lerobot", "slices"):
+        topics = [topic for topic in topics if not topic.startswith(f"{INPUT}.")]
+    with progress_bar(form, sum(counts[topic] for topic in topics), "message") as progress, writing(out, "the export"):
+        if form == "rrd":
+            from shearloop.tools.recordings.rerun_export import export_rerun
+
+            written = [export_rerun(path, out, topics, load_fingertip(args.fingertip), progress)]
+        elif form == "lerobot":
+            from shearloop.tools.recordings.lerobot_export import export_lerobot
+
+            written = export_lerobot(path, out, topics, progress)
+        elif form == "slices":
+            from shearloop.tools.recordings.slice_export import export_slices
+
+            written, missed = export_slices(path, out, topics, progress)
+            for reason, count in missed.items():
+                print(f"{path}: {counted(count, 'hold')} without a slice: {reason}", file=sys.stderr)
+        else:
+            written = export(path, form, out, topics, progress)
+    return print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
+
+
+def _import(args: argparse.Namespace) -> int:
+    from mcap.writer import MCAP0_MAGIC
+
+    from shearloop.tools.recordings.matlab_import import import_mat
+
+    check_overwrite(args.out, "a recording", MCAP0_MAGIC)
+    imported = import_mat(args.sources, args.out)
+    counts = [f"{counted(count, 'frame')} of the {side} side" for side, count in imported.frames.items()]
+    sentence = f"{args.out}: {', '.join(counts)}, {counted(imported.torques, 'torque')}."
+    return print_result({"path": str(args.out), **asdict(imported)}, [sentence, *imported.remarks], as_json=args.json)

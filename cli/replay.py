@@ -1,0 +1,98 @@
+"""`shearloop replay REC`: process a recording again and publish it as if live."""
+
+import argparse
+import asyncio
+import sys
+from contextlib import ExitStack, nullcontext, suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shearloop.cli.options import add_json, add_option
+from shearloop.cli.terminal import print_result
+from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.words import counted
+
+if TYPE_CHECKING:
+    from shearloop.daemon.config import DaemonConfig
+    from shearloop.tools.recordings.replay import RecordedRun, ReplayComparison
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    add_option(parser, "recording", Path, "REC", "made by `shearloop run --record` or imported")
+    add_option(parser, "--speed", _speed, "N", "factor, or max for no waiting (default: %(default)s)", default="1")
+    add_option(parser, "--publish", str, "ADDRESS", "publish here (default: %(default)s)", default=PUBLISH_ADDRESS)
+    add_option(parser, "--config", Path, "FILE", "instead of the configuration in the recording")
+    parser.add_argument("--wait", action="store_true", help="begin with the first subscriber")
+    printed = parser.add_mutually_exclusive_group()
+    printed.add_argument("--show", action="store_true", help="print the estimates")
+    add_json(printed)
+    text = "exit with status 1 unless all estimates equal the recorded ones, bit for bit"
+    parser.add_argument("--check", action="store_true", help=text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay to the end and print the comparison with the recorded estimates."""
+    from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.recorder.schema import code_digest
+    from shearloop.tools.recordings.replay import RecordedRun
+
+    run = RecordedRun(args.recording)
+    with nullcontext(load_daemon_config(args.config)) if args.config else run.configuration() as config:
+        comparison = asyncio.run(_replay(run, config, args))
+    same_code = run.metadata.get("code_sha256") == code_digest()
+    for line in _comparison_text(comparison, same_code):
+        print(line, file=sys.stderr)
+    if args.json:
+        counts = {"compared": comparison.compared, "different": comparison.different}
+        others = {"unrecorded": comparison.unrecorded, "examples": comparison.examples, "same_code": same_code}
+        print_result(counts | others, (), as_json=True)
+    return 1 if args.check and (comparison.different or not comparison.compared) else 0
+
+
+def _speed(text: str) -> float:
+    with suppress(ValueError):
+        if (speed := float("inf" if text == "max" else text)) > 0:
+            return speed
+    raise argparse.ArgumentTypeError(f"{text} is not a number above 0, or max")
+
+
+async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Namespace) -> "ReplayComparison":
+    import zmq.asyncio
+
+    from shearloop.cli.terminal import print_estimate
+    from shearloop.daemon.messaging.publisher import Publisher
+    from shearloop.tools.outputs import progress_bar
+    from shearloop.tools.recordings.replay import Replay, ReplayClock
+
+    clock = ReplayClock()
+    with ExitStack() as opened:
+        publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), args.publish, clock)
+        opened.callback(publisher.close)
+        replay = Replay(run, config, publisher, clock)
+        if args.show:
+            publisher.add_listener(partial(print_estimate, sys.stdout), raises=True)
+        while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - the publisher has no event
+            await asyncio.sleep(0.05)
+        progress = opened.enter_context(progress_bar(run.path.name, sum(run.counts.values()), "message"))
+        await replay.play(args.speed, progress)
+        # The last messages are still being sent.
+        await asyncio.sleep(0.1)
+    return replay.comparison
+
+
+def _comparison_text(comparison: "ReplayComparison", same_code: bool) -> list[str]:
+    if not comparison.compared:
+        return ["Nothing was compared: the recording has no estimates with raw input."]
+    lines = []
+    for topic, count in sorted(comparison.compared.items()):
+        different = comparison.different[topic]
+        lines.append(f"{topic}: {count - different} of {count} equal the recorded ones, bit for bit")
+    lines += comparison.examples
+    if comparison.unrecorded:
+        computed = counted(comparison.unrecorded, "computed message is", "computed messages are")
+        lines.append(f"{computed} not in the recording.")
+    if comparison.different and not same_code:
+        lines.append("The recording was made by different code, so its results may differ.")
+    return lines

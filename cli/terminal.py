@@ -1,0 +1,261 @@
+"""What commands print, as text or JSON, with progress bars, and the lines that an operator types."""
+
+import asyncio
+import dataclasses
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Self, TextIO
+
+from shearloop.errors import UserError
+from shearloop.printable import printable
+from shearloop.tools.task_row import task_row
+
+if TYPE_CHECKING:
+    from shearloop.daemon.logs import NonBlockingWriter
+
+STDIN = 0
+READ_BYTES = 4096
+
+
+def print_result(result: object, sentences: Iterable[str], *, as_json: bool) -> int:
+    """Print a result as one line of JSON for a script, or as sentences for a person; return the exit status 0."""
+    if as_json:
+        print(json.dumps(result, ensure_ascii=False), flush=True)
+    else:
+        print(*sentences, sep="\n", flush=True)
+    return 0
+
+
+def print_estimate(out: "TextIO | NonBlockingWriter", topic: str, content: Mapping[str, Any]) -> None:
+    """Print a message that is an estimate."""
+    if topic in ("eit.estimate", "skin.shear"):
+        out.write(printable(message_line(topic, content)) + "\n")
+        out.flush()
+
+
+class StatusLine:
+    """Shows a daemon's state on one line of a terminal, as a context that leaves an empty line."""
+
+    def __init__(self, out: "TextIO | NonBlockingWriter") -> None:
+        self._out = out
+        self._state = self._torque = ""
+        # None until a control loop reports; a daemon without a robot has no loop.
+        self._driving: str | None = None
+
+    def __enter__(self) -> Self:
+        """Show that the daemon starts."""
+        self._draw("starting")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Empty the line."""
+        self._draw("")
+
+    def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
+        """Take one message; redraw after those that it shows."""
+        if topic == "loop.state":
+            self._state = loop_line(content)
+            self._driving = content["torque_source"]
+        elif topic in ("eit.estimate", "load.torque", "skin.shear") and content["source"] == self._driving:
+            torque_nm = content["torque_nm"] if content["valid"] else None
+            self._torque = "" if torque_nm is None else f"   {self._driving} {torque_nm:+.3f} N·m"
+        elif topic in ("eit.estimate", "skin.shear") and self._driving is None:
+            self._state = message_line(topic, content)
+        else:
+            return
+        self._draw(self._state, self._torque)
+
+    def _draw(self, text: str, end: str = "") -> None:
+        from shearloop.daemon.logs import CLEAR_LINE
+
+        # A longer line would wrap, and could not be cleared.
+        text, end = (printable(part).replace("\n", " ") for part in (text, end))
+        width = shutil.get_terminal_size().columns - 1 - len(end)
+        self._out.write(f"{CLEAR_LINE}{text if len(text) <= width else text[: width - 1] + '…'}{end}")
+        self._out.flush()
+
+
+@contextmanager
+def stdin_lines(on_line: Callable[[str | None], None]) -> Iterator[None]:
+    """Have the event loop call `on_line` with each line of standard input, and with None at its end.
+
+    Raises PermissionError for a file, which an event loop cannot watch.
+    """
+    loop, partial = asyncio.get_running_loop(), b""
+
+    def read() -> None:
+        nonlocal partial
+        data = os.read(STDIN, READ_BYTES)
+        *lines, partial = (partial + data).split(b"\n")
+        # An unfinished line must not grow without limit.
+        partial = partial[-READ_BYTES:]
+        for line in lines:
+            on_line(line.decode(errors="replace").strip())
+        if not data:
+            loop.remove_reader(STDIN)
+            on_line(None)
+
+    loop.add_reader(STDIN, read)
+    try:
+        yield
+    finally:
+        loop.remove_reader(STDIN)
+
+
+class Operator:
+    """The person at the terminal, as a context within an event loop; a pipe or a file works too."""
+
+    def __init__(self, *, stdout_is_for_json: bool = False) -> None:
+        """Print to stdout, or to stderr if stdout is for a result in JSON."""
+        self._out = sys.stderr if stdout_is_for_json else sys.stdout
+        self._lines: asyncio.Queue[str | None] = asyncio.Queue()
+        self._reading = ExitStack()
+
+    def __enter__(self) -> Self:
+        """Start reading."""
+        try:
+            self._reading.enter_context(stdin_lines(self._lines.put_nowait))
+        except PermissionError:
+            # Reading a file never blocks.
+            with open(STDIN, closefd=False) as file:
+                for line in (*file, None):
+                    self._lines.put_nowait(line)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop reading."""
+        self._reading.close()
+
+    async def ask(self, prompt: str) -> None:
+        """Print the prompt and wait for the next line; raise UserError at the end of the input."""
+        self.say(prompt)
+        if await self._lines.get() is None:
+            raise UserError("the input ended before all was measured; press Enter after each step")
+
+    def say(self, sentence: str) -> None:
+        """Print a sentence."""
+        print(sentence, file=self._out, flush=True)
+
+
+def message_line(topic: str, content: Mapping[str, Any]) -> str:
+    """Return one line of text: time, topic, source, and the values with their units."""
+    clock = datetime.fromtimestamp(content["timestamp"]).astimezone().strftime("%H:%M:%S.%f")[:-3]
+    body = _BODIES[topic](content) if topic in _BODIES else _columns(topic, content)
+    return f"{clock}  {topic:<13} {content['source']:<9} {body}"
+
+
+def message_json(topic: str, content: Mapping[str, Any]) -> str:
+    """Return one line of JSON: the topic and the content, arrays as lists, null for a number that is not finite."""
+    from pydantic_core import to_json
+
+    def plain(value: Any) -> Any:
+        return value.tolist() if hasattr(value, "tolist") else str(value)
+
+    compact = to_json({"topic": topic, **content}, inf_nan_mode="null", bytes_mode="base64", fallback=plain)
+    return json.dumps(json.loads(compact), ensure_ascii=False)
+
+
+def _estimate(content: Mapping[str, Any]) -> str:
+    if not content["valid"]:
+        return f"no estimate: {content['reason']}"
+    torque = _with_interval(content, "torque", "nm", "torque {:+.4f} N·m", "[{:+.4f}, {:+.4f}]")
+    details = (
+        _present("diameter {:5.1f} mm", content["diameter_mm"]),
+        _present("k {:.3f}  sigma {:.3f} cm", content["k"], content["sigma"]),
+        _present("score {:.3f}", content["score"]),
+    )
+    return "   ".join(filter(None, (torque or "no torque", *details)))
+
+
+def _shear(content: Mapping[str, Any]) -> str:
+    if not content["valid"]:
+        return f"no force: {content['reason']}"
+    shear = _with_interval(content, "shear", "n", "shear {:+.3f} N", "[{:+.3f}, {:+.3f}]")
+    details = (
+        _present("torque {:+.4f} N·m", content["torque_nm"]),
+        _present("response {:+.5f}", content["response"]),
+        "within the deadband" if content["deadband"] else content["direction"],
+    )
+    return "   ".join(filter(None, (shear or "no force", *details)))
+
+
+def _with_interval(content: Mapping[str, Any], name: str, unit: str, value: str, interval: str) -> str:
+    """Return a value with its interval, or alone without one end of it; empty without the value."""
+    shown = _present(value, content[f"{name}_{unit}"])
+    ends = _present(interval, content[f"{name}_low_{unit}"], content[f"{name}_high_{unit}"])
+    return f"{shown} {ends}" if shown and ends else shown
+
+
+def _present(pattern: str, *values: float | None) -> str:
+    """Return the values in their pattern, empty if one of them is None."""
+    return "" if any(value is None for value in values) else pattern.format(*values)
+
+
+def _load(content: Mapping[str, Any]) -> str:
+    if not content["valid"]:
+        return f"no torque: {content['reason']}   raw {content['raw']:.10g}"
+    return f"torque {content['torque_nm']:+.4f} N·m   raw {content['raw']:.10g}"
+
+
+def loop_line(content: Mapping[str, Any]) -> str:
+    """Return phase, progress, the reasons for holding or the stop, step, and activity."""
+    if not content["experiment"]:
+        return f"{content['phase']}: {content['reasons']}" if content["reasons"] else str(content["phase"])
+    step = f"step {content['step']} of {content['steps']} {content['step_name']}"
+    activity, stopped = content["activity"] or content["experiment"], content["phase"] == "stopped"
+    percent = "" if stopped else f" {100 * content['progress']:.0f} %"
+    # A narrow terminal cuts the end.
+    reasons = activity if stopped else content["reasons"]
+    parts = (f"{content['phase']}{percent}{f': {reasons}' if reasons else ''}", step, activity)
+    return "  ".join(parts[:2] if activity == reasons else parts)
+
+
+def _health(content: Mapping[str, Any]) -> str:
+    rows = [task_row(name, facts) for name, facts in content["tasks"].items()]
+    tasks = (f"{name} {', '.join(filter(None, cells))}" for name, *cells in rows)
+    return f"{content['memory_mb']:.0f} MB  {content['cpu_percent']:.1f} % CPU  " + "; ".join(tasks)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table with aligned columns."""
+    every = [tuple(head), *map(tuple, rows)]
+    widths = [max(map(len, column)) for column in zip(*every, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in every]
+
+
+def _columns(topic: str, content: Mapping[str, Any]) -> str:
+    from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS
+
+    fields = dataclasses.fields(TOPICS[topic]) if topic in TOPICS else ()
+    units = {item.name: f" {item.metadata['unit']}" for item in fields if item.metadata.get("unit")}
+    hidden = (*ENVELOPE, "topic")
+    own = {
+        key: value
+        for key, value in content.items()
+        if key not in hidden and value is not None and not (isinstance(value, str) and not value)
+    }
+    return "  ".join(f"{key} {_value(value)}{units.get(key, '')}" for key, value in own.items())
+
+
+def _value(value: object) -> str:
+    import numpy as np
+
+    if isinstance(value, np.ndarray):
+        finite = value[np.isfinite(value)]
+        span = f", {finite.min():.4g} to {finite.max():.4g}" if finite.size else ""
+        return f"({'×'.join(map(str, value.shape))}{span})"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+_BODIES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "eit.estimate": _estimate,
+    "skin.shear": _shear,
+    "load.torque": _load,
+    "loop.state": loop_line,
+    "health": _health,
+}

@@ -1,0 +1,68 @@
+"""`shearloop view`: show a running daemon as a page in the browser."""
+
+import argparse
+import asyncio
+from pathlib import Path
+
+from shearloop.cli.options import PORT, add_connection, add_fingertip, add_option, client_keys, load_fingertip
+from shearloop.cli.terminal import print_result
+from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
+from shearloop.errors import require
+
+PAGE_PORT = 7760
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `view`."""
+    add_connection(parser, PUBLISH_ADDRESS, "where the daemon publishes")
+    text = "where the daemon takes commands (default: %(default)s)"
+    add_option(parser, "--commands", str, "ADDRESS", text, default=COMMAND_ADDRESS)
+    text = "the page's port on 127.0.0.1; 0 for any free one (default: %(default)s)"
+    add_option(parser, "--port", PORT, "PORT", text, default=PAGE_PORT)
+    text = "serve Foxglove at this port of 127.0.0.1 instead of the page; 0 for any free one"
+    add_option(parser, "--foxglove", PORT, "PORT", text)
+    add_fingertip(parser)
+    text = "the token that permits motion (default: ~/.local/state/shearloop/view-token)"
+    add_option(parser, "--token-file", Path, "FILE", text)
+    parser.add_argument("--new-token", action="store_true", help="make a new token; the old one becomes invalid")
+    parser.add_argument("--json", action="store_true", help="print the page's address as JSON")
+    parser.epilog = "Prints the address to open in a browser of this computer, and serves it until Ctrl-C."
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the page until SIGINT, SIGTERM or SIGHUP."""
+    return _serve_page(args) if args.foxglove is None else _serve_foxglove(args)
+
+
+def _serve_page(args: argparse.Namespace) -> int:
+    require("aiohttp", "view", "the live view")
+    from shearloop.daemon.logs import logging_to_stderr
+    from shearloop.daemon.web.server import DaemonAddress, default_token_path, load_token, serve
+
+    address = DaemonAddress(args.connect, args.commands, client_keys(args))
+    path = args.token_file or default_token_path()
+    token = load_token(path, new=args.new_token)
+    fingertip = load_fingertip(args.fingertip)
+
+    def print_address(port: int) -> None:
+        page = f"http://127.0.0.1:{port}/"
+        result = {"url": page, "url_with_token": f"{page}#token={token}", "token_file": str(path)}
+        without = f"Without the token the page shows everything and can stop, but moves nothing. Token: {path}"
+        print_result(result, [result["url_with_token"], without], as_json=args.json)
+
+    with logging_to_stderr():
+        asyncio.run(serve(address, args.port, token, fingertip, print_address))
+    return 0
+
+
+def _serve_foxglove(args: argparse.Namespace) -> int:
+    from shearloop.daemon.messaging.client import receive_messages
+    from shearloop.daemon.web.foxglove import FoxgloveServer
+
+    with FoxgloveServer(args.foxglove) as server:
+        url = f"ws://127.0.0.1:{server.port}"
+        sentence = f"{url}: open this connection in Foxglove, with the layout foxglove.json of `shearloop init`"
+        print_result({"url": url}, [sentence], as_json=args.json)
+        for topic, content in receive_messages(args.connect, (), keys=client_keys(args)):
+            server.publish(topic, content)
+    return 0

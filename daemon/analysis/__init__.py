@@ -1,1 +1,0 @@
-"""Analysis of recordings: calibrate, evaluate, reproduce, charts."""

@@ -1,0 +1,204 @@
+"""Checks of an experiment: what its steps turn, and which of them its limits or its devices do not allow. No I/O."""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from shearloop.daemon.control.experiment_schema import (
+    AdaptStep,
+    ApproachStep,
+    Direction,
+    ExperimentFile,
+    GripperStep,
+    GripStep,
+    HoldTorqueStep,
+    IdentifyStep,
+    Mistake,
+    ReleaseStep,
+    Step,
+    TareStep,
+    TightenStep,
+    TurnToStep,
+    TwistStep,
+    demand,
+    direction_of,
+)
+from shearloop.drivers.robotiq.models import GripperModel
+from shearloop.drivers.ur.settings import UrLimits
+
+
+class Turn(NamedTuple):
+    """What a step turns: the direction of its first turn, and of the turn that it leaves; None for none, or unknown.
+
+    `low_rad` and `high_rad` bound the angle since the grip after the step; infinite where it is unknown.
+    """
+
+    begins: Direction | None
+    leaves: Direction | None
+    low_rad: float
+    high_rad: float
+
+
+def turns(file: ExperimentFile) -> Iterator[Turn]:
+    """Yield what each step turns."""
+    low_rad = high_rad = 0.0
+    for step in file.steps:
+        begins: Direction | None = None
+        leaves: Direction | None = None
+        match step:
+            case GripStep() | ReleaseStep():
+                low_rad = high_rad = 0.0
+            case TightenStep(direction=direction):
+                begins = leaves = direction
+                low_rad -= step.until_angle_rad if direction == "clockwise" else 0.0
+                high_rad += step.until_angle_rad if direction == "counterclockwise" else 0.0
+            case HoldTorqueStep(signed_torque_nm=torque_nm):
+                begins = leaves = direction_of(torque_nm)
+                low_rad, high_rad = -math.inf, math.inf
+            case TwistStep(absolute=False, angles_rad=angles_rad):
+                begins = _turn_to(angles_rad[0], low_rad, high_rad)
+                if not step.return_to_start:
+                    leaves = _turn_to(angles_rad[-1], low_rad, high_rad)
+                    low_rad = high_rad = angles_rad[-1]
+            case TwistStep() | TurnToStep():
+                low_rad, high_rad = -math.inf, math.inf
+        yield Turn(begins, leaves, low_rad, high_rad)
+
+
+def _turn_to(angle_rad: float, low_rad: float, high_rad: float) -> Direction | None:
+    """Return the direction from any angle between two ends to another angle; None where it is unknown."""
+    if low_rad <= angle_rad <= high_rad and low_rad < high_rad:
+        return None
+    return direction_of(angle_rad - (low_rad if angle_rad < low_rad else high_rad))
+
+
+class Reversal(NamedTuple):
+    """A step that turns a held tool back: the numbers, from 1, of it and of the step before, and both directions."""
+
+    number: int
+    direction: Direction
+    before: int
+    direction_before: Direction
+
+    def sentence(self, file: ExperimentFile) -> str:
+        """Return what turns back what."""
+        step, before = file.steps[self.number - 1], file.steps[self.before - 1]
+        return (
+            f"reversal: {step.do} turns {self.direction}, against step {self.before} "
+            f"({before.do}), which turned {self.direction_before}"
+        )
+
+
+def reversals(file: ExperimentFile) -> Iterator[Reversal]:
+    """Yield each step that turns the tool against the turn that the steps before have left in this grip."""
+    left: tuple[int, Direction] | None = None
+    for number, (step, turn) in enumerate(zip(file.steps, turns(file), strict=True), 1):
+        if isinstance(step, GripperStep):
+            left = None
+        if turn.begins is not None and left is not None and turn.begins != left[1]:
+            yield Reversal(number, turn.begins, *left)
+        if turn.leaves is not None:
+            left = number, turn.leaves
+
+
+def check_steps(file: ExperimentFile) -> list[Mistake]:
+    """Return each step that exceeds its limits or its timeout, and each step that the steps before it make wrong.
+
+    These are the first `hold_torque` on an unidentified tool, and a `tare` of a gripped one.
+    """
+    found: list[Mistake] = list(_undoing(file))
+    identified = gripped = False
+    for number, step in enumerate(file.steps):
+        limits, needs = file.limits_of(step), demand(step)
+        torque = needs.torque_nm, limits.torque_nm, "N·m", "torque_nm"
+        for value, limit, unit, key in (torque, (needs.angle_rad, limits.angle_rad, "rad", "angle_rad")):
+            if value >= limit:
+                asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
+                found.append((("steps", number), f"{asks}; raise limits.{key}, or ask for less"))
+        if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
+            asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
+            found.append((("steps", number), f"{asks}; raise timeout_s"))
+        if isinstance(step, GripperStep):
+            gripped = isinstance(step, GripStep) and step.expect_object
+        if gripped and isinstance(step, TareStep):
+            cure = "put it before the `grip`, or a `release` before it"
+            found.append((("steps", number), f"tare would make the gripped tool's torque the zero; {cure}"))
+        match step:
+            case IdentifyStep():
+                identified = True
+            case _ if _forgets_tool(step, file.torque_source):
+                identified = False
+            case HoldTorqueStep() if not identified:
+                cure = "put an `identify` step before it, after the last `tare`, `grip`, `release` or `adapt`"
+                found.append((("steps", number), f"hold_torque needs an identified tool; {cure}"))
+                # One sentence is enough.
+                identified = True
+    return found
+
+
+def _forgets_tool(step: Step, torque_source: str) -> bool:
+    """Return whether an identification is invalid afterwards: a new grip, zero, or gain of the driving torque."""
+    match step:
+        case AdaptStep(fingertip=fingertip):
+            return fingertip == torque_source
+    return isinstance(step, TareStep | GripperStep)
+
+
+def _undoing(file: ExperimentFile) -> Iterator[Mistake]:
+    """Yield each torque that undoes a `tighten`, where only its sign says so."""
+    for back in reversals(file):
+        step, before = file.steps[back.number - 1], file.steps[back.before - 1]
+        if isinstance(before, TightenStep) and isinstance(step, HoldTorqueStep) and step.direction is None:
+            yield (
+                ("steps", back.number - 1),
+                f"hold_torque turns {back.direction} by the sign of its torque_nm, and undoes step {back.before}, "
+                f"tighten {back.direction_before}; write `direction: {back.direction_before}`, or "
+                f"`direction: {back.direction}` if it is meant",
+            )
+
+
+def check_devices(file: ExperimentFile, robot: UrLimits | None, gripper: GripperModel | None) -> Iterator[Mistake]:
+    """Yield each step whose pose, angle, torque or grip lies outside what the configured devices allow.
+
+    Nothing of these is clipped, because another pose than the written one may be anywhere.
+    """
+    for number, step in enumerate(file.steps):
+        for outside in (_outside_robot(step, robot), _outside_gripper(step, gripper)):
+            if outside:
+                yield (("steps", number), f"{step.do} {outside}")
+
+
+def _outside_robot(step: Step, limits: UrLimits | None) -> str:
+    if limits is None:
+        return ""
+    joints = limits.joints
+    low_rad, high_rad = joints.lower_rad[-1] + joints.margin_rad, joints.upper_rad[-1] - joints.margin_rad
+    angles_rad: tuple[float, ...] = ()
+    match step:
+        case ApproachStep(pose_m_rad=pose) if pose is not None:
+            outside = limits.workspace.why_outside(pose[:3])
+            return f"ends at {outside}" if outside else ""
+        case TurnToStep(angle_rad=angle_rad):
+            angles_rad = (angle_rad,)
+        case TwistStep(absolute=True, angles_rad=given):
+            angles_rad = given
+        case HoldTorqueStep() | TightenStep() if (torque_nm := demand(step).torque_nm) >= limits.torque_nm.inner:
+            return (
+                f"asks for {torque_nm:g} N·m, and the robot's torque_nm allows less than {limits.torque_nm.inner:g} N·m"
+            )
+    for angle_rad in angles_rad:
+        if not low_rad <= angle_rad <= high_rad:
+            ends = f"{low_rad:g} to {high_rad:g} rad"
+            return f"turns to {angle_rad:g} rad, and the robot's wrist has {ends} with its margin"
+    return ""
+
+
+def _outside_gripper(step: Step, model: GripperModel | None) -> str:
+    match step:
+        case GripStep() if model is not None:
+            beyond = model.why_beyond(step.width_mm, step.speed_mm_per_s, step.force_n)
+            return f"asks for {beyond}" if beyond else ""
+        case ReleaseStep() if model is not None and "width_mm" in step.model_fields_set:
+            beyond = model.why_beyond(step.width_mm, model.speed_mm_s[0], model.force_n[0])
+            return f"asks for {beyond}" if beyond else ""
+    return ""

@@ -1,0 +1,42 @@
+"""Diameter of the tool from the fingertips. No I/O; times are passed in."""
+
+from shearloop.daemon.messaging.messages import stale_after_s
+from shearloop.estimation import Estimate, Measured, combine
+
+STALE_AFTER_NS = round(stale_after_s("eit.estimate") * 1e9)
+
+
+def tool_as_bytes(frame: int, tool: Measured | None) -> bytes:
+    """Return the raw event's data: the tool that is held from a frame on."""
+    return (str(frame) if tool is None else f"{frame} {tool.value!r} {tool.half_width!r}").encode()
+
+
+def tool_from_bytes(data: bytes) -> tuple[int, Measured | None]:
+    """Return the frame and the tool of a raw event; raises ValueError for other data."""
+    frame, *tool = data.decode().split()
+    if not tool:
+        return int(frame), None
+    value, half_width = map(float, tool)
+    return int(frame), Measured(value, half_width)
+
+
+class FingertipDiameters:
+    """The latest diameter of each fingertip, and of all together."""
+
+    def __init__(self, combined: str) -> None:
+        """Take the name of the source that already combines the fingertips."""
+        self._combined = combined
+        self._latest: dict[str, tuple[int, Measured]] = {}
+
+    def update(self, source: str, estimate: Estimate, t_ns: int) -> None:
+        """Take a source's estimate at t_ns."""
+        low_mm, high_mm = estimate.diameter_low_mm, estimate.diameter_high_mm
+        if estimate.diameter_mm is None or low_mm is None or high_mm is None:
+            self._latest.pop(source, None)
+        else:
+            self._latest[source] = (t_ns, Measured(estimate.diameter_mm, 0.5 * (high_mm - low_mm)))
+
+    def latest(self, t_ns: int) -> Measured | None:
+        """Return the fingertips' diameter at t_ns, None where none of them has a recent one."""
+        fresh = {name: one for name, (then_ns, one) in self._latest.items() if t_ns - then_ns <= STALE_AFTER_NS}
+        return fresh.get(self._combined) or combine(*fresh.values())

@@ -1,0 +1,154 @@
+"""Experiments: read with every mistake at the desk, and at an operator's request in a thread and within bounds.
+
+Every user of this machine may send `start` with the name of a file, and the daemon may be allowed to read more than
+they are. So a request names only files in the configured folders, and the reply names no content.
+"""
+
+import asyncio
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import structlog
+
+from shearloop.daemon.control.experiment_check import check_devices, check_steps
+from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
+from shearloop.drivers.robotiq.models import GripperModel
+from shearloop.drivers.ur.settings import UrLimits
+from shearloop.errors import UserError
+from shearloop.files import read_file
+from shearloop.yaml_files import MOST_BYTES, Document, shown
+
+# A file on a network drive may never answer.
+READ_WITHIN_S = 5.0
+# Of a path in a message.
+_LONGEST_NAME = 300
+
+
+class InvalidExperimentError(UserError):
+    """A file that can be read is no valid experiment; the message has none of its content."""
+
+
+def read_experiment(path: Path) -> ExperimentFile:
+    """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
+    return _checked(read_document(path), None, None)
+
+
+def _checked(document: Document, robot: UrLimits | None, gripper: GripperModel | None) -> ExperimentFile:
+    """Return the experiment of a document; raises UserError for one that is invalid, or that these do not allow."""
+    file = outline(document.content)
+    return without_mistakes(document, [*check_steps(file), *check_devices(file, robot, gripper)])
+
+
+def read_document(path: Path) -> Document:
+    """Return the content of an experiment's file; raises UserError."""
+    return Document.read(path, UserError, ExperimentFile.what)
+
+
+def without_mistakes(document: Document, mistakes: Sequence[Mistake]) -> ExperimentFile:
+    """Return the experiment of a file; raises UserError with these mistakes, and with those of its keys and values."""
+    lines: list[str] = []
+    try:
+        file = document.model(ExperimentFile)
+    except UserError as error:
+        lines.append(str(error))
+    lines += document.located(mistakes)
+    if lines:
+        raise UserError("\n".join(lines))
+    return file
+
+
+@dataclass(frozen=True, slots=True)
+class ReadExperiment:
+    """An experiment with the bytes of its file, as they were read once."""
+
+    path: Path
+    file: ExperimentFile
+    data: bytes
+
+
+@dataclass(slots=True)
+class ExperimentFiles:
+    """The experiments that a request may name: regular files of at most 128 kB in `folders`, or below them.
+
+    They stay within what `robot` and `gripper` allow, where these are given.
+    """
+
+    folders: tuple[Path, ...]
+    robot: UrLimits | None = None
+    gripper: GripperModel | None = None
+    _reading: threading.Thread | None = field(default=None, init=False)
+
+    async def read(self, path: Path) -> ReadExperiment:
+        """Return the experiment of a file; raises UserError without the file's content, at the latest after 5 s.
+
+        It is read in a thread, one at a time: no file keeps the event loop, or the threads of others, from working.
+        """
+        if self._reading is not None and self._reading.is_alive():
+            raise UserError("the file of another start is being read; wait for its end")
+        loop = asyncio.get_running_loop()
+        result: asyncio.Future[ReadExperiment] = loop.create_future()
+        # A daemon thread: a drive that does not answer must not keep the process alive.
+        reading = self._reading = threading.Thread(
+            target=_run, args=(lambda: self._read(path), loop, result), name="experiment", daemon=True
+        )
+        reading.start()
+        try:
+            await asyncio.wait({result}, timeout=READ_WITHIN_S)
+            if not result.done():
+                cure = "copy it to a local drive"
+                raise UserError(f"{path}: the experiment was not read within {READ_WITHIN_S:g} s; {cure}")
+        finally:
+            # Nobody waits for what comes later.
+            result.cancel()
+        # Nothing is left for it to do.
+        reading.join()
+        return result.result()
+
+    def _read(self, named: Path) -> ReadExperiment:
+        name = str(named) if len(str(named)) <= _LONGEST_NAME else shown(str(named))
+        try:
+            path = named.resolve()
+            if not any(path.is_relative_to(folder.resolve()) for folder in self.folders):
+                folders = " and ".join(map(str, self.folders)) or "no folder"
+                raise UserError(
+                    f"{name} is in none of the folders of experiments ({folders}); copy it there, or name its folder "
+                    "under `experiments` in the configuration"
+                )
+            data = read_file(path, MOST_BYTES)
+        except (OSError, ValueError, RuntimeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            raise UserError(f"{name}: the experiment cannot be read: {reason}") from error
+        try:
+            document = Document.parse(path, data, UserError, ExperimentFile.what)
+            file = _checked(document, self.robot, self.gripper)
+        except UserError as error:
+            structlog.get_logger().warning("the experiment is not valid", mistakes=str(error))
+            raise InvalidExperimentError(
+                f"{name} is not a valid experiment; the daemon's log names each mistake"
+            ) from error
+        return ReadExperiment(path, file, data)
+
+
+def _run(
+    read: Callable[[], ReadExperiment], loop: asyncio.AbstractEventLoop, result: "asyncio.Future[ReadExperiment]"
+) -> None:
+    """Read in a thread, and hand the result or the error to the event loop, if it still waits for it."""
+    try:
+        found, error = read(), None
+    except Exception as raised:  # noqa: BLE001 - it is raised in the event loop
+        found, error = None, raised
+
+    def hand_over() -> None:
+        if result.done():
+            return
+        if error is not None:
+            result.set_exception(error)
+        elif found is not None:
+            result.set_result(found)
+
+    # The loop may have ended meanwhile.
+    with suppress(RuntimeError):
+        loop.call_soon_threadsafe(hand_over)

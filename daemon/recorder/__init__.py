@@ -1,0 +1,1 @@
+"""The writer of recordings: MCAP files of JSON messages, and their schemas."""

@@ -1,0 +1,140 @@
+"""The whole rig in one process: arm, gripper, load cell and two EIT boards, tied by one physics.
+
+Arm → wrist angle → twin ← force of the fingers; twin → wrench, load cell and EIT frames. The
+controller's cycle makes time pass, so that all devices see the same moment.
+"""
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, Protocol, TypeAlias
+
+from shearloop.drivers.defaults import FRAME_PERIOD_S, URCAP_PORT
+from shearloop.emulators import number_between
+from shearloop.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch, format_line
+from shearloop.emulators.gripper import Gripper, GripperPlayer, ModbusSlave, UrcapSession
+from shearloop.emulators.ports import PtyServer, Server, SocketServer
+from shearloop.emulators.scene import FloatArray, Joint, Scene, TwinSettings
+from shearloop.emulators.ur_controller import FAULTS, Controller
+from shearloop.emulators.ur_robot import ControllerSpec, Robot
+
+NOISE_NM = 0.0005
+JOINTS = {joint.value: joint for joint in Joint}
+# The pads face each other: a shear on the right has the opposite sign on the left.
+SIDES = {"right": 1.0, "left": -1.0}
+COMMANDS = (
+    f"kick NM, slip [NM], joint {'|'.join(JOINTS)}, object MM|none, silence DEVICE [SECONDS], "
+    "unplug DEVICE [SECONDS], replug DEVICE, right|left|load FAULT, "
+    "gripper drop|fault CODE|…, a fault of the robot, or normal"
+)
+
+
+class FrameSynthesiser(Protocol):
+    """Makes the frames of one fingertip."""
+
+    def line(self, grip: FloatArray, shear_torque_nm: FloatArray, diameter_mm: float) -> FloatArray:
+        """Return the board's line, (v,) in volts, for grip (0…1) and shear at each injection, (L,) each."""
+
+
+Device: TypeAlias = EitKitBoard | Hx711Board | GripperPlayer | Controller
+
+
+class EmulatedRig:
+    """All devices: `run` plays all but the robot, and the `controller`, iterated over, makes time pass.
+
+    `command` applies faults, `scene` is the true state. `ports` get the path or address of each port when it appears.
+    """
+
+    def __init__(
+        self,
+        synthesiser: FrameSynthesiser,
+        run_dir: Path,
+        *,
+        host: str = "127.0.0.1",
+        gripper_on: Literal["socket", "modbus"] = "socket",
+        twin: TwinSettings | None = None,
+        diameter_mm: float = 20.0,
+        speed: float = 1.0,
+        rate_hz: float = 500.0,
+        make: ControllerSpec | None = None,
+        sketch: Sketch | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Gel, fingers and boards are `speed` times as fast as arm, answers and watchdog, which stay in real time."""
+        gripper = Gripper(object_mm=diameter_mm)
+        self.scene = Scene(gripper, twin, speed)
+        self.controller = Controller(Robot(make, self.scene), host=host, rate_hz=rate_hz)
+        player = GripperPlayer(
+            gripper,
+            PtyServer(ModbusSlave(gripper), run_dir / "gripper")
+            if gripper_on == "modbus"
+            else SocketServer(UrcapSession(gripper), host, URCAP_PORT),
+        )
+        boards: dict[str, EitKitBoard | Hx711Board] = {
+            side: EitKitBoard(
+                self._frames(synthesiser, sign),
+                period_s=FRAME_PERIOD_S / speed,
+                link=run_dir / f"eit-{side}",
+                seed=seed + number,
+            )
+            for number, (side, sign) in enumerate(SIDES.items())
+        }
+        boards["load"] = Hx711Board(
+            (sketch or Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm)).lines(self._torques_nm(), seed),
+            period_s=LOAD_PERIOD_S / speed,
+            link=run_dir / "load-cell",
+            seed=seed,
+        )
+        self._played: list[EitKitBoard | Hx711Board | Server] = [*boards.values(), player.server]
+        self._commanded: dict[str, Device] = {**boards, "gripper": player, "robot": self.controller}
+        self.ports = {name: board.port.appearances for name, board in boards.items()}
+        self.ports["gripper"] = player.server.appearances
+
+    async def run(self) -> None:
+        """Play all but the robot until cancelled; OSError, in a group, if an address or port is not available."""
+        async with asyncio.TaskGroup() as group:
+            for device in self._played:
+                group.create_task(device.run())
+
+    def command(self, text: str) -> None:
+        """Execute a command; ValueError, with a sentence, for an unknown one."""
+        match text.split():
+            case ["kick", jump_nm]:
+                self.scene.kick(_torque(jump_nm))
+            case ["slip", *left_nm] if len(left_nm) < 2:
+                self.scene.slip(*map(_torque, left_nm))
+            case ["joint", name] if name in JOINTS:
+                self.scene.put_on(JOINTS[name])
+            case ["object", *_]:
+                self._commanded["gripper"].command(text)
+            case ["normal"]:
+                for commanded in self._commanded.values():
+                    commanded.command("normal")
+            case ["replug", device]:
+                self._device(device).command("normal")
+            case ["silence" | "unplug" as outage, device, *seconds]:
+                self._device(device).command(" ".join([outage, *seconds]))
+            case [device, *words] if device in self._commanded and words:
+                self._commanded[device].command(" ".join(words))
+            case [name, *_] if name in FAULTS:
+                self.controller.command(text)
+            case _:
+                raise ValueError(f"{text!r} is no command; there are {COMMANDS}")
+
+    def _device(self, name: str) -> Device:
+        if name not in self._commanded:
+            raise ValueError(f"there is no device {name!r}; there are {', '.join(self._commanded)}")
+        return self._commanded[name]
+
+    def _frames(self, synthesiser: FrameSynthesiser, sign: float) -> Iterator[bytes]:
+        while True:
+            grip, shear_nm, width_mm = self.scene.frame(FRAME_PERIOD_S)
+            yield format_line(synthesiser.line(grip, sign * shear_nm, width_mm))
+
+    def _torques_nm(self) -> Iterator[float]:
+        while True:
+            yield self.scene.conversion_nm(LOAD_PERIOD_S)
+
+
+def _torque(text: str) -> float:
+    return number_between(text, -5.0, 5.0, "no torque in N·m of at most 5; write for instance 0.05")

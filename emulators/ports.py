@@ -1,0 +1,260 @@
+"""Ports of emulated devices: pseudo-terminals and sockets that can be unplugged and fall silent."""
+
+import asyncio
+import contextlib
+import os
+import tty
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from copy import copy
+from pathlib import Path
+from typing import Protocol, Self, TypeAlias
+
+from shearloop.emulators import number_between
+
+READ_BYTES = 4096
+OUTAGES = "silence [SECONDS], unplug [SECONDS], normal"
+
+
+class PtyPort:
+    """The device's end of a serial port; as a context it is plugged in, and unplugged at the end.
+
+    `received` gets the other side's bytes, and `appearances` the port's path whenever it is plugged in. With `link`, a
+    symbolic link of that name leads to the plugged-in port, as udev's links do. Use it in one event loop.
+    """
+
+    def __init__(self, link: Path | None = None) -> None:
+        self.received: asyncio.Queue[bytes] = asyncio.Queue()
+        self.appearances: asyncio.Queue[str] = asyncio.Queue()
+        self._link = link
+        self._master: int | None = None
+        # Held open, so that the port outlives the programs that open it.
+        self._slave = -1
+        self._terminal = ""
+        self._room = asyncio.Event()
+        # Set while a write waits for the reader.
+        self.held_up = asyncio.Event()
+
+    @property
+    def path(self) -> str:
+        """The path for the other side."""
+        return self._terminal if self._link is None else str(self._link)
+
+    def __enter__(self) -> Self:
+        """Plug the port in."""
+        self.plug()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Unplug the port."""
+        self.unplug()
+
+    def plug(self) -> None:
+        """Make the port appear, under a new terminal; OSError if the link cannot be made."""
+        if self._master is not None:
+            return
+        if self._link is not None and self._link.exists() and not self._link.is_symlink():
+            raise FileExistsError(f"{self._link} is a file")
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._terminal = os.ttyname(self._slave)
+        if self._link is not None:
+            fresh = self._link.with_name(f".{self._link.name}.{os.getpid()}")
+            fresh.symlink_to(self._terminal)
+            fresh.replace(self._link)
+        asyncio.get_running_loop().add_reader(self._master, self._receive, self._master)
+        self.appearances.put_nowait(self.path)
+
+    def unplug(self) -> None:
+        """Make the port disappear: its users are hung up on and unread bytes are lost."""
+        if self._master is None:
+            return
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._master)
+        loop.remove_writer(self._master)
+        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self._terminal:
+            self._link.unlink()
+        os.close(self._master)
+        os.close(self._slave)
+        self._master = None
+        self._room.set()
+
+    def _receive(self, master: int) -> None:
+        with contextlib.suppress(BlockingIOError):
+            self.received.put_nowait(os.read(master, READ_BYTES))
+
+    async def write(self, data: bytes) -> None:
+        """Write all of `data`, waiting for the reader; ConnectionError if unplugged."""
+        while data:
+            if self._master is None:
+                raise ConnectionError("the port is unplugged")
+            try:
+                data = data[os.write(self._master, data) :]
+            except BlockingIOError:
+                self._room.clear()
+                asyncio.get_running_loop().add_writer(self._master, self._on_room, self._master)
+                self.held_up.set()
+                await self._room.wait()
+                self.held_up.clear()
+
+    def _on_room(self, master: int) -> None:
+        asyncio.get_running_loop().remove_writer(master)
+        self._room.set()
+
+
+class Session(Protocol):
+    """A device as one connection sees it."""
+
+    def feed(self, data: bytes) -> bytes:
+        """Return the replies to received bytes, empty for none."""
+
+
+class Server(ABC):
+    """A device that answers requests, after `answer_s`, and its outages.
+
+    `appearances` gets the port's path or address whenever it can be opened.
+    """
+
+    appearances: asyncio.Queue[str]
+
+    def __init__(self, answer_s: float) -> None:
+        self._answer_s = answer_s
+        # normal, silence or unplug.
+        self._state = "normal"
+        self._changed = asyncio.Event()
+        self._recovery: asyncio.TimerHandle | None = None
+
+    async def run(self) -> None:
+        """Serve until cancelled; OSError if the port is taken."""
+        try:
+            while True:
+                self._changed.clear()
+                await (self.disconnect() if self._state == "unplug" else self.restore())
+                await self._changed.wait()
+        finally:
+            await self.disconnect()
+
+    @abstractmethod
+    async def restore(self) -> None:
+        """Make the port available, unless it is; OSError if it is taken."""
+
+    @abstractmethod
+    async def disconnect(self) -> None:
+        """Break every connection and make the port unavailable."""
+
+    def command(self, text: str) -> None:
+        """Begin or end an outage; ValueError, with a sentence, for another command."""
+        match text.split():
+            case ["silence" | "unplug" as kind, *seconds] if len(seconds) < 2:
+                times_s = [
+                    number_between(each, 0.0, 1e9, "no time in seconds; write for instance 2.5") for each in seconds
+                ]
+                self._begin(kind)
+                for time_s in times_s:
+                    self._recovery = asyncio.get_running_loop().call_later(time_s, self._begin, "normal")
+            case ["normal"]:
+                self._begin("normal")
+            case _:
+                raise ValueError(f"{text!r} is no command; there are {OUTAGES}")
+
+    def _begin(self, state: str) -> None:
+        if self._recovery is not None:
+            self._recovery.cancel()
+        self._state = state
+        self._changed.set()
+
+
+class PtyServer(Server):
+    """A device that answers requests on a pseudo-terminal."""
+
+    def __init__(self, session: Session, link: Path | None = None, answer_s: float = 0.0) -> None:
+        super().__init__(answer_s)
+        self._session = session
+        self._port = PtyPort(link)
+        self.appearances = self._port.appearances
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(super().run())
+            while True:
+                data = await self._port.received.get()
+                reply = self._session.feed(data)
+                if not reply or self._state == "silence":
+                    continue
+                # The time of the measurement.
+                await asyncio.sleep(self._answer_s)
+                with contextlib.suppress(ConnectionError):  # unplugged in between
+                    await self._port.write(reply)
+
+    async def restore(self) -> None:
+        """Plug the port in."""
+        self._port.plug()
+
+    async def disconnect(self) -> None:
+        """Unplug the port."""
+        self._port.unplug()
+
+
+# Open connections, by the tasks that serve them.
+Connections: TypeAlias = dict[asyncio.Task[None], asyncio.StreamWriter]
+
+
+@contextlib.contextmanager
+def connected(writer: asyncio.StreamWriter, connections: Connections) -> Iterator[None]:
+    """Register an open connection that this task serves; close it at the end, quietly when the peer breaks it."""
+    task = asyncio.current_task()
+    if task is None:
+        raise RuntimeError("a connection is served by a task")
+    connections[task] = writer
+    try:
+        with contextlib.suppress(ConnectionError):
+            yield
+    finally:
+        del connections[task]
+        writer.close()
+
+
+class SocketServer(Server):
+    """A device that answers requests on a socket; each connection gets a copy of `session`."""
+
+    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 0, answer_s: float = 0.0) -> None:
+        super().__init__(answer_s)
+        self._session = session
+        self._host = host
+        self._server: asyncio.Server | None = None
+        self._connections: Connections = {}
+        self.appearances = asyncio.Queue()
+        # With 0, a free port from the first start on.
+        self.port = port
+
+    async def restore(self) -> None:
+        """Listen, unless it does already."""
+        if self._server is None:
+            self._server = await asyncio.start_server(self._serve, self._host, self.port)
+            self.port = self._server.sockets[0].getsockname()[1]
+            self.appearances.put_nowait(f"{self._host}:{self.port}")
+
+    async def disconnect(self) -> None:
+        """Abort every connection and stop listening."""
+        if self._server is None:
+            return
+        server, self._server = self._server, None
+        server.close()
+        for writer in self._connections.values():
+            writer.transport.abort()
+        await server.wait_closed()
+        if self._connections:
+            await asyncio.wait(self._connections)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        session = copy(self._session)
+        with connected(writer, self._connections):
+            while data := await reader.read(READ_BYTES):
+                replies = session.feed(data)
+                if replies and self._state != "silence":
+                    # The time of the measurement.
+                    await asyncio.sleep(self._answer_s)
+                    writer.write(replies)
+                    await writer.drain()

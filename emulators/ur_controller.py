@@ -1,0 +1,200 @@
+"""The controller's three ports and its clock around a `Robot`, its dashboard, and faults by lines of text."""
+
+import asyncio
+import re
+import time
+from collections.abc import AsyncIterator, Collection
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from dataclasses import replace
+
+from shearloop.emulators import number_between
+from shearloop.emulators.ports import Connections, connected
+from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
+from shearloop.emulators.ur_rtde import RtdeSession
+from shearloop.emulators.urscript import translate
+
+RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
+# A control script closes its outermost block in the first column.
+SCRIPT_END = b"\nend\n"
+# A controller is never late. When this process was, the robot's time stands still, so that no watchdog expires on
+# heartbeats that wait in the socket. Its clock goes on: its samples are of now.
+MOST_CATCH_UP_S = 0.02
+BANNER = "Connected: Universal Robots Dashboard Server"
+_ROBOT_MODES = {MODE_POWER_OFF: "POWER_OFF", MODE_IDLE: "IDLE", MODE_RUNNING: "RUNNING"}
+# What changes the robot needs remote control; UR's words differ from version to version.
+_CONTROLS = ("power on", "brake release", "unlock protective stop", "stop", "close popup", "close safety popup")
+_SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
+
+FAULTS = (
+    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence"),
+    *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "version", "payload", "normal"),
+)
+
+
+class Controller:
+    """A `Robot` that real clients can connect to."""
+
+    def __init__(
+        self, robot: Robot, *, host: str = "127.0.0.1", rate_hz: float = 500.0, closed_ports: Collection[int] = ()
+    ) -> None:
+        """Take a robot; nothing is opened yet. `closed_ports` are of services that are not enabled."""
+        self.robot = robot
+        self._first_spec = robot.spec
+        # What the controller refuses or ignores.
+        self.faults: set[str] = set()
+        self._host = host
+        self._closed_ports = closed_ports
+        self._rate_hz = rate_hz
+        self._silent_until_s = 0.0
+        self._rtde: dict[asyncio.StreamWriter, RtdeSession] = {}
+        self._connections: Connections = {}
+
+    @asynccontextmanager
+    async def open(self) -> AsyncIterator[None]:
+        """Open the ports, and close them and every connection at the end."""
+        async with AsyncExitStack() as stack:
+            for port, serve in (
+                (RTDE_PORT, self._serve_rtde),
+                (SCRIPT_PORT, self._serve_scripts),
+                (DASHBOARD_PORT, self._serve_dashboard),
+            ):
+                if port in self._closed_ports:
+                    continue
+                server = await asyncio.start_server(serve, self._host, port)
+                stack.push_async_callback(server.wait_closed)
+                stack.callback(self._drop_all)
+                stack.callback(server.close)
+            yield
+        if self._connections:
+            await asyncio.wait(self._connections)
+
+    async def run(self) -> AsyncIterator[RobotEvent]:
+        """Let time pass, and yield the robot's events, until cancelled."""
+        dt_s = 1.0 / self._rate_hz
+        last_s = time.monotonic()
+        while True:
+            await asyncio.sleep(max(0.0, last_s + dt_s - time.monotonic()))
+            now_s = time.monotonic()
+            missed_s = max(0.0, now_s - MOST_CATCH_UP_S - last_s)
+            last_s += missed_s
+            self.robot.stand_still(missed_s)
+            while last_s + dt_s <= now_s:
+                last_s += dt_s
+                self.robot.step(dt_s)
+                for writer, session in self._rtde.items():
+                    self._send(writer, session.data())
+            for event in self.robot.take_events():
+                yield event
+
+    def command(self, line: str) -> None:
+        """Carry out a fault, as `protective-stop` or `silence 2`; ValueError where the line is none."""
+        match line.split():
+            case ["protective-stop"]:
+                self.robot.protective_stop("requested by hand")
+            case ["emergency-stop"]:
+                self.robot.emergency_stop()
+            case ["release"]:
+                self.robot.release()
+            case ["drop-rtde"]:
+                # The other ports live on.
+                for writer in list(self._rtde):
+                    writer.close()
+            case ["silence", seconds]:
+                self.silence(number_between(seconds, 0.0, 86400.0, "not a time in seconds from 0 to 86400"))
+            case ["registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" as fault]:
+                self.faults.add(fault)
+            case ["version", numbers]:
+                if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", numbers) is None:
+                    raise ValueError(f"{numbers!r} is not a version such as 5.4.0.0")
+                major, minor, bugfix, build = map(int, numbers.split("."))
+                self.robot.change(replace(self.robot.spec, version=(major, minor, bugfix, build)))
+            case ["payload", mass_kg]:
+                payload_kg = number_between(mass_kg, 0.0, 100.0, "not a mass in kg from 0 to 100")
+                self.robot.change(replace(self.robot.spec, payload_kg=payload_kg))
+            case ["normal"]:
+                self.robot.clear_faults()
+                self.robot.change(self._first_spec)
+                self.faults.clear()
+                self.silence(0.0)
+            case [name, *arguments] if name in FAULTS:
+                raise ValueError(f"{name} does not take {' '.join(arguments) or 'nothing'}")
+            case _:
+                raise ValueError(f"there is no fault {line!r}; there are {', '.join(FAULTS)}")
+
+    def silence(self, duration_s: float) -> None:
+        """Send nothing on any port for a while; the connections stay open, and the data is lost."""
+        self._silent_until_s = time.monotonic() + duration_s
+
+    def _drop_all(self) -> None:
+        for writer in self._connections.values():
+            writer.close()
+
+    def _send(self, writer: asyncio.StreamWriter, data: bytes) -> None:
+        if data and time.monotonic() >= self._silent_until_s and not writer.is_closing():
+            writer.write(data)
+
+    async def _serve_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with connected(writer, self._connections):
+            session = RtdeSession(self.robot, self._rate_hz, self.faults)
+            self._rtde[writer] = session
+            try:
+                while data := await reader.read(4096):
+                    self._send(writer, session.receive(data))
+            finally:
+                del self._rtde[writer]
+
+    async def _serve_scripts(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with connected(writer, self._connections):
+            text = bytearray()
+            while data := await reader.read(65536):
+                text += data
+                if text.endswith(SCRIPT_END):
+                    script = text.decode("utf-8", "replace")
+                    with suppress(SyntaxError):  # which `upload` reports
+                        # In a thread: it takes 40 ms, and the controller is never late.
+                        await asyncio.to_thread(translate, script)
+                    self.robot.upload(script)
+                    text.clear()
+
+    async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with connected(writer, self._connections):
+            if "mute-dashboard" not in self.faults:
+                self._send(writer, BANNER.encode() + b"\n")
+            while line := await reader.readline():
+                if "mute-dashboard" in self.faults:
+                    continue
+                request = line.decode("utf-8", "replace").strip()
+                self._send(writer, f"{self._answer_dashboard(request)}\n".encode())
+
+    def _answer_dashboard(self, request: str) -> str:
+        """Carry out a request as UR's page "Dashboard Server e-Series" describes it, and return the reply."""
+        robot = self.robot
+        if "local-control" in self.faults and request in _CONTROLS:
+            return f"Command is not allowed: the robot is in local control ({request})"
+        match request:
+            case "PolyscopeVersion":
+                return f"URSoftware {'.'.join(map(str, robot.spec.version))} (Jun 01 2024)"
+            case "get serial number":
+                return "20235500001"
+            case "is in remote control":
+                return "false" if "local-control" in self.faults else "true"
+            case "robotmode":
+                return f"Robotmode: {_ROBOT_MODES[robot.robot_mode]}"
+            case "safetymode":
+                return f"Safetymode: {_SAFETY_MODES[robot.safety_mode]}"
+            case "stop":
+                robot.end_program("stopped from the dashboard")
+                return "Stopped"
+            case "unlock protective stop":
+                cause = "Always inspect cause of protective stop before unlocking"
+                refusal = f"Cannot unlock protective stop until 5s after occurrence. {cause}"
+                return "Protective stop releasing" if robot.unlock() else refusal
+            case "power on":
+                robot.begin_power_step(MODE_POWER_OFF)
+                return "Powering on"
+            case "brake release":
+                robot.begin_power_step(MODE_IDLE)
+                return "Brake releasing"
+            case "close popup" | "close safety popup":
+                return request.replace("close", "closing")
+        return f"could not understand: '{request}'"

@@ -1,0 +1,166 @@
+"""The emulated controller without I/O: scripts, registers, faults and time in; state and events out.
+
+Nothing here reads a clock. A process that plays more of the rig gives the robot a `WristPlant` and steps it.
+"""
+
+import math
+from dataclasses import dataclass
+
+from shearloop.emulators.ur_arm import Arm, PathError, WristPlant
+from shearloop.emulators.urscript import Program, ProgramEndedError, Registers
+
+STOPPED, PLAYING, PAUSED = 1, 2, 4
+MODE_POWER_OFF, MODE_IDLE, MODE_RUNNING = 3, 5, 7
+SAFETY_NORMAL, SAFETY_PROTECTIVE_STOP, SAFETY_EMERGENCY_STOP = 1, 3, 7
+PROGRAM_END_DECELERATION, SAFETY_DECELERATION = 10.0, 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerSpec:
+    """The kind of controller."""
+
+    unlock_wait_s: float = 5.0
+    power_on_s: float = 1.0
+    version: tuple[int, int, int, int] = (5, 17, 3, 0)
+    # A gripper's; the arm's own pose is the flange's, so that the tool centre point is not moved.
+    payload_kg: float = 1.0
+    payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.06)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotEvent:
+    """An event at the robot's own time."""
+
+    time_s: float
+    name: str
+    detail: str
+
+
+class Robot:
+    """Arm, safety mode, power, program and registers."""
+
+    def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None) -> None:
+        """Be switched on, safe, at rest, without a program."""
+        self.spec = spec or ControllerSpec()
+        self.arm = Arm(plant)
+        self.robot_mode, self.safety_mode = MODE_RUNNING, SAFETY_NORMAL
+        self._stopped_s, self._power_step_s = 0.0, math.inf
+        self.registers = Registers()
+        self.runtime_state = STOPPED
+        self.time_s = 0.0
+        # The controller's clock, which never stands still.
+        self.clock_s = 0.0
+        self._events: list[RobotEvent] = []
+        self._program: Program | None = None
+
+    def step(self, dt_s: float) -> None:
+        """Run one control cycle."""
+        self.time_s += dt_s
+        self.clock_s += dt_s
+        if self.time_s >= self._power_step_s:
+            self._power_step_s = math.inf
+            self.robot_mode = MODE_IDLE if self.robot_mode == MODE_POWER_OFF else MODE_RUNNING
+        if self._program is not None and self.runtime_state == PLAYING:
+            try:
+                for event in self._program.cycle(dt_s, self.time_s):
+                    self._note(*event)
+            except ProgramEndedError as ended:
+                self.end_program(str(ended))
+        self._move(dt_s)
+        self.arm.feel(dt_s)
+
+    def stand_still(self, seconds: float) -> None:
+        """Let only the clock go on."""
+        self.clock_s += seconds
+
+    def take_events(self) -> list[RobotEvent]:
+        """Return what has happened since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def _move(self, dt_s: float) -> None:
+        moving = self.arm.moving
+        try:
+            self.arm.advance(dt_s)
+        except PathError as error:
+            self.protective_stop(str(error))
+        if moving != self.arm.moving:
+            self._note("motion-stopped" if moving else "motion-started")
+
+    @property
+    def program_running(self) -> bool:
+        """Whether a program is loaded and has not ended; a paused one counts."""
+        return self._program is not None
+
+    def upload(self, text: str) -> None:
+        """Run a program in URScript."""
+        if (self.safety_mode, self.robot_mode) != (SAFETY_NORMAL, MODE_RUNNING):
+            modes = f"robot mode {self.robot_mode}, safety mode {self.safety_mode}"
+            self._note("script-refused", modes)
+            return
+        self.end_program("a new script arrived")
+        try:
+            self._program = Program(text, self.registers, self.arm)
+        except SyntaxError as error:
+            self._note("script-refused", str(error))
+            return
+        self.runtime_state = PLAYING
+        self._note("program-started")
+
+    def end_program(self, cause: str) -> None:
+        """End the program; the arm slows down by itself."""
+        if self._program is not None:
+            self._program = None
+            self.runtime_state = STOPPED
+            self.arm.halt(PROGRAM_END_DECELERATION)
+            self._note("program-ended", cause)
+
+    def protective_stop(self, cause: str) -> None:
+        """Stop for safety and pause the program."""
+        if self.safety_mode == SAFETY_NORMAL:
+            self.safety_mode, self._stopped_s = SAFETY_PROTECTIVE_STOP, self.clock_s
+            self.arm.halt(SAFETY_DECELERATION)
+            self._note("protective-stop", cause)
+            if self._program is not None:
+                self.runtime_state = PAUSED
+
+    def emergency_stop(self) -> None:
+        """Press the emergency stop button: the program ends and the power goes off."""
+        if self.safety_mode != SAFETY_EMERGENCY_STOP:
+            self.arm.halt(SAFETY_DECELERATION)
+            self._note("emergency-stop", "the button is pressed")
+            self.end_program("emergency stop")
+            self.safety_mode, self.robot_mode = SAFETY_EMERGENCY_STOP, MODE_POWER_OFF
+
+    def release(self) -> None:
+        """Release the emergency stop button."""
+        if self.safety_mode == SAFETY_EMERGENCY_STOP:
+            self.safety_mode = SAFETY_NORMAL
+            self._note("emergency-stop-released")
+
+    def unlock(self) -> bool:
+        """End a protective stop; False within `unlock_wait_s` of its beginning."""
+        if self.safety_mode == SAFETY_PROTECTIVE_STOP:
+            if self.clock_s - self._stopped_s < self.spec.unlock_wait_s:
+                return False
+            self.safety_mode = SAFETY_NORMAL
+            self._note("protective-stop-unlocked")
+        return True
+
+    def begin_power_step(self, from_mode: int) -> None:
+        """Begin to power the arm, or to release its brakes, if it is in this mode."""
+        if self.robot_mode == from_mode and self.safety_mode != SAFETY_EMERGENCY_STOP:
+            self._power_step_s = min(self._power_step_s, self.time_s + self.spec.power_on_s)
+
+    def change(self, spec: ControllerSpec) -> None:
+        """Have another version or payload from now on."""
+        self.spec = spec
+
+    def clear_faults(self) -> None:
+        """Be safe and powered, without a program."""
+        self.end_program("the faults are cleared")
+        self.robot_mode, self.safety_mode, self._power_step_s = MODE_RUNNING, SAFETY_NORMAL, math.inf
+        self._note("faults-cleared")
+
+    def _note(self, name: str, detail: str = "") -> None:
+        self._events.append(RobotEvent(self.time_s, name, detail))

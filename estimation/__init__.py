@@ -1,0 +1,52 @@
+"""Estimators: `fit` makes a calibration from recordings; an `EstimatorSession` turns frames into estimates with it."""
+
+from typing import TYPE_CHECKING
+
+from shearloop.faces import importer
+
+if TYPE_CHECKING:
+    from shearloop.estimation.calibration import Calibration
+    from shearloop.estimation.estimator import Estimator, Physics
+    from shearloop.estimation.fitting import adapt, fit
+    from shearloop.estimation.load_delay import TRUSTED, LoadTiming, measure_timing
+    from shearloop.estimation.session import Adaptation, EstimatorSession
+    from shearloop.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, combine, torque_at
+
+__all__ = [
+    "TRUSTED",
+    "Adaptation",
+    "Calibration",
+    "Estimate",
+    "Estimator",
+    "EstimatorSession",
+    "FrameSeries",
+    "LoadTiming",
+    "Measured",
+    "Physics",
+    "TactileFrame",
+    "adapt",
+    "combine",
+    "fit",
+    "measure_timing",
+    "torque_at",
+]
+
+_HOMES = {
+    "Adaptation": "shearloop.estimation.session:Adaptation",
+    "Calibration": "shearloop.estimation.calibration:Calibration",
+    "Estimate": "shearloop.estimation.values:Estimate",
+    "Estimator": "shearloop.estimation.estimator:Estimator",
+    "EstimatorSession": "shearloop.estimation.session:EstimatorSession",
+    "FrameSeries": "shearloop.estimation.values:FrameSeries",
+    "LoadTiming": "shearloop.estimation.load_delay:LoadTiming",
+    "Measured": "shearloop.estimation.values:Measured",
+    "Physics": "shearloop.estimation.estimator:Physics",
+    "TRUSTED": "shearloop.estimation.load_delay:TRUSTED",
+    "TactileFrame": "shearloop.estimation.values:TactileFrame",
+    "adapt": "shearloop.estimation.fitting:adapt",
+    "combine": "shearloop.estimation.values:combine",
+    "fit": "shearloop.estimation.fitting:fit",
+    "measure_timing": "shearloop.estimation.load_delay:measure_timing",
+    "torque_at": "shearloop.estimation.values:torque_at",
+}
+__getattr__ = importer(__name__, globals(), _HOMES)

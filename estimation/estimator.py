@@ -1,0 +1,342 @@
+"""What an estimator is: what it needs, its features of a frame, and its fit; and the estimators that read one frame.
+
+An estimator is a subclass of `Estimator`, and a line in `bank/estimator_names.py`. It must have `name` and `features`.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
+
+import numpy as np
+
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.bank_file import Bank
+from shearloop.bank.channels import PAPER_TABLE, ChannelTable
+from shearloop.estimation.bank_match import (
+    NOT_TURNED,
+    BankMatch,
+    BankMatcher,
+    ElectrodeNumbering,
+    PaperMatcher,
+    RefinedMatcher,
+    find_numberings,
+    image_matrix,
+    resolve_symmetry,
+)
+from shearloop.estimation.fingertip_validator import FingertipValidator
+from shearloop.estimation.interval_regressor import (
+    STRENGTHS,
+    IntervalRegressor,
+    RegressorFit,
+    Ridge,
+    fit_interval_regressor,
+)
+from shearloop.estimation.novelty import NoveltyDetector
+from shearloop.estimation.regressors import ChannelImputer, later_origins, left_out_groups
+from shearloop.estimation.session_state import Motion, ProcessedFrame
+
+if TYPE_CHECKING:
+    from shearloop.bank.mesh import Mesh
+
+Quantity = Literal["torque", "diameter"]
+# Least and largest torque (n,) that each frame may have.
+Bounds: TypeAlias = tuple[FloatArray, FloatArray]
+# Two cells of the paper's bank.
+_LEAST_MARGIN_K_CM = 0.05
+# A diameter is constant within a recording: more frames add nothing and take long.
+_MOST_FOR_DIAMETER = 240
+# Fewer diameters do not determine a line and its error.
+LEAST_DIAMETERS, LEAST_LEFT = 3, 2
+NO_ERRORS: FloatArray = np.zeros((0, 1, 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Physics:
+    """Knowledge before calibration: the bank, and the mesh of the reconstruction."""
+
+    bank: Bank | None = None
+    mesh: "Mesh | None" = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OutputModel:
+    """How one quantity is predicted: its regressor, and for differences the detector of novel ones.
+
+    k_range holds the least and largest matched k in cm, or nothing without a bank.
+    """
+
+    regressor: IntervalRegressor
+    novelty: NoveltyDetector | None
+    k_range: FloatArray
+
+    def match_reasons(self, match: BankMatch) -> tuple[str, ...]:
+        """Return the reason against a bank match far from the calibrated ones, if there is one."""
+        if not len(self.k_range):
+            return ()
+        low, high = self.k_range.tolist()
+        margin = max(high - low, _LEAST_MARGIN_K_CM)
+        if low - margin <= match.k <= high + margin:
+            return ()
+        return (
+            f"the bank fits best at k = {match.k:.2f} cm, outside the calibrated {low:.2f} to {high:.2f} cm; "
+            "the match is on another ridge of the bank",
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """What an estimator reads: a frame after the session's checks, at t_s, and each side's match in its bank."""
+
+    frame: ProcessedFrame
+    t_s: float
+    matches: tuple[BankMatch, ...]
+
+    @classmethod
+    def of(cls, frame: ProcessedFrame, t_s: float, matcher: BankMatcher | None) -> Self:
+        """Return the reading of a frame; the matcher is that of the estimator's bank, None without one."""
+        return cls(frame, t_s, () if matcher is None else tuple(map(matcher.match, frame.difference)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Material:
+    """What an estimator is prepared from: the scale (m, c) of its differences, knowledge before calibration, and
+    the channels.
+
+    Raw recordings have validators, and the (n, m, c) frames of each grip.
+    """
+
+    scale: FloatArray
+    physics: Physics
+    table: ChannelTable
+    validators: tuple[FingertipValidator, ...] = ()
+    grips: Sequence[FloatArray] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationRows:
+    """Calibration frames: the recording (n,), number and age (n,) of each there, its features (n, d) and the truth.
+
+    position and mean_position (n, m·c) are the difference to the idle frame and its mean over the grip, in units of
+    noise.
+    """
+
+    recording: IntArray
+    frame: IntArray
+    age_s: FloatArray
+    features: FloatArray
+    position: FloatArray
+    mean_position: FloatArray
+    torque_nm: FloatArray
+    diameter_mm: FloatArray
+
+    def where(self, rows: IntArray | BoolArray) -> Self:
+        """Return some of the frames."""
+        return type(self)(*(getattr(self, one.name)[rows] for one in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator(ABC):
+    """An estimator of one calibration. The file keeps its fields, which are arrays, values, or dataclasses of these.
+
+    scale (m, c) divides differences per channel and is infinite for dead ones. imputer serves raw frames.
+    """
+
+    name: ClassVar[str]
+    needs: ClassVar[Literal["bank", "mesh", ""]] = ""
+    # Features that a quantity is predicted from.
+    columns: ClassVar[Mapping[Quantity, slice]] = {"torque": slice(None), "diameter": slice(None)}
+    # Penalties to choose from.
+    strengths: ClassVar[tuple[float, ...]] = STRENGTHS
+    # Whether features further from their mean than any at calibration are refused.
+    limits_features: ClassVar[bool] = True
+    # Whether a slice's size matters, and whether the regressor ignores NaN.
+    uses_amplitude: ClassVar[bool] = True
+    ignores_nan: ClassVar[bool] = False
+    # Whether a session imputes dead channels of raw frames along the motion, or the imputer does.
+    imputes_by_motion: ClassVar[bool] = False
+    least_slices: ClassVar[int] = 10
+
+    scale: FloatArray
+    table: ChannelTable = PAPER_TABLE
+    imputer: ChannelImputer | None = None
+
+    @classmethod
+    def prepare(cls, material: Material) -> Self:
+        """Return the estimator before its fit."""
+        return cls(material.scale, material.table)
+
+    @property
+    def motion(self) -> Motion:
+        """What a session remembers of the gel's motion."""
+        return Motion()
+
+    def matcher(self, _bank: Bank) -> BankMatcher | None:
+        """Return the matcher on the bank, None for an estimator without a bank."""
+        return None
+
+    @abstractmethod
+    def features(self, reading: Reading) -> FloatArray:
+        """Return the (d,) features of a reading."""
+
+    def inputs(self, quantity: Quantity, features: FloatArray, _reading: Reading) -> FloatArray:
+        """Return the (d,) inputs of a quantity's regressor."""
+        return features[self.columns[quantity]]
+
+    def impute(
+        self, difference: FloatArray, usable: BoolArray, novelty: NoveltyDetector | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return a (m, c) difference with unusable channels imputed, and their errors (k, m, c)."""
+        if self.imputer is not None:
+            return self.imputer.impute(difference, usable)
+        if novelty is None:
+            return difference, NO_ERRORS
+        imputed = np.nan if self.ignores_nan else novelty.impute(difference[0], usable[0])
+        return np.where(usable, difference, imputed), NO_ERRORS
+
+    def position_noise_mm(self, _regressor: IntervalRegressor) -> float:
+        """Return the diameter's 95 % error from the noise of one frame."""
+        return 0.0
+
+    def ridge(self, features: FloatArray, values: FloatArray, strength: float) -> Ridge:
+        """Fit a ridge to (n, d) features and (n,) values."""
+        return Ridge.fit(features, values, strength)
+
+    def k_range(self, features: FloatArray) -> FloatArray:
+        """Return the least and the largest k of (n, d) features, empty for an estimator without a bank."""
+        return np.array([features[:, 0].min(), features[:, 0].max()]) if self.needs == "bank" else np.zeros(0)
+
+    def slices_fits(self, _quantity: Quantity, _values: FloatArray) -> tuple[RegressorFit, RegressorFit]:
+        """Return the fit to slices of (n,) values, and that of a line, which reads values beyond these.
+
+        Raises CalibrationError where the values do not determine the fit.
+        """
+        return self.ridge, self.ridge
+
+    def fit_torque(
+        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
+    ) -> tuple[Self, IntervalRegressor, float]:
+        """Return the torque's regressor on raw frames of numbered recordings (n,), and the estimator as it uses them.
+
+        The third value is the share of the torque's variance that a tool's motion leaves unexplained on frames left
+        out, 0 where that is not tested.
+        """
+        # Without memory the gel's drift enters the torque, so validation uses later frames only.
+        regressor = fit_interval_regressor(
+            features[:, self.columns["torque"]],
+            torque_nm,
+            self.ridge,
+            strengths=self.strengths,
+            limit_features=self.limits_features,
+            left_out=later_origins(len(torque_nm)),
+            bounds=bounds,
+            recordings=recordings,
+            fingertips=len(self.scale),
+        )
+        return self, regressor, 0.0
+
+    def side_of_features(self, n_features: int) -> IntArray:
+        """Return the side (d,) that each of the torque's features comes from: one number where they have no side."""
+        return np.zeros(n_features, dtype=np.int64)
+
+    def fit_diameter(self, rows: CalibrationRows) -> OutputModel:
+        """Return the diameter's model from rows of known diameters, by age."""
+        n = len(rows.age_s)
+        rows = rows.where(np.arange(0, n, 1 + n // _MOST_FOR_DIAMETER))
+        # A new grip is another recording, not a later part of this one.
+        recordings = left_out_groups(rows.recording)
+        left_out = [pair for pair in recordings if len(np.unique(rows.diameter_mm[pair[0]])) >= LEAST_LEFT]
+        regressor = fit_interval_regressor(
+            rows.features[:, self.columns["diameter"]],
+            rows.diameter_mm,
+            self.ridge,
+            strengths=self.strengths,
+            left_out=left_out,
+        )
+        return OutputModel(regressor, None, self.k_range(rows.features))
+
+
+class Regression(Estimator):
+    """A ridge on the difference of each channel."""
+
+    name: ClassVar[str] = "regression"
+
+    def features(self, reading: Reading) -> FloatArray:
+        """Return the channels' differences."""
+        return (reading.frame.difference / self.scale).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction(Estimator):
+    """A ridge on an image of the conductivity; image (p, c) maps a difference to pixels."""
+
+    name: ClassVar[str] = "reconstruction"
+    needs: ClassVar[Literal["bank", "mesh", ""]] = "mesh"
+
+    image: FloatArray = field(kw_only=True)
+
+    @classmethod
+    def prepare(cls, material: Material) -> Self:
+        """Return the estimator with the mesh's image."""
+        if material.physics.mesh is None:
+            raise ValueError("a reconstruction needs a mesh")
+        return cls(material.scale, material.table, image=image_matrix(material.physics.mesh, material.table))
+
+    def features(self, reading: Reading) -> FloatArray:
+        """Return the pixels of each side."""
+        return (reading.frame.difference @ self.image.T).ravel()
+
+
+class _OnBank(Estimator):
+    """A ridge on a match in the bank, which lies within the bank's grid: its features need no limit."""
+
+    needs: ClassVar[Literal["bank", "mesh", ""]] = "bank"
+    limits_features: ClassVar[bool] = False
+
+    def ridge(self, features: FloatArray, values: FloatArray, strength: float) -> Ridge:
+        """Fit a ridge; the features of a match have different units and are scaled."""
+        return Ridge.fit_scaled(features, values, strength)
+
+
+@dataclass(frozen=True, eq=False)
+class BankEstimator(_OnBank):
+    """A ridge on a refined match of each side."""
+
+    name: ClassVar[str] = "bank"
+
+    numbering: ElectrodeNumbering = NOT_TURNED
+
+    @classmethod
+    def prepare(cls, material: Material) -> Self:
+        """Return the estimator with the numbering of the first side's electrodes."""
+        bank = material.physics.bank
+        if not material.validators or bank is None:
+            return cls(material.scale, material.table)
+        first = material.validators[0]
+        found = find_numberings(first.idle, bank.homogeneous, material.table)
+        return cls(material.scale, material.table, numbering=resolve_symmetry(found, first.gripped - first.idle, bank))
+
+    def matcher(self, bank: Bank) -> BankMatcher:
+        """Return the refined match on the bank."""
+        return RefinedMatcher(bank, self.numbering)
+
+    def features(self, reading: Reading) -> FloatArray:
+        """Return those of each side's match."""
+        return np.concatenate([one.features for one in reading.matches])
+
+
+class PaperEstimator(_OnBank):
+    """The paper's curves on one fingertip: torque over σ and σ², diameter over k; the amplitude is ignored."""
+
+    name: ClassVar[str] = "paper"
+    columns: ClassVar[Mapping[Quantity, slice]] = {"torque": slice(1, 3), "diameter": slice(0, 1)}
+    strengths: ClassVar[tuple[float, ...]] = (1e-9,)
+    uses_amplitude: ClassVar[bool] = False
+
+    def matcher(self, bank: Bank) -> BankMatcher:
+        """Return the paper's match on the bank."""
+        return PaperMatcher(bank)
+
+    def features(self, reading: Reading) -> FloatArray:
+        """Return k, σ and σ² of the first side."""
+        return reading.matches[0].features[:3]

@@ -1,0 +1,415 @@
+"""Checks of raw frames: right fingertip, gripped, undisturbed; and the grip in a recording.
+
+A fingertip is recognised by its pattern of voltages. From day to day the pattern changes by a common gain and a few
+per cent: the median deviation is 0.03 to 0.07 for the same fingertip and 0.15 to 0.19 for another one. A linear
+discriminant detects the grip. It ignores the motion of a frame by twisting and by the gel's slow recovery.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy import linalg
+
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.values import FrameSeries
+
+# One step of the board's converter, measured on recorded frames. Its rounding is the smallest noise.
+_CONVERTER_STEP_V = 0.00215
+LEAST_NOISE_V = float(_CONVERTER_STEP_V / np.sqrt(12.0))
+
+# Largest median relative deviation, after the common gain, of the calibrated fingertip.
+LARGEST_DEVIATION = 0.12
+# Added to voltages in denominators: a relative change of less is noise.
+SMALL_V = 0.01
+# Channels that are compared, and the least share of them.
+_WELL_ABOVE_NOISE_V, _LEAST_COMPARED_SHARE = 0.03, 0.25
+LARGEST_JUMPING_SHARE = 0.12
+LARGEST_UNUSABLE_SHARE = 0.25
+# A channel that moves between frames by more than both of these is disturbed.
+_JUMP_NOISES, _JUMP_V = 6.0, 0.008
+# A channel this far from its expected value, relative and after the common gain, has lost its electrode. Recorded
+# frames stay within 0.4, except single channels while the grip closes.
+_LOST_SHARE = 0.6
+# Directions of motion while gripped or idle that the grip's discriminant ignores.
+_N_NUISANCE = 2
+# Recorded frames have at most two channels at their largest value. This many are at an amplifier's rail.
+_FEWEST_AT_RAIL = 9
+# Closing and opening take this many frames and move further than twisting under load by this factor.
+STEP_FRAMES, _STEP_MARGIN = 4, 1.25
+# A grip scores above the idle frames by this many standard deviations, and by at least this share of the calibrated
+# grip. Idle frames of other sessions score at most 0.06, their grips at least 0.12 (docs/decisions/0042).
+_IDLE_DEVIATIONS, _LEAST_RISE = 3.0, 0.08
+_LEAST_IDLE, _LEAST_GRIPPED = 5, 20
+# The first frame of a session counts as idle unless it is clearly nearer to the gripped frame. Below the second
+# deviation it is from the calibration's own session, and its score decides.
+_CLEARLY_NEARER, _SAME_SESSION, _GRIPPED_SCORE = 0.8, 0.01, 0.5
+# A grip ends when its score falls below this share of its mean over this many frames.
+_LOOSE_SHARE, _LEVEL_FRAMES = 0.5, 60
+# A large step exceeds the steps of twisting under load by this factor.
+_LARGE_STEP = 1.4
+# Frames below this share of the way from idle to loaded, in this running median, are idle. Gripped and not twisted they
+# are at 0.57 and more, in recovery from a touch or a release at 0.41 and less.
+_IDLE_SHARE, _MEDIAN_FRAMES = 0.45, 5
+# Fewer loaded frames have no second differences to show the noise.
+_LEAST_LOADED = 3
+# Fewer frames after a step are still its transient.
+_LEAST_RELEASED = 10
+
+
+# A channel that reads 0 in more of a part's frames is dead at calibration.
+_SILENT_SHARE = 0.05
+# The threshold's largest share of the way from idle to the weakest grip.
+_LARGEST_RISE = 1 / 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FingertipValidator:
+    """One fingertip at calibration: mean frames idle and gripped, noise (c,), all in volts, and grip discriminant.
+
+    Channels that were dead at calibration have infinite noise. If the calibration has no frames after a release, the
+    gel's slow recovery could pass for a grip. A release is then detected as a step: further than step_limit (in
+    noises) within STEP_FRAMES frames, while the grip score falls by more than fall_limit. Otherwise both are infinite.
+    """
+
+    side: str
+    idle: FloatArray
+    gripped: FloatArray
+    noise: FloatArray
+    grip_weights: FloatArray
+    grip_threshold: float
+    step_limit: float
+    fall_limit: float
+
+    @classmethod
+    def fit(cls, side: str, *recordings: tuple[FloatArray, FloatArray, FloatArray]) -> Self:
+        """Fit to each recording's (n, c) frames before, in, and after the grip (none after it is allowed).
+
+        Each recording is compared with its own idle frames, because the gel drifts between recordings.
+        """
+        n_idle, n_gripped = (min(len(one[i]) for one in recordings) for i in (0, 1))
+        if n_idle < _LEAST_IDLE or n_gripped < _LEAST_GRIPPED:
+            raise CalibrationError(
+                f"side {side}: {n_idle} idle and {n_gripped} gripped frames are too few to detect a grip; "
+                "start the recording some seconds before gripping"
+            )
+        bases = [np.median(idle, axis=0) for idle, _, _ in recordings]
+        noise = np.sqrt(np.mean([channel_noise(gripped) ** 2 for _, gripped, _ in recordings], axis=0))
+        silent = np.max([(part == 0.0).mean(axis=0) for one in recordings for part in one[:2]], axis=0)
+        noise = np.where(silent > _SILENT_SHARE, np.inf, noise)
+        base = np.mean(bases, axis=0)
+        scale = np.where(np.isfinite(noise), noise, 1.0) / (base + SMALL_V)
+        floor = 0.3 * float(np.median(scale))
+        scale = np.where(np.isfinite(noise), np.maximum(scale, floor), np.inf)
+        relative = [
+            tuple(relative_change(part, own) for part in one) for own, one in zip(bases, recordings, strict=True)
+        ]
+
+        def discriminant(rows: slice) -> FloatArray:
+            parts = [np.concatenate([one[i][rows] for one in relative]) / scale for i in range(3)]
+            return _discriminant([part for part in parts if len(part)]) / scale
+
+        # Some combination of c channels separates any frames, so test it on frames that it was not fitted to.
+        half = discriminant(slice(0, None, 2))
+        for one in relative:
+            scores = [part[1::2] @ half for part in one]
+            not_gripped = np.concatenate([scores[0], *scores[2:]])
+            if np.quantile(scores[1], 0.01) <= np.quantile(not_gripped, 0.99):
+                raise CalibrationError(
+                    f"side {side}: gripped frames look like idle ones; did the fingertip touch the tool?"
+                )
+        weights = discriminant(slice(None))
+        idle_scores = np.concatenate([one[0] @ weights for one in relative])
+        rise = max(_IDLE_DEVIATIONS * float(idle_scores.std()), _LEAST_RISE)
+        highest_idle = float(np.quantile(idle_scores, 0.99))
+        weakest_grip = min(float(np.quantile(one[1] @ weights, 0.01)) for one in relative)
+        # Idle scores of different tools scatter further than the weakest grip of them.
+        threshold = highest_idle + min(rise, _LARGEST_RISE * max(weakest_grip - highest_idle, 0.0))
+        step_limit = fall_limit = np.inf
+        if not any(len(released) for _, _, released in recordings):
+            gripped = [frames for _, frames, _ in recordings]
+            score = [one[1] @ weights for one in relative]
+            step_limit = _STEP_MARGIN * max(float(frame_steps(frames, noise).max()) for frames in gripped)
+            fall_limit = _STEP_MARGIN * max(float((one[:-STEP_FRAMES] - one[STEP_FRAMES:]).max()) for one in score)
+        mean = np.concatenate([gripped for _, gripped, _ in recordings]).mean(axis=0)
+        return cls(side, base, mean, noise, weights, threshold, step_limit, fall_limit)
+
+    def looks_idle(self, frame: FloatArray) -> bool:
+        """Return whether a session's first frame is idle: not clearly nearer to the calibrated grip."""
+        known = np.array([self.idle, self.gripped])
+        *_, (from_idle, from_gripped) = compare_frames(frame, known, np.isfinite(self.noise))
+        score = self.grip_score(frame / self.gain(frame), self.idle)
+        if min(from_idle, from_gripped) < _SAME_SESSION and score > _GRIPPED_SCORE:
+            return False
+        return bool(_CLEARLY_NEARER * from_idle <= from_gripped)
+
+    def gain(self, idle: FloatArray) -> float:
+        """Return the common factor of an idle frame over the calibration's, which changes as the gel ages."""
+        found = float(compare_frames(idle, self.idle[None])[0][0])
+        return found if found > 0 else 1.0
+
+    def grip_score(self, frame: FloatArray, idle: FloatArray) -> float:
+        """Return the grip's score, about 0 when idle and 1 when gripped as at calibration; idle is this session's."""
+        return float(relative_change(frame, idle) @ self.grip_weights)
+
+    def released(self, frame: FloatArray, earlier: FloatArray, idle: FloatArray) -> bool | None:
+        """Return whether the grip opened (True) or closed (False) since a frame STEP_FRAMES ago; None for neither."""
+        if float((np.abs(frame - earlier) / self.noise).mean()) <= self.step_limit:
+            return None
+        fall = self.grip_score(earlier, idle) - self.grip_score(frame, idle)
+        return fall > 0 if abs(fall) > self.fall_limit else None
+
+
+def compare_frames(
+    frame: FloatArray, known: FloatArray, usable: BoolArray | np.bool_ = np.True_
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Compare a (…, c) frame with k known (…, k, c) ones; return gains (n,), deviations and their medians (n,).
+
+    The common gain over each known frame is divided out of the relative deviations (…, k, c); n counts the known
+    frames. Channels that are not usable or hardly above the noise are NaN. Gains and deviations are NaN, and medians
+    infinite, without a gain. Medians are also infinite where too few channels can be compared.
+    """
+    known = np.where(usable & (known > _WELL_ABOVE_NOISE_V), known, np.nan)
+    counts = np.isfinite(known).sum(axis=-1).ravel()
+    frame = frame[..., None, :]
+    gains = _medians(frame / known, counts)
+    gains[~(gains > 0)] = np.nan
+    deviations = np.abs(frame / gains.reshape(*known.shape[:-1], 1) - known) / known
+    medians = _medians(deviations, counts)
+    medians[(counts < _LEAST_COMPARED_SHARE * known.shape[-1]) | np.isnan(medians)] = np.inf
+    return gains, deviations, medians
+
+
+class FingertipSet:
+    """The validators of m sides together; frames are (m, c) in volts."""
+
+    def __init__(self, sides: tuple[FingertipValidator, ...]) -> None:
+        """Take the validators in the order of a frame's sides."""
+        self.sides = sides
+        self.idle: FloatArray = np.array([one.idle for one in sides])
+        self.gripped: FloatArray = np.array([one.gripped for one in sides])
+        noise = np.array([one.noise for one in sides])
+        # Channels that were not dead at calibration.
+        self.alive: BoolArray = np.isfinite(noise)
+        self._jump_limits_v = np.maximum(_JUMP_NOISES * np.sqrt(2.0) * noise, _JUMP_V)
+        self._frames = np.stack([self.idle, self.gripped], axis=1)
+
+    def too_few_channels(self, usable: BoolArray) -> list[str]:
+        """Return for each side the reason why too few channels are usable, empty where there are enough."""
+        unusable = 1.0 - np.count_nonzero(usable, axis=1) / usable.shape[1]
+        return [
+            f"{one.side} fingertip: {100 * share:.0f} % of the channels are dead or saturated; check the ribbon cable "
+            "and the gel's contact with the electrodes"
+            if share > LARGEST_UNUSABLE_SHARE
+            else ""
+            for one, share in zip(self.sides, unusable.tolist(), strict=True)
+        ]
+
+    def check(self, frame: FloatArray, usable: BoolArray) -> tuple[list[str], BoolArray]:
+        """Return for each side a reason against it or an empty text, and which (m, c) channels are lost.
+
+        A side is refused with too few usable channels or as another fingertip. A lost channel reads a value that
+        neither grip nor twist explains: a lost electrode or a crossed wire.
+        """
+        _, deviations, medians = compare_frames(frame, self._frames, usable[:, None])
+        lost = deviations > _LOST_SHARE
+        reasons = [""] * len(self.sides) if usable.all() else self.too_few_channels(usable)
+        for number, deviation in enumerate(medians.reshape(-1, 2).min(axis=1).tolist()):
+            if not reasons[number] and deviation > LARGEST_DEVIATION:
+                reasons[number] = (
+                    f"{self.sides[number].side} fingertip: the voltages deviate by {100 * deviation:.0f} % from the "
+                    f"calibration, more than {100 * LARGEST_DEVIATION:.0f} %; this is another fingertip or another "
+                    "gel, calibrate it"
+                )
+        return reasons, lost[:, 0] & lost[:, 1]
+
+    def jumping_shares(self, frame: FloatArray, before: FloatArray, usable: BoolArray) -> FloatArray:
+        """Return the share of each side's usable channels that moved further than noise explains; 1 without any."""
+        jumping = (np.abs(frame - before) > self._jump_limits_v) & usable
+        counts = np.count_nonzero(usable, axis=1)
+        return np.where(counts > 0, np.count_nonzero(jumping, axis=1) / np.maximum(counts, 1), 1.0)
+
+    def disturbance(self, jumping_shares: FloatArray) -> str:
+        """Return why shares of jumping channels mean a disturbance."""
+        number = int(np.argmax(jumping_shares > LARGEST_JUMPING_SHARE))
+        return (
+            f"{self.sides[number].side} fingertip: {100 * jumping_shares[number]:.0f} % of the channels jumped since "
+            "the last frame; the tool was gripped, released or knocked, or the board is disturbed"
+        )
+
+
+class GripDetector:
+    """Detects whether one fingertip is gripped, from its grip score and its steps, frame by frame.
+
+    A grip starts when the score rises by the threshold above the lowest score since the last grip, because a gel that
+    recovers from a release scores less and less. It ends below half of that rise, or below a share of this grip's own
+    mean score, because grips may be a fifth or three times as strong as the calibrated one.
+    """
+
+    def __init__(self, side: FingertipValidator) -> None:
+        """Start without a grip."""
+        self._side = side
+        self._floor = 0.0
+        self._level: float | None = None
+        self._frames = 0
+        self._released = False
+        self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
+
+    def forget_steps(self) -> None:
+        """Forget the last frames: they do not show a step."""
+        self._passed.clear()
+
+    def update(self, frame: FloatArray, idle: FloatArray, gain: FloatArray, least_score: float) -> bool:
+        """Take the next (c,) frame and return whether it is gripped; a grip begins above the least score."""
+        side = self._side
+        self._passed.append(frame)
+        if len(self._passed) > STEP_FRAMES and max(side.step_limit, side.fall_limit) < math.inf:
+            released = side.released(frame / gain, self._passed[0] / gain, idle / gain)
+            self._released = self._released if released is None else released
+        score, threshold = side.grip_score(frame, idle), side.grip_threshold
+        if self._level is None:
+            if score > least_score:
+                self._floor = min(self._floor, max(score, 0.0))
+                if score - self._floor > threshold:
+                    self._level, self._frames = score, 1
+        elif score < max(self._floor + 0.5 * threshold, _LOOSE_SHARE * self._level):
+            self._level, self._floor = None, max(score, 0.0)
+        else:
+            self._frames = min(self._frames + 1, _LEVEL_FRAMES)
+            self._level += (score - self._level) / self._frames
+        return self._level is not None and not self._released
+
+
+def relative_change(frame: FloatArray, idle: FloatArray) -> FloatArray:
+    """Return the change of (…, c) channels from idle, relative to idle."""
+    return np.asarray((frame - idle) / (idle + SMALL_V))
+
+
+def mask_unmeasured(channels: FloatArray, usable: BoolArray) -> BoolArray:
+    """Return the (m, c) usable channels without those at an amplifier's rail, and those where the board sends 0."""
+    usable = usable & (channels != 0.0)
+    heights = np.where(usable, channels, -np.inf)
+    largest = heights == heights.max(axis=-1, keepdims=True)
+    at_rail = largest & (np.count_nonzero(largest, axis=-1) >= _FEWEST_AT_RAIL)[:, None]
+    return np.asarray(usable & ~at_rail)
+
+
+def channel_noise(frames: FloatArray) -> FloatArray:
+    """Return the (c,) standard deviation of fast noise in (n, c) frames, from their second differences.
+
+    Slow signals cancel. It is at least the converter's rounding, and infinite for a channel that never changes.
+    """
+    noise = np.sqrt((np.diff(frames, 2, axis=0) ** 2).mean(axis=0) / 6.0)
+    still = np.ptp(frames, axis=0) == 0
+    return np.where(still, np.inf, np.maximum(noise, LEAST_NOISE_V))
+
+
+def frame_steps(frames: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return the (n − STEP_FRAMES,) mean distances in noises that (n, c) frames move within STEP_FRAMES frames."""
+    return np.asarray((np.abs(frames[STEP_FRAMES:] - frames[:-STEP_FRAMES]) / noise).mean(axis=1))
+
+
+def _medians(rows: FloatArray, counts: IntArray) -> FloatArray:
+    """Return the (n,) medians of (…, c) rows with `counts` (n,) values that are not NaN; 0 for a row without any."""
+    # Sorting puts NaN last and takes half the time of np.partition and a tenth of np.nanmedian.
+    ordered, rows_of = np.sort(rows, axis=-1).reshape(-1, rows.shape[-1]), np.arange(len(counts))
+    halves = ordered[rows_of, (counts - 1) // 2] + ordered[rows_of, counts // 2]
+    return np.where(counts > 0, halves / 2, 0.0)
+
+
+def _discriminant(parts: list[FloatArray]) -> FloatArray:
+    """Return weights of idle, gripped and perhaps released frames: 0 for the mean idle frame, 1 for the gripped one.
+
+    Directions of variation within the parts, and the one from idle to released, have no weight.
+    """
+    means = [part.mean(axis=0) for part in parts]
+    within = np.vstack([part - mean for part, mean in zip(parts, means, strict=True)])
+    # The first right singular vectors, by the smaller of the two Gram matrices: np.linalg.svd would find all.
+    few = len(within) < within.shape[1]
+    gram = within @ within.T if few else within.T @ within
+    vectors = linalg.eigh(gram, subset_by_index=(len(gram) - _N_NUISANCE, len(gram) - 1))[1]
+    nuisance = list((within.T @ vectors if few else vectors).T)
+    step = means[1] - means[0]
+    if len(parts) == 3:
+        nuisance.append(means[2] - means[0])
+        step = means[1] - 0.5 * (means[0] + means[2])
+    q = np.linalg.qr(np.array(nuisance).T)[0]
+    direction = step - q @ (q.T @ step)
+    return np.asarray(direction / float(direction @ step))
+
+
+def segment_grip(series: FrameSeries) -> tuple[slice, slice, slice]:
+    """Return the frames before the grip, in it, and after it, from the torque, the steps, and the positions.
+
+    Loaded frames are gripped; frames before the first large step are not. The grip begins at the last large step before
+    the first torque, or later where the frames become more like the loaded ones than the idle ones. It ends likewise.
+    Frames of unknown torque belong to neither. Raises CalibrationError for a recording without torque.
+    """
+    known = series.torque_at_frames()
+    if len(known) == 0:
+        sides = f"the side {series.sides[0]}" if len(series.sides) == 1 else f"{' and '.join(series.sides)} together"
+        raise CalibrationError(f"the recording holds no frames of {sides}; record some frames")
+    if not np.isfinite(known).any():
+        raise CalibrationError("no torque is known for these frames; record the load cell with them")
+    torque = np.abs(np.nan_to_num(known))
+    loaded = np.flatnonzero(torque > 0.1 * torque.max(initial=np.finfo(np.float64).tiny))
+    if len(loaded) == 0:
+        raise CalibrationError("the torque is 0 at all of these frames; record twists that the load cell measures")
+    n, span = len(series.t_s), slice(int(loaded[0]), int(loaded[-1]) + 1)
+    if span.stop - span.start < _LEAST_LOADED:
+        raise CalibrationError(
+            f"from the first torque to the last there are {span.stop - span.start} frames, too few to detect a grip; "
+            "record several twists"
+        )
+    step = np.zeros(n)
+    for layer in range(len(series.sides)):
+        frames = series.channels[:, layer]
+        step[STEP_FRAMES:] = np.maximum(step[STEP_FRAMES:], frame_steps(frames, channel_noise(frames[span])))
+    large = np.flatnonzero(step > _LARGE_STEP * float(np.quantile(step[span], 0.99)))
+    before, after = large[large < loaded[0]], large[large > loaded[-1]]
+    begin = int(before[-1]) + 1 if len(before) else 0
+    end = int(after[0]) - 1 if len(after) else n
+    # The transients of closing and opening belong to neither side.
+    idle_end = int(before[0]) - 1 if len(before) else _idle_end_without_step(series.channels, span)
+    let_go = 0
+    for layer in range(len(series.sides)):
+        like_idle = _is_like_idle(series.channels[:, layer], slice(0, idle_end), span)
+        earlier, later = np.flatnonzero(like_idle[: loaded[0]]), np.flatnonzero(like_idle[loaded[-1] :])
+        let_go = max(let_go, int(np.flatnonzero(~like_idle)[-1]) + _MEDIAN_FRAMES // 2)
+        if len(earlier):
+            begin = max(begin, int(earlier[-1]) + _MEDIAN_FRAMES // 2)
+        if len(later):
+            end = min(end, int(loaded[-1] + later[0]) - _MEDIAN_FRAMES // 2)
+    end = min(end, int(np.flatnonzero(np.isfinite(known))[-1]) + 1)
+    released = int(after[-1]) + 1 if len(after) else let_go
+    if n - released < _LEAST_RELEASED:
+        released = n
+    return slice(0, idle_end), slice(begin, end), slice(released, n)
+
+
+def _idle_end_without_step(frames: FloatArray, loaded: slice) -> int:
+    """Return how many of (n, m, c) frames are like the first ones, where no step shows the grip.
+
+    0 where frames between the twists are like the first ones too: then the recording began gripped.
+    """
+    first = slice(0, min(_LEAST_RELEASED, loaded.start // 2))
+    like = np.all([_is_like_idle(frames[:, layer], first, loaded) for layer in range(frames.shape[1])], axis=0)
+    if like[: loaded.start].all() or like[loaded].any():
+        return 0
+    return max(int(np.argmin(like)) - _MEDIAN_FRAMES // 2, 0)
+
+
+def _is_like_idle(frames: FloatArray, idle: slice, loaded: slice) -> BoolArray:
+    """Return which (n, c) frames are nearer to the idle ones than to the loaded ones, along their difference."""
+    if idle.stop == 0:
+        return np.zeros(len(frames), dtype=np.bool_)
+    # Imported here because the daemon does not calibrate: it would slow its start.
+    from scipy.ndimage import median_filter
+
+    base, noise = np.median(frames[idle], axis=0), channel_noise(frames[loaded])
+    moved = (np.median(frames[loaded], axis=0) - base) / noise
+    along = median_filter((frames - base) / noise @ moved, _MEDIAN_FRAMES, mode="nearest")
+    return np.asarray(along < _IDLE_SHARE * float(moved @ moved))

@@ -1,0 +1,304 @@
+"""Fitting an estimator to recordings: one function for all estimators, on raw frames or on slices.
+
+Every choice is made on data left out of the fit: later data, blocks of time or recordings (docs/calibrations.md).
+Nothing looks at the recordings that the calibration will be evaluated on.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.bank_match import BankMatcher
+from shearloop.estimation.calibration import Assumption, Calibration
+from shearloop.estimation.estimator import (
+    LEAST_DIAMETERS,
+    CalibrationRows,
+    Estimator,
+    Material,
+    OutputModel,
+    Physics,
+    Quantity,
+    Reading,
+)
+from shearloop.estimation.estimator_names import EstimatorName, estimator_class
+from shearloop.estimation.fingertip_validator import FingertipValidator, segment_grip
+from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, gains_of_recordings
+from shearloop.estimation.interval_regressor import CensoredRidge, IntervalRegressor, fit_interval_regressor
+from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
+from shearloop.estimation.novelty import NoveltyDetector
+from shearloop.estimation.regressors import ChannelImputer, later_origins
+from shearloop.estimation.session_state import ProcessedFrame, SessionState
+from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
+
+# With more variance left on a tool of another diameter, the tools have no torque in common.
+_TOOLS_MAY_LEAVE = 0.75
+# Share of a recording's frames below its released torque, and the penalty while tools are compared.
+_RELEASED, _TOOLS_STRENGTH = 0.05, 1e-5
+# Tools have a torque in common where their gains differ by less than this factor.
+_TOOLS_DIFFER = 2.0
+
+
+def fit(
+    name: EstimatorName,
+    recordings: Sequence[FrameSeries],
+    source: str,
+    physics: Physics | None = None,
+    *,
+    timing: LoadTiming | None = None,
+    full_range: bool = False,
+) -> Calibration:
+    """Calibrate an estimator on recordings of one kind, in time order; `source` describes them in words.
+
+    Slices with torque give a torque, those with diameters a diameter. `timing` is measured on the recordings where it
+    is not given. With `full_range` the user guarantees that no torque exceeds the slices: intervals do not extend
+    further. Raises CalibrationError for recordings that do not determine the calibration, and for missing physics.
+    """
+    physics, kind = physics or Physics(), estimator_class(name)
+    sides = _check_recordings(recordings)
+    if kind.needs and getattr(physics, kind.needs) is None:
+        raise CalibrationError(f"the estimator {name} needs a {kind.needs}; name it with --{kind.needs}")
+    chosen = [one.select_sides(sides) for one in recordings]
+    is_raw = recordings[0].kind == "raw"
+    if is_raw:
+        timing = timing or measure_timing(recordings)
+    table = recordings[0].table
+    slices = Material(np.ones((len(sides), table.n_channels)), physics, table)
+    material = _material(chosen, physics) if is_raw else slices
+    tools = _tools_of(recordings)
+    blank = Calibration(
+        estimator=kind.prepare(material),
+        kind=recordings[0].kind,
+        sides=sides,
+        source=source,
+        bank_identity=physics.bank.identity if physics.bank is not None and kind.needs == "bank" else "",
+        tool_mm=tools[0].value if len(tools) == 1 else np.nan,
+        validators=material.validators,
+    )
+    if timing is None or not is_raw:
+        return _fit_slices(blank, chosen, physics, full_range=full_range)
+    fitted = _fit_raw(blank, chosen, physics, timing.uncertainty_s)
+    return fitted if timing.references else replace(fitted, assumptions=("load timing",))
+
+
+def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:
+    """Return the sides that all recordings have; raises CalibrationError for recordings that do not belong together."""
+    if not recordings:
+        raise CalibrationError("there is no recording to calibrate on")
+    check_finite(recordings)
+    if len({one.table for one in recordings}) > 1:
+        raise CalibrationError("the recordings are of different kinds of fingertips; make a calibration of each")
+    if len({one.kind for one in recordings}) > 1:
+        raise CalibrationError("raw frames and slices of differences do not fit into one calibration; make two")
+    sides = tuple(side for side in recordings[0].sides if all(side in one.sides for one in recordings))
+    if not sides:
+        raise CalibrationError("the recordings have no side in common; name the side of each when importing")
+    return sides
+
+
+def _tools_of(recordings: Sequence[FrameSeries]) -> list[Measured]:
+    """Return the known diameters in mm of raw recordings' different tools."""
+    return distinct([tool for one in recordings if (tool := one.tool_mm) is not None])
+
+
+def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
+    """Return what an estimator of raw frames is prepared from."""
+    parts = [segment_grip(one) for one in recordings]
+    validators = tuple(
+        FingertipValidator.fit(
+            side,
+            *(
+                (one.channels[before, layer], one.channels[during, layer], one.channels[after, layer])
+                for one, (before, during, after) in zip(recordings, parts, strict=True)
+            ),
+        )
+        for layer, side in enumerate(recordings[0].sides)
+    )
+    grips = [one.channels[during] for one, (_, during, _) in zip(recordings, parts, strict=True)]
+    return Material(np.array([one.noise for one in validators]), physics, recordings[0].table, validators, grips)
+
+
+def _fit_raw(
+    calibration: Calibration, recordings: list[FrameSeries], physics: Physics, timing_uncertainty_s: float
+) -> Calibration:
+    """Return the calibration with its outputs; the torques may be off by the uncertainty in time."""
+    matcher = calibration.matcher(physics.bank)
+    rows = _replay(calibration, matcher, recordings)
+    if rows is None:
+        raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
+    bounds = None
+    if timing_uncertainty_s:
+        each = [torque_bounds(one, timing_uncertainty_s) for one in recordings]
+        places = zip(rows.recording.tolist(), rows.frame.tolist(), strict=True)
+        least_nm, largest_nm = np.array([[end[frame] for end in each[recording]] for recording, frame in places]).T
+        bounds = least_nm, largest_nm
+    estimator = calibration.estimator
+    if not estimator.imputes_by_motion:
+        estimator = replace(estimator, imputer=ChannelImputer.fit(rows.position, calibration.validators))
+    estimator, regressor, unexplained = estimator.fit_torque(rows.features, rows.torque_nm, bounds, rows.recording)
+    # By age within the recordings, so that every part has all tools.
+    order = np.argsort(rows.age_s, kind="stable")
+    known = rows.where(order[np.isfinite(rows.diameter_mm[order])])
+    enough = len(np.unique(known.diameter_mm)) >= LEAST_DIAMETERS
+    diameter = estimator.fit_diameter(known) if enough else None
+    law = None
+    if len(tools := _tools_of(recordings)) > 1:
+        diameters_mm = np.array([np.nan if one.tool_mm is None else one.tool_mm.value for one in recordings])
+        fitted = _fit_tools(estimator, rows, diameters_mm) if enough else None
+        if fitted is not None:
+            estimator, regressor, law = fitted
+        elif unexplained > _TOOLS_MAY_LEAVE:
+            raise CalibrationError(
+                f"the tools of {' and '.join(f'{one.value:.3g}' for one in tools)} mm turn so differently that they "
+                "have no torque in common; calibrate on each alone, or on three diameters"
+            )
+    torque = OutputModel(regressor, None, estimator.k_range(rows.features))
+    return replace(calibration, estimator=estimator, torque=torque, diameter=diameter, tools=law)
+
+
+def _fit_tools(
+    estimator: Estimator, rows: CalibrationRows, diameters_mm: FloatArray
+) -> tuple[Estimator, IntervalRegressor, ToolLaw] | None:
+    """Return the regressor of torques in units of each tool's gain, and the law of these gains.
+
+    None where the tools have the torque in common, or were twisted both ways. Motion shows how torque changes after
+    the grip, so a recording counts from its least torque on.
+    """
+    rows = rows.where(np.isfinite(diameters_mm)[rows.recording])
+    features, torque_nm = rows.features, rows.torque_nm.copy()
+    tools, recording = np.unique(rows.recording, return_inverse=True)
+    diameters_mm = diameters_mm[tools]
+    for own in (recording == one for one in range(len(tools))):
+        if torque_nm[own].min() < -LOADED_SHARE * torque_nm[own].max():
+            return None
+        torque_nm[own] -= np.quantile(torque_nm[own], _RELEASED)
+
+    def predict(kept: IntArray, out: IntArray, values: FloatArray) -> FloatArray:
+        return np.maximum(CensoredRidge.fit(features[kept], values[kept], _TOOLS_STRENGTH).predict(features[out]), 0.0)
+
+    gains = gains_of_recordings(recording, torque_nm, predict)
+    if gains.max() < _TOOLS_DIFFER * gains.min():
+        return None
+    estimator, regressor, _ = estimator.fit_torque(features, torque_nm / gains[recording], None, recording)
+    return estimator, regressor, ToolLaw.fit(diameters_mm, gains)
+
+
+def adapt(
+    calibration: Calibration,
+    recordings: Sequence[FrameSeries],
+    source: str,
+    physics: Physics | None = None,
+    *,
+    first_frames: Sequence[int] = (),
+) -> tuple[Calibration, GainCorrection]:
+    """Return a calibration with the gain of each fingertip corrected by recordings of known torque, and the correction.
+
+    `source` describes them in words. Twists count from each recording's frame of `first_frames` on. The correction is
+    shrunk by how much these can tell. Raises CalibrationError for recordings without a torque estimate under load, and
+    for a calibration without such a gain.
+    """
+    if len(tools := _tools_of(recordings)) > 1:
+        raise CalibrationError("the recordings are of several tools; adapt to one at a time")
+    calibration = calibration.for_tool(tools[0] if tools else None)
+    calibration.gain_regressor()
+    matcher = calibration.matcher((physics or Physics()).bank)
+    check_finite(recordings)
+    rows = _replay(calibration, matcher, [one.select_sides(calibration.sides) for one in recordings])
+    if rows is not None and first_frames:
+        rows = rows.where(rows.frame >= np.array(first_frames)[rows.recording])
+    if rows is None or not len(rows.frame):
+        raise CalibrationError(
+            "no frame is gripped and undisturbed for long enough; `shearloop evaluate` lists the reasons; "
+            "twist the gripped tool again"
+        )
+    features = rows.features[:, calibration.estimator.columns["torque"]]
+    adapted, correction = calibration.correct_gain(features, rows.torque_nm)
+    return replace(adapted, source=f"{calibration.source}, adapted on {source}"), correction
+
+
+def _replay(
+    calibration: Calibration, matcher: BankMatcher | None, recordings: Sequence[FrameSeries]
+) -> CalibrationRows | None:
+    """Return the frames that an estimate would be made of, processed as in a session; None without any."""
+    estimator, rows = calibration.estimator, []
+    for recording, series in enumerate(recordings):
+        state = SessionState(calibration.validators, estimator.motion)
+        truths = zip(series.torque_at_frames(), series.diameter_mm, strict=True)
+        for i, (t_s, channels, truth) in enumerate(zip(series.t_s.tolist(), series.channels, truths, strict=True)):
+            processed = state.process(TactileFrame.of(t_s, channels))
+            if processed.reasons or not np.isfinite(truth[0]):
+                continue
+            features = estimator.features(Reading.of(processed, t_s, matcher))
+            places = ((one / estimator.scale).ravel() for one in (processed.difference, processed.mean_difference))
+            rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, *truth))
+    return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None
+
+
+def _fit_slices(
+    blank: Calibration, recordings: list[FrameSeries], physics: Physics, *, full_range: bool = False
+) -> Calibration:
+    """Return a blank calibration with torque and diameter fitted to slices in time order.
+
+    With `full_range` no torque beyond theirs will occur. Raises CalibrationError for slices of several fingertips, and
+    for too few.
+    """
+    if len(blank.sides) > 1:
+        raise CalibrationError(
+            f"slices of {len(blank.sides)} fingertips ({', '.join(blank.sides)}) do not fit into one calibration; make "
+            "one for each"
+        )
+    estimator = blank.estimator
+    frames = np.concatenate([one.channels for one in recordings])
+    times = _consecutive([one.t_s for one in recordings])
+    torque = np.concatenate([one.torque_at_frames() for one in recordings])
+    diameter = np.concatenate([one.diameter_mm for one in recordings])
+    matcher = blank.matcher(physics.bank)
+    models: dict[Quantity, OutputModel] = {}
+    # Cylinders were twisted too, but at one torque each, which determines no torque.
+    torque = np.where(np.isfinite(diameter), np.nan, torque)
+    truths: dict[Quantity, FloatArray] = {"torque": torque, "diameter": diameter}
+    for quantity, values in truths.items():
+        known = np.isfinite(values)
+        if not known.any():
+            continue
+        n = int(known.sum())
+        if quantity == "torque" and n < estimator.least_slices:
+            raise CalibrationError(
+                f"too few slices with a torque for the estimator {estimator.name}: {n}; record "
+                f"{estimator.least_slices} or more"
+            )
+        differences = np.abs(frames[known, 0])
+        # First, because it checks that a board sent the slices.
+        novelty = NoveltyDetector.fit(differences, estimator.table)
+        every = np.ones((1, differences.shape[1]), dtype=np.bool_)
+        readings = (
+            Reading.of(ProcessedFrame(one[None], (), every), t_s, matcher)
+            for one, t_s in zip(differences, times[known].tolist(), strict=True)
+        )
+        features = np.array([estimator.features(one) for one in readings])
+        of_value, line = estimator.slices_fits(quantity, values[known])
+        regressor = fit_interval_regressor(
+            features[:, estimator.columns[quantity]],
+            values[known],
+            of_value,
+            strengths=estimator.strengths,
+            left_out=later_origins(n) if quantity == "torque" else (),
+            fit_line=line if quantity == "torque" else None,
+            full_range=full_range,
+        )
+        models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))
+    if not models:
+        raise CalibrationError("the slices come with neither torque nor diameter")
+    assumptions: tuple[Assumption, ...] = ("full range",) if full_range and "torque" in models else ()
+    return replace(blank, torque=models.get("torque"), diameter=models.get("diameter"), assumptions=assumptions)
+
+
+def _consecutive(times: list[FloatArray]) -> FloatArray:
+    """Return the times of several series one after another; each starts one after the end of the last, or later."""
+    shifted: list[FloatArray] = []
+    for one in times:
+        begins_early = bool(shifted) and one[0] <= shifted[-1][-1]
+        shifted.append(one - one[0] + shifted[-1][-1] + 1.0 if begins_early else one)
+    return np.concatenate(shifted)

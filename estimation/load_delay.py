@@ -1,0 +1,275 @@
+"""Delay of the load cell's torques against the frames: late torques teach an estimator the past.
+
+An estimator with a memory of seconds cannot find the delay from its error, because its frames still know the load of a
+second ago. A changing load moves the gel within the same frame. So the motion between single frames, along its main
+directions, is regressed on the torque's change over the same time at various shifts. The shift that explains most, on
+stretches of time left out, is the delay; its uncertainty comes from resampled stretches. Recorded twists give 0.25 to
+0.28 s ± 0.02 to 0.06 s, most of it from the load cell's filter, which settles within 0.4 s (HX711 at ten samples a
+second). Emulated rigs without the filter give −0.08 to 0.05 s.
+"""
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import TWO_SIDED_95
+from shearloop.estimation.fingertip_validator import channel_noise, segment_grip
+from shearloop.estimation.regressors import left_out_blocks
+from shearloop.estimation.values import FrameSeries, check_finite
+
+_STEP_S = 0.06
+_SHIFTS_S = np.round(np.arange(-6.0, 6.01, _STEP_S), 2)
+# Half width of the parabola through the peak.
+_PEAK_S = 0.18
+_N_DIRECTIONS = 6
+# Ridge penalty: on a stretch without load nothing but noise moves.
+_STRENGTH = 1e-3
+# Moves are clipped to this many times the median: larger ones come from knocks.
+_LARGEST_MOVE = 4.0
+# The peak must explain this share, and this factor more than any shift this far away. A minute with a single twist
+# (`glitch_20241202_173837`) has a chance peak of 0.06 at five seconds.
+_LEAST_EXPLAINED, _PROMINENCE, _APART_S = 0.1, 1.5, 1.1
+# With fewer gripped frames than the first nothing is refused. From the second on a peak this high gives a warning: of
+# 1128 stretches of 50 to 59 frames of recordings with correct times one has such a peak elsewhere.
+_SURE_FRAMES, _WARN_FRAMES, _WARN_EXPLAINED = 10 * _N_DIRECTIONS, 50, 0.45
+# Usual delay of a load cell in its sampling periods: with a filter (an HX711 settles within four; the recorded ones
+# have 2.7), without one (at most the mean over a period; negative where a gel moves on after the load, −0.9 on a
+# emulated rig), and unknown.
+_USUAL_PERIODS: dict[bool | None, tuple[float, float]] = {True: (1.6, 2.7), False: (-1.0, 1.0), None: (-1.0, 2.7)}
+# Tolerance of the time stamps.
+_STAMPS_S = 0.05
+# Standard errors outside of the usual delay that are refused, and the resampling behind them.
+_CERTAIN = 1.5
+_STRETCH_FRAMES, _DRAWS = 16, 200
+# Assumed uncertainty of unchecked times: half a second and the quarter of a filter. With half a second alone, one
+# fingertip of a third of the recorded twists still had 23 % of its intervals wrong.
+_UNCHECKED_S = 0.75
+# A larger standard error leaves the times open within its 95 % interval; recorded twists have 0.02 to 0.06 s.
+_LARGE_ERROR_S = 0.1
+# Readings per stretch for the load cell's noise, and the least number of stretches.
+_NOISE_READINGS, _LEAST_QUIET = 64, 4
+
+
+@dataclass(frozen=True, slots=True)
+class LoadDelay:
+    """Delay of the torques after the frames' motion in s, its standard error, and the explained share of change.
+
+    late_s is the delay beyond the load cell's own one, 0 where that is usual. few_frames is the number of gripped
+    frames where they are too few to be sure, else 0.
+    """
+
+    delay_s: float
+    error_s: float
+    explained: float
+    late_s: float = 0.0
+    few_frames: int = 0
+
+    @property
+    def text(self) -> str:
+        """The delay as a part of a sentence."""
+        apart = f"{abs(self.delay_s):.2f} ± {self.error_s:.2f} s {'before' if self.delay_s > 0 else 'after'}"
+        return f"the frames move {apart} the load that moves them is stamped"
+
+
+@dataclass(frozen=True, slots=True)
+class LoadTiming:
+    """The series that show the torques' delay, the delay in each, and how far in s the torques may be off unnoticed.
+
+    warnings are doubts about each series' times, empty without any. Without references the user guarantees the timing.
+    """
+
+    references: Sequence[FrameSeries] = ()
+    delays: Sequence[LoadDelay | None] = ()
+    warnings: Sequence[str] = ()
+    uncertainty_s: float = 0.0
+
+
+TRUSTED = LoadTiming()
+
+
+def measure_timing(recordings: Sequence[FrameSeries], others: Sequence[FrameSeries] = ()) -> LoadTiming:
+    """Return the timing of the torques of raw recordings: by themselves if any shows it, else by other fingertips'.
+
+    One clock has stamped them all. Another fingertip's board may have been dead, garbled or away: then it shows
+    nothing. Raises CalibrationError for a recording without torque, with values that are not finite, or with torques
+    clearly stamped at other times than its frames.
+    """
+    if not recordings or any(one.kind != "raw" for one in recordings):
+        return TRUSTED
+    check_finite(recordings)
+    timed: Sequence[tuple[FrameSeries, LoadDelay | None]] = [(one, find_load_delay(one)) for one in recordings]
+    if all(delay is None or delay.few_frames for _, delay in timed):
+        timed = _sure_delays(others) or timed
+    sure = [None if delay is None or delay.few_frames else delay for _, delay in timed]
+    for delay in sure:
+        if delay is not None and delay.late_s:
+            raise CalibrationError(
+                f"{delay.text}, and this load cell's own delay is {delay.delay_s - delay.late_s:.2f} s: a calibration "
+                "would learn the torque of another moment; correct the load cell's clock and record again, or "
+                f"calibrate with --load-cell-delay-s {delay.late_s:.2f}"
+            )
+    error_s = min((delay.error_s for delay in sure if delay is not None), default=np.inf)
+    uncertainty_s = min(TWO_SIDED_95 * error_s, _UNCHECKED_S) if error_s > _LARGE_ERROR_S else 0.0
+    return LoadTiming([one for one, _ in timed], sure, [_doubt(*one) for one in timed], uncertainty_s)
+
+
+def find_load_delay(series: FrameSeries) -> LoadDelay | None:
+    """Return the delay of the torques of raw frames; None where no shift stands out, as with few changes of load.
+
+    It takes up to some tenths of a second. Raises CalibrationError for a recording without torque.
+    """
+    part = segment_grip(series)[1]
+    if (n := len(series.t_s[part])) < _WARN_FRAMES:
+        return None
+    sides = (_delay_of_side(series, part, layer) for layer in range(len(series.sides)))
+    best = max((one for one in sides if one is not None), key=lambda one: one.explained, default=None)
+    if best is None:
+        return None
+    return replace(best, late_s=_lateness(series, best), few_frames=0 if n >= _SURE_FRAMES else n)
+
+
+def measured_delay(fingertips: Sequence[FrameSeries]) -> LoadDelay | None:
+    """Return the delay in the series of the fingertip that shows it best, None where none is sure."""
+    return max((delay for _, delay in _sure_delays(fingertips)), key=lambda one: one.explained, default=None)
+
+
+def _sure_delays(recordings: Sequence[FrameSeries]) -> list[tuple[FrameSeries, LoadDelay]]:
+    """Return the recordings that show a sure delay; others, as of a dead board, are left out."""
+    found = []
+    for one in recordings:
+        with contextlib.suppress(CalibrationError):
+            if np.isfinite(one.channels).all() and (delay := find_load_delay(one)) is not None and not delay.few_frames:
+                found.append((one, delay))
+    return found
+
+
+def load_delay_warning(series: FrameSeries) -> str:
+    """Return a doubt about the times of a recording's torques, empty without any."""
+    if series.kind != "raw" or not np.abs(series.torque_nm).any():
+        return ""
+    try:
+        return _doubt(series, find_load_delay(series))
+    except CalibrationError:
+        return series.load_doubt
+
+
+def _doubt(series: FrameSeries, found: LoadDelay | None) -> str:
+    """Return why a delay is unusual. With few gripped frames it can be chance: a warning and not a refusal."""
+    if found is None or (found.few_frames and found.explained < _WARN_EXPLAINED):
+        return series.load_doubt
+    if not found.late_s:
+        return ""
+    sure = f" (though {found.few_frames} gripped frames are too few to be sure)" if found.few_frames else ""
+    return f"{found.text}{sure}; check the load cell's clock, or calibrate with --load-cell-delay-s {found.late_s:.2f}"
+
+
+def torque_bounds(series: FrameSeries, uncertainty_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the largest torque (n,) in N·m within the uncertainty before and after each frame."""
+    steps = int(np.ceil(uncertainty_s / _STEP_S))
+    shifts_s = np.linspace(-uncertainty_s, uncertainty_s, 2 * steps + 1)
+    found = [np.interp(series.t_s + shift, series.torque_t_s, series.torque_nm) for shift in shifts_s]
+    return np.min(found, axis=0), np.max(found, axis=0)
+
+
+def _lateness(series: FrameSeries, found: LoadDelay) -> float:
+    """Return the delay beyond the load cell's own one in s, 0 for a usual delay."""
+    period_s = float(np.median(np.diff(series.torque_t_s)))
+    earliest_s, latest_s = (each * period_s for each in _USUAL_PERIODS[is_filtered(series.torque_nm)])
+    tolerance_s = _STAMPS_S + _CERTAIN * found.error_s
+    if earliest_s - tolerance_s <= found.delay_s <= latest_s + tolerance_s:
+        return 0.0
+    return found.delay_s - (earliest_s + latest_s) / 2
+
+
+def is_filtered(torque_nm: FloatArray) -> bool | None:
+    """Return whether a load cell's noise is filtered, from the quietest quarter of (p,) readings; None if unclear.
+
+    Differences of independent readings correlate by −½ with the next one. Where a reading shares half of its time with
+    the one before, they correlate with the one after next. Recorded HX711s have −0.07 and −0.34, emulated ones, which
+    have no filter, −0.45 and 0.
+    """
+    differences = np.diff(torque_nm)
+    stretches = differences[: len(differences) // _NOISE_READINGS * _NOISE_READINGS].reshape(-1, _NOISE_READINGS)
+    stretches = stretches - stretches.mean(axis=1, keepdims=True)
+    power = (stretches**2).mean(axis=1)
+    quietest = np.argsort(power)[np.count_nonzero(power == 0) :][: np.count_nonzero(power) // 4]
+    if len(quietest) < _LEAST_QUIET:
+        return None
+    quiet = stretches[quietest]
+    next_one, one_after = (
+        float(np.median((quiet[:, :-k] * quiet[:, k:]).mean(axis=1) / power[quietest])) for k in (1, 2)
+    )
+    if next_one > -0.25 and -0.6 < one_after < -0.15:  # a lever that rings has a lower one_after
+        return True
+    return False if next_one < -0.35 and one_after > -0.15 else None
+
+
+def _delay_of_side(series: FrameSeries, part: slice, layer: int) -> LoadDelay | None:
+    moves, middles, span_s = _moves(series.t_s[part], series.channels[part, layer])
+    changes = np.array([_changes(series, middles + delay, span_s) for delay in _SHIFTS_S]).T
+    total, rest = changes**2, _cross_validated_residual(moves, changes) ** 2
+    explained = _explained(total.sum(axis=0), rest.sum(axis=0))
+    best = int(np.argmax(explained))
+    others = explained[np.abs(_SHIFTS_S - _SHIFTS_S[best]) > _APART_S]
+    if not explained[best] >= max(_LEAST_EXPLAINED, _PROMINENCE * float(others.max())):
+        return None
+    near = np.abs(_SHIFTS_S - _SHIFTS_S[best]) <= _APART_S / 2
+    shifts_s = _SHIFTS_S[near]
+    parts = [np.add.reduceat(each[:, near], np.arange(0, len(moves), _STRETCH_FRAMES)) for each in (total, rest)]
+    drawn = np.random.default_rng(0).integers(0, len(parts[0]), (_DRAWS, len(parts[0])))
+    peaks = [_peak(shifts_s, _explained(*(each[some].sum(axis=0) for each in parts))) for some in drawn]
+    # Half of the central two thirds: a few draws find another peak.
+    error_s = float(np.diff(np.quantile(peaks, [0.16, 0.84]))[0]) / 2
+    return LoadDelay(_peak(shifts_s, explained[near]), error_s, float(explained[best]))
+
+
+def _peak(shifts_s: FloatArray, explained: FloatArray) -> float:
+    """Return the position of the highest of (s,) shares, between the shifts."""
+    best = shifts_s[np.argmax(explained)]
+    near = np.abs(shifts_s - best) <= _PEAK_S + 1e-9
+    bend, slope, _ = np.polyfit(shifts_s[near] - best, explained[near], 2)
+    offset = -slope / (2 * bend) if bend < 0 else 0.0
+    return float(best + np.clip(offset, -_PEAK_S, _PEAK_S))
+
+
+def _moves(t_s: FloatArray, channels: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return the motion of (n, c) frames from each to the next, (n − 1, p), its times, and its duration."""
+    frames = channels / np.where(np.isfinite(noise := channel_noise(channels)), noise, 1e9)
+    moved = np.diff(frames, axis=0)
+    size = np.linalg.norm(moved, axis=1)
+    limit = _LARGEST_MOVE * float(np.median(size))
+    if limit > 0:  # else most frames repeat the one before
+        moved *= np.minimum(1.0, limit / np.maximum(size, limit * 1e-9))[:, None]
+    moved -= moved.mean(axis=0)
+    # The n × n products of n frames have the same directions, for a tenth of the work.
+    values, vectors = np.linalg.eigh(moved @ moved.T)
+    scores = vectors[:, -_N_DIRECTIONS:] * np.sqrt(np.maximum(values[-_N_DIRECTIONS:], 0.0))
+    return scores, (t_s[1:] + t_s[:-1]) / 2, float(np.median(np.diff(t_s)))
+
+
+def _changes(series: FrameSeries, middles: FloatArray, span_s: float) -> FloatArray:
+    ends = [np.interp(middles + sign * span_s / 2, series.torque_t_s, series.torque_nm) for sign in (1, -1)]
+    change = ends[0] - ends[1]
+    return np.asarray(change - change.mean())
+
+
+def _cross_validated_residual(moves: FloatArray, changes: FloatArray) -> FloatArray:
+    """Return the residual (n, s) of a ridge from (n, p) moves to (n, s) changes, on blocks of time left out."""
+    left = np.zeros_like(changes)
+    for rest, block in left_out_blocks(len(moves)):
+        gram = moves[rest].T @ moves[rest]
+        if not gram.any():  # a board that repeats one frame
+            left[block] = changes[block]
+            continue
+        penalty = _STRENGTH * float(np.trace(gram)) / len(gram) * np.eye(len(gram))
+        left[block] = changes[block] - moves[block] @ np.linalg.solve(gram + penalty, moves[rest].T @ changes[rest])
+    return left
+
+
+def _explained(total: FloatArray, rest: FloatArray) -> FloatArray:
+    """Return the explained shares of (s,) sums of squares; 0 for a shift without a change of load."""
+    return np.where(total > 0, 1.0 - rest / np.where(total > 0, total, 1.0), 0.0)

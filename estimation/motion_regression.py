@@ -1,0 +1,277 @@
+"""The estimator of motion, the default: the gel's motion over the last seconds; for slices a curve over the value.
+
+Its features are how far the frame has moved since each of the last frames, in a few directions per fingertip. The gel
+creeps for seconds under a held twist, so its speed shows torque that its position does not, and slow drift of the
+baseline leaves no trace. Where the gel holds its position, that position is a feature too and shows a long twist.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.channels import ChannelTable, smoothed_along_channels
+from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import TWO_SIDED_95
+from shearloop.estimation.defaults import BASELINE_FRAMES
+from shearloop.estimation.estimator import (
+    LEAST_LEFT,
+    Bounds,
+    CalibrationRows,
+    Estimator,
+    Material,
+    OutputModel,
+    Quantity,
+    Reading,
+)
+from shearloop.estimation.fingertip_validator import FingertipValidator
+from shearloop.estimation.interval_regressor import (
+    LEAST_HALF_WIDTH,
+    CensoredRidge,
+    IntervalRegressor,
+    Intervals,
+    RegressorFit,
+    Ridge,
+    ValueRange,
+    best_strength,
+    fit_interval_regressor,
+    is_one_sided,
+)
+from shearloop.estimation.novelty import fitted_parts
+from shearloop.estimation.regressors import InverseCalibration, left_out_blocks
+from shearloop.estimation.session_state import Motion
+
+# Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
+_N_DIRECTIONS, _N_LAGS = 4, 12
+# A hundred features of a few directions need little penalty.
+_MOTION_STRENGTHS = (1e-6, 1e-5, 1e-4, 1e-3)
+# Positions drift between recordings, motion does not. So motion alone is preferred unless it leaves more than the first
+# share of the torque's variance unexplained on frames left out and the position lowers the error by the second.
+_MOTION_MAY_LEAVE, _POSITION_MUST_GAIN = 0.5, 0.5
+# Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.
+_N_NUISANCE, _MOST_FRAMES = 16, 500
+# The tools differ along a direction where the positions vary by this factor more than their noise. At least this share
+# of the variation along the clearest direction counts as the tools', at any noise.
+_CLEAR, _LEAST_SHARE = 2.0, 0.2
+# Centred positions have one direction less than their number; the last one is rounding.
+_ROUNDING = 1e-9
+# Inverse calibration over torque and over diameter: degree, directions of drift, trend. The torque's have the least
+# mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones; docs/decisions/0042).
+_CURVES: dict[Quantity, tuple[int, int, bool]] = {"torque": (4, 3, True), "diameter": (1, 1, False)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TemporalFeatures(Motion):
+    """Directions (m, p, c) along which each side's motion is measured, in units of noise, and how far back.
+
+    With uses_position the position relative to the idle frame is a feature too.
+    """
+
+    directions: FloatArray
+    n_lags: int
+    uses_position: bool = False
+
+    @classmethod
+    def fit(cls, parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...]) -> Self:
+        """Fit the main directions of motion to each recording's (n, m, c) gripped frames."""
+        directions = []
+        for layer, one in enumerate(validators):
+            moved = np.vstack([(part[_N_LAGS:, layer] - part[:-_N_LAGS, layer]) / one.noise for part in parts])
+            rows = np.linalg.svd(moved, full_matrices=False)[2][:_N_DIRECTIONS] / one.noise
+            directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
+        return cls(np.array(directions), _N_LAGS, uses_position=True)
+
+    def project(self, channels: FloatArray) -> FloatArray:
+        """Return the (…, m·p) positions of (…, m, c) frames along the directions."""
+        found = np.einsum("...mc,mpc->...mp", channels, self.directions)
+        return np.asarray(found.reshape(*found.shape[:-2], -1))
+
+    def impute(
+        self, moved: FloatArray, usable: BoolArray, sides: Sequence[FingertipValidator], *, from_idle: bool
+    ) -> FloatArray:
+        """Return a motion (m, c), unusable channels along the directions, and from idle along the grip too."""
+        imputed = []
+        for layer, one in enumerate(sides):
+            alive = np.isfinite(one.noise)
+            modes = self.directions[layer] * np.where(alive, one.noise, 0.0) ** 2
+            if from_idle:
+                modes = np.vstack([modes, one.gripped - one.idle])
+            weights = np.where(usable[layer] & alive, 1.0 / one.noise, 0.0)
+            found = np.linalg.lstsq((modes * weights).T, moved[layer] * weights, rcond=None)[0]
+            imputed.append(found @ modes)
+        return np.where(usable, moved, imputed)
+
+    def features(self, positions: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
+        """Return n_lags · m·p features of motion, nearest lag first, and m·p of position where it is used.
+
+        positions are the last n_lags + 1 (m·p,) positions; from_idle (m·p,) is the newest one relative to idle.
+        """
+        rows = np.array(positions)
+        moved = (rows[-1] - rows[-2::-1]).ravel()
+        return np.concatenate([moved, from_idle]) if self.uses_position else moved
+
+
+@dataclass(frozen=True, eq=False)
+class MotionRegression(Estimator):
+    """A ridge on the gel's motion over the last frames; for slices a curve of frames over the value.
+
+    Slices have no temporal features.
+    """
+
+    name: ClassVar[str] = "motion_regression"
+    strengths: ClassVar[tuple[float, ...]] = (0.0,)
+    # With a block left out, enough remain for the torque's curve.
+    least_slices: ClassVar[int] = 15
+    ignores_nan: ClassVar[bool] = True
+    imputes_by_motion: ClassVar[bool] = True
+
+    temporal: TemporalFeatures | None = None
+
+    @classmethod
+    def prepare(cls, material: Material) -> Self:
+        """Return the estimator with the directions of the grips' motion."""
+        if not material.validators:
+            return cls(material.scale, material.table)
+        return cls(material.scale, material.table, temporal=TemporalFeatures.fit(material.grips, material.validators))
+
+    @property
+    def motion(self) -> Motion:
+        """What a session remembers of the gel's motion."""
+        return self.temporal or Motion()
+
+    def features(self, reading: Reading) -> FloatArray:
+        """Return the features of motion. A slice has its time as a feature, because the gel drifts."""
+        if self.temporal is not None:
+            return reading.frame.motion
+        return np.append((reading.frame.difference / self.scale).ravel(), reading.t_s)
+
+    def inputs(self, quantity: Quantity, features: FloatArray, reading: Reading) -> FloatArray:
+        """Return the inputs of a quantity's regressor; the diameter's are the gel's mean position in this grip."""
+        if self.temporal is not None and quantity == "diameter":
+            return np.asarray((reading.frame.mean_difference / self.scale).ravel())
+        return features
+
+    def position_noise_mm(self, regressor: IntervalRegressor) -> float:
+        """Return the diameter's 95 % error from the noise of one frame, where each feature has a noise of 1.
+
+        A mean of n frames has a root of n less. The calibrated interval lacks this noise: it comes from means of whole
+        grips, which have little noise left.
+        """
+        if not isinstance(regressor.point, Ridge):
+            return 0.0
+        weights = regressor.point.weights
+        return TWO_SIDED_95 * math.sqrt(weights @ weights)
+
+    def fit_torque(
+        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
+    ) -> tuple[Self, IntervalRegressor, float]:
+        """Return the torque's regressor, and the estimator with position where that does better on blocks left out."""
+        fit = CensoredRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
+        if (temporal := self.temporal) is None:
+            raise ValueError("raw frames have motion")
+        m = temporal.directions.shape[0]
+        n_motion = temporal.n_lags * m * temporal.directions.shape[1]
+        choices, variance = {False: features[:, :n_motion], True: features}, float(torque_nm.var())
+        best = {
+            used: best_strength(one, torque_nm, fit, _MOTION_STRENGTHS, left_out_blocks(len(torque_nm)))
+            for used, one in choices.items()
+        }
+        alone, with_position = best[False][1], best[True][1]
+        used = alone > _MOTION_MAY_LEAVE * variance and with_position < _POSITION_MUST_GAIN * alone
+        strength, error = best[used]
+        regressor = fit_interval_regressor(
+            choices[used], torque_nm, fit, strengths=(strength,), limit_features=True, bounds=bounds,
+            recordings=recordings, fingertips=m,
+        )  # fmt: skip
+        return replace(self, temporal=replace(temporal, uses_position=used)), regressor, error / variance
+
+    def side_of_features(self, n_features: int) -> IntArray:
+        """Return the side (d,) that each of the torque's features comes from."""
+        m, p, _ = self.temporal.directions.shape if self.temporal is not None else (1, 1, 0)
+        return np.tile(np.repeat(np.arange(m), p), n_features // (m * p))
+
+    def fit_diameter(self, rows: CalibrationRows) -> OutputModel:
+        """Return the diameter's model from rows of known diameters, by age."""
+        grips = [rows.where(rows.recording == one) for one in np.unique(rows.recording)]
+        return OutputModel(fit_cylinders(grips, self.table), None, np.zeros(0))
+
+    def slices_fits(self, quantity: Quantity, values: FloatArray) -> tuple[RegressorFit, RegressorFit]:
+        """Return the fits of a curve and of a line.
+
+        Raises CalibrationError where a part of (n,) values has too few distinct ones.
+        """
+        degree, n_drift, trend = _CURVES[quantity]
+        for rows in fitted_parts(len(values)) if np.ptp(values) > 0 else ():
+            n_distinct = len(np.unique(values[rows]))
+            if n_distinct <= degree:
+                raise CalibrationError(
+                    f"{len(rows)} of the {len(values)} slices have too few different {quantity}s for the estimator "
+                    f"motion_regression, {n_distinct}; record more of them, in turn"
+                )
+
+        def fit_of(degree: int) -> RegressorFit:
+            return lambda frames, known, _: InverseCalibration.fit(frames, known, degree, n_drift, trend=trend)
+
+        return fit_of(degree), fit_of(1)
+
+
+def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> IntervalRegressor:
+    """Return the diameter's regressor on the mean of a grip, from recordings of one grip each, of three diameters or
+    more.
+
+    Its interval is the error on cylinders left out.
+    """
+    diameters = np.array([one.diameter_mm[0] for one in grips])
+    line = fit_line(grips, table)
+    squares = []
+    for one, diameter in zip(grips, diameters, strict=True):
+        # Leave out all grips of this cylinder: another one would only confirm this diameter.
+        rest = [other for other in grips if other.diameter_mm[0] != diameter]
+        if len({float(other.diameter_mm[0]) for other in rest}) >= LEAST_LEFT:
+            squares.append(float(((fit_line(rest, table).predict(one.mean_position) - diameter) ** 2).mean()))
+    # Each recording counts once, which is too few for a quantile.
+    half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
+    low, high = float(diameters.min()), float(diameters.max())
+    intervals = Intervals(np.zeros(0), np.array([half_width]))
+    return IntervalRegressor(line, intervals, ValueRange(low, high), line.mean, np.zeros(0))
+
+
+def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
+    """Return the line from a position to a diameter through grips of two diameters or more.
+
+    The noise of the idle frame is constant within a recording, like the diameter, so a regression on single frames
+    confuses the two. Here a recording counts as one position of known noise. Motion within recordings is shrunk, and
+    the line uses only directions where positions differ by more than their noise, by the amount that they would
+    differ without it (errors in variables, Fuller 1987). Averaging channels of one voltage and smoothing along
+    neighbours, as the paper did with its cylinders, lowers the noise.
+    """
+    diameters = np.array([one.diameter_mm[0] for one in grips])
+    n_sides = grips[0].position.shape[1] // table.n_channels
+    reduction = np.kron(np.eye(n_sides), table.twin_means(smoothed_along_channels(np.eye(table.n_channels))))
+    frames = [one.position @ reduction for one in grips]
+    positions = np.array([one.mean(axis=0) for one in frames])
+    moved = np.concatenate([one - position for one, position in zip(frames, positions, strict=True)])
+    moved = moved[:: 1 + len(moved) // _MOST_FRAMES]
+    _, sizes, directions = np.linalg.svd(moved, full_matrices=False)
+    n = max(min(_N_NUISANCE, int(np.count_nonzero(sizes)) - 1), 0)
+    shrink = 1.0 - sizes[n] / sizes[:n]
+
+    def whitened(rows: FloatArray) -> FloatArray:
+        return np.asarray(rows - (rows @ directions[:n].T * shrink) @ directions[:n])
+
+    frame_noise = float((whitened(moved) ** 2).sum()) / max(len(moved) - len(grips), 1)
+    noise = frame_noise * (1.0 / BASELINE_FRAMES + float(np.mean([1.0 / len(one) for one in frames])))
+    centred = whitened(positions - positions.mean(axis=0))
+    squares, modes = np.linalg.eigh(centred @ centred.T)
+    clear: BoolArray = squares > max(_CLEAR * noise, _ROUNDING * float(squares[-1]))
+    clear[-1] = True
+    squares, modes = squares[clear], modes[:, clear]
+    # One recording under several diameters differs by rounding alone, and would give an arbitrarily steep line.
+    least = _ROUNDING * noise + float(np.finfo(np.float64).eps * (positions**2).sum())
+    true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
+    along = centred.T @ (modes @ (modes.T @ (diameters - diameters.mean()) / true))
+    mean = np.mean([one.position.mean(axis=0) for one in grips], axis=0)
+    return Ridge(mean, reduction @ whitened(along), float(diameters.mean()), 0.0)

@@ -1,0 +1,462 @@
+"""A skin's calibration, one rising curve from tension at the gauges to response, and the tracking of a shear force.
+
+The curve is a straight line through the origin up to 1.2 N. Beyond, to 5 N and more, it has as many straight pieces as
+the recorded data support. Rising straight pieces invert without iteration. The fit reads a table of recorded
+resistances and forces: the belt's two plays turn the forces into the tension at the gauges, friction included, and
+leave the coefficient of friction and the curve to be fitted. The load turns with the skin. The stretched gauge gives
+its angle, in the fit and in the inverse. scipy.optimize is imported only to fit: the daemon loads calibrations.
+
+Friction gives one response a band of forces. A rising or falling response proves slip, and the force is at an end of
+the band. A constant one leaves it anywhere within: it is then taken to be at its last known place, moved no further
+than the band demands (the inverse of a play).
+"""
+
+import csv
+import io
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from scipy.special import stdtrit
+
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.skin.membrane import PAPER_SECTION, UNSTRETCHED, Belt, Direction, ShearInterval, direction_of
+from shearloop.files import open_file
+from shearloop.words import counted
+from shearloop.yaml_files import read_yaml, save_yaml, validated
+
+FORMAT = "shearloop skin calibration 3"
+# The paper's response is straight up to here and rises faster beyond.
+LINEAR_TO_N = 1.2
+UNLOADED_BELOW_N = 0.02
+MAX_FRICTION = 0.5
+# A table that leaves the friction coefficient less certain than this does not determine it.
+FRICTION_STD = 0.02
+MIN_ROWS_PER_PIECE, MAX_PIECES = 8, 6
+NOT_RISING = (
+    "The response does not rise with the shear force everywhere; check that R1 is the gauge stretched by a positive "
+    "shear force, and that no gauge is broken."
+)
+# A response has moved when it differs by this many standard deviations of the compared means: by chance about once a
+# week at ten responses a second.
+STANDARD_DEVIATIONS = 5.0
+# Responses averaged before they are compared.
+AVERAGED = 3
+# A slip proves the direction for this long. A longer time misses a hand that turns back, a shorter one forgets a slow
+# loading between two responses.
+MEMORY_S = 0.2
+# While the skin sticks, the reference response is averaged over about this many: noise chose the first one.
+SETTLES_OVER = 20.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationTable:
+    """Recorded rows in the order of recording: resistances in Ω, forces in N, each (rows,)."""
+
+    r1_ohm: FloatArray
+    r2_ohm: FloatArray
+    shear_n: FloatArray
+    normal_n: FloatArray
+
+
+class SkinCalibration(BaseModel):
+    """Friction, and the curve from net tension at the gauges (N) to response, both rising.
+
+    `response_half_width` is the 95 % prediction interval of one response. `rows` were fitted; `rows_beyond` lie outside
+    the curve, too few for a piece of their own. `rest_ohm` are R₁ and R₂ without load, to judge a later zero by.
+    `slack` is the slack gauge's change ΔR/R₀ at each response of the curve, within `slack_half_width` (95 %). The slack
+    side bends, so it depends on `gauge_depth_mm`, outwards from mid-thickness of the paper's section; None where no
+    depth within the skin gives this ratio.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    friction: float = Field(ge=0, le=1)
+    gauge_angle_deg: float = Field(gt=0, lt=90)
+    linear_to_n: float = Field(gt=0)
+    tension_n: tuple[float, ...] = Field(min_length=2, strict=False)
+    response: tuple[float, ...] = Field(min_length=2, strict=False)
+    response_half_width: float = Field(ge=0)
+    slack: tuple[float, ...] = Field(min_length=2, strict=False)
+    slack_half_width: float = Field(ge=0)
+    gauge_depth_mm: float | None
+    rows: int = Field(ge=1)
+    rows_beyond: int = Field(ge=0)
+    rest_ohm: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = Field(strict=False)
+
+    @field_validator("tension_n", "response")
+    @classmethod
+    def _rises(cls, values: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
+        if (np.diff(values) <= 0).any():
+            raise ValueError("must rise from each value to the next")
+        if len(info.data.get("tension_n", values)) != len(values):
+            raise ValueError("must have as many values as tension_n")
+        return values
+
+    @property
+    def slope_per_n(self) -> float:
+        """Response per N of tension at the gauges, in the middle piece of the curve: F/(EA)."""
+        ends = np.clip([-self.linear_to_n, self.linear_to_n], self.tension_n[0], self.tension_n[-1])
+        low, high = np.interp(ends, self.tension_n, self.response)
+        return float((high - low) / (ends[1] - ends[0]))
+
+    @property
+    def slack_ratio(self) -> float:
+        """The slack gauge's change over the stretched one's, in the middle piece of the curve; both sides' mean."""
+        ends = np.clip([-self.linear_to_n, self.linear_to_n], self.tension_n[0], self.tension_n[-1])
+        size = abs(np.interp(ends, self.tension_n, self.response))
+        slack = np.interp(ends, self.tension_n, self.slack)
+        return float(slack.sum() / (size + slack).sum())
+
+    def slack_deviation(self, response_1: float, response_2: float) -> float:
+        """Return how far the slack gauge's change lies beyond its 95 % interval, signed; 0 within it."""
+        # As a function of the stretched gauge, which a drift of the slack one leaves alone.
+        knots = [at + math.copysign(1.0, at) * slack for at, slack in zip(self.response, self.slack, strict=True)]
+        slack, stretched = sorted((response_1, response_2))
+        expected = _slack_at(math.copysign(1.0, response_1 - response_2) * stretched, knots, self.slack)
+        left = slack - expected
+        return left - min(max(left, -self.slack_half_width), self.slack_half_width)
+
+    @property
+    def prediction_half_width_n(self) -> float:
+        """The 95 % prediction interval in N of shear, ±, at small forces."""
+        capstan = math.exp(self.friction * math.radians(self.gauge_angle_deg))
+        return self.response_half_width / self.slope_per_n * capstan
+
+    def band(self, response: float, normal_n: float, direction: Direction) -> ShearInterval:
+        """Return the shear forces (N) that friction leaves open for an exact response.
+
+        Beyond the calibrated curve it is the band of the curve's end.
+        """
+        low, high = self._shear_range(response, self._tension(response), normal_n, direction)
+        return ShearInterval((low + high) / 2, low, high)
+
+    def shear_from_response(
+        self, response: float, normal_n: float, direction: Direction = Direction.UNKNOWN, wider: float = 0.0
+    ) -> ShearInterval:
+        """Return the shear force (N) and its 95 % interval, which includes what friction leaves open.
+
+        A known direction of loading takes the deadband out; an unknown one adds it to the interval. An end beyond the
+        calibrated curve is infinite. `wider` is a further uncertainty of the response, either way.
+        """
+        half, shear_n = self.response_half_width + wider, self.band(response, normal_n, direction).shear_n
+        ends = response - half, response + half
+        tensions = self._tension(ends[0], left=-math.inf), self._tension(ends[1], right=math.inf)
+        low, high = (
+            self._shear_range(end, tension, normal_n, direction)[side]
+            for side, (end, tension) in enumerate(zip(ends, tensions, strict=True))
+        )
+        if ends[0] <= 0 <= ends[1]:
+            slack = self._belt.shear_range(0.0, normal_n, 0.0, direction)
+            low, high = min(low, slack[0]), max(high, slack[1])
+        return ShearInterval(shear_n, low, high)
+
+    def _tension(self, response: float, left: float | None = None, right: float | None = None) -> float:
+        return float(np.interp(response, self.response, self.tension_n, left=left, right=right))
+
+    def _shear_range(
+        self, response: float, tension_n: float, normal_n: float, direction: Direction
+    ) -> tuple[float, float]:
+        slack = _slack_at(response, self.response, self.slack)
+        turned = math.copysign(float(turned_rad(abs(response) + slack)), response)
+        return self._belt.shear_range(tension_n, normal_n, turned, direction)
+
+    @property
+    def _belt(self) -> Belt:
+        return Belt(self.friction, math.radians(self.gauge_angle_deg))
+
+
+class _Row(BaseModel):
+    """A row of a recorded table."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    r1_ohm: float = Field(gt=0)
+    r2_ohm: float = Field(gt=0)
+    shear_n: float
+    # A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
+    normal_n: float = Field(ge=-0.05)
+
+
+def read_table(path: Path) -> CalibrationTable:
+    """Return the rows of a CSV file with these columns; raises CalibrationError with the line and column at fault."""
+    try:
+        with open_file(path) as raw, io.TextIOWrapper(raw, newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, restkey="a value without a column")
+            rows = [validated(row, _Row, f"{path}, line {reader.line_num}", CalibrationError) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise CalibrationError(f"{path}: the table cannot be read: {error}.") from error
+    if not rows:
+        raise CalibrationError(f"{path}: the table has no rows; its columns are {', '.join(_Row.model_fields)}.")
+    return CalibrationTable(*np.array([list(row.model_dump().values()) for row in rows]).T)
+
+
+def save_calibration(calibration: SkinCalibration, path: Path) -> None:
+    """Write a calibration as YAML, replacing the file at once."""
+    save_yaml(path, {"format": FORMAT, **calibration.model_dump()}, CalibrationError)
+
+
+def load_calibration(path: Path) -> SkinCalibration:
+    """Return the calibration in a YAML file; raises CalibrationError naming the file and every wrong key."""
+    document = read_yaml(path, CalibrationError, "calibration", "; make it with `shearloop skin calibrate`.")
+    if not (isinstance(document, dict) and document.pop("format", None) == FORMAT):
+        raise CalibrationError(
+            f"{path} is not a calibration as `shearloop skin calibrate` writes it: it has no `format: {FORMAT}`."
+        )
+    return validated(document, SkinCalibration, str(path), CalibrationError)
+
+
+def fit_calibration(table: CalibrationTable, *, friction: float | None = None) -> SkinCalibration:
+    """Return the least-squares calibration of a table; friction is fitted too unless given.
+
+    Raises CalibrationError where the table has too few rows, no row at rest or does not determine friction, and where
+    the response does not rise with the force.
+    """
+    changes, loading = _changes(table)
+    response = changes[:, 0] - changes[:, 1]
+    from shearloop.estimation.skin.plane_strain import gauge_depth_mm
+
+    loaded, idle = loading > 0, loading == 0
+    turned = np.sign(response) * turned_rad(changes.max(axis=1))
+    forces = np.column_stack([loading, table.shear_n, table.normal_n, turned])[loaded]
+    nominal = _tensions(forces, PAPER_SECTION.friction if friction is None else friction)
+    upper, lower = _knots(nominal), _knots(-nominal)
+    kept = (len(upper) > 0) | (nominal <= LINEAR_TO_N)
+    kept &= (len(lower) > 0) | (-nominal <= LINEAR_TO_N)
+    curve = _CurveFit(forces, kept, response[loaded][kept], upper, lower)
+    if curve.freedom < 3:
+        raise CalibrationError(
+            f"{counted(len(curve.response), 'row')} under load cannot carry "
+            f"{counted(1 + len(upper) + len(lower), 'piece')} of curve and an "
+            "interval; record more."
+        )
+    # The response must go with the tension, not against it.
+    if float(nominal[kept] @ curve.response) <= 0.0:
+        raise CalibrationError(NOT_RISING)
+    if friction is None:
+        friction = curve.best_friction()
+    knots, responses, half_width = curve.fit(friction)
+    slack, slack_half_width = _fit_slack(changes[loaded][kept], responses)
+    found = SkinCalibration(
+        friction=friction,
+        gauge_angle_deg=math.degrees(PAPER_SECTION.gauge_angle_rad),
+        linear_to_n=LINEAR_TO_N,
+        tension_n=tuple(knots.tolist()),
+        response=tuple(responses.tolist()),
+        response_half_width=half_width,
+        slack=tuple(slack.tolist()),
+        slack_half_width=slack_half_width,
+        rows=len(curve.response),
+        rows_beyond=int((~kept).sum()),
+        rest_ohm=(float(table.r1_ohm[idle].mean()), float(table.r2_ohm[idle].mean())),
+        gauge_depth_mm=None,
+    )
+    return found.model_copy(update={"gauge_depth_mm": gauge_depth_mm(PAPER_SECTION, found.slack_ratio)})
+
+
+def _slack_at(response: float, knots: Sequence[float], slack: Sequence[float]) -> float:
+    """Return the slack gauge's change at a response: straight between the curve's knots and the origin."""
+    grid = dict(sorted({**dict(zip(knots, slack, strict=True)), 0.0: 0.0}.items()))
+    return float(np.interp(response, list(grid), list(grid.values())))
+
+
+def _fit_slack(changes: FloatArray, knots: FloatArray) -> tuple[FloatArray, float]:
+    """Return the slack gauge's change at the curve's responses (knots,), and ± its 95 % interval.
+
+    `changes` (rows, 2) has a column for each gauge.
+    """
+    response, slack = changes[:, 0] - changes[:, 1], changes.min(axis=1)
+    hats = np.eye(len(knots))
+    design = np.array([[_slack_at(at, knots.tolist(), hat) for hat in hats.tolist()] for at in response.tolist()])
+    values = np.linalg.lstsq(design, slack)[0]
+    left, freedom = slack - design @ values, len(slack) - len(knots)
+    return values, float(stdtrit(freedom, 0.975)) * math.sqrt(float(left @ left) / freedom)
+
+
+def _changes(table: CalibrationTable) -> tuple[FloatArray, IntArray]:
+    """Return both gauges' ΔR/R₀ (rows, 2) and each row's loading, counted from 1; 0 for rows without load.
+
+    Each loading begins with rows without load; their mean resistances normalise it, as in the paper.
+    """
+    idle = (abs(table.shear_n) <= UNLOADED_BELOW_N) & (abs(table.normal_n) <= UNLOADED_BELOW_N)
+    if not idle.size or not idle[0]:
+        raise CalibrationError(
+            f"The table must begin with a row without load (both forces below {UNLOADED_BELOW_N} N): "
+            "it gives the resistances at rest."
+        )
+    loading = np.cumsum(idle & ~np.concatenate([[False], idle[:-1]]))
+    changes = np.empty((len(idle), 2))
+    for number in range(1, loading[-1] + 1):
+        rows = loading == number
+        for gauge, ohm in enumerate((table.r1_ohm, table.r2_ohm)):
+            changes[rows, gauge] = ohm[rows] / ohm[rows & idle].mean() - 1.0
+    return changes, np.where(idle, 0, loading)
+
+
+def turned_rad(stretched: FloatArray | float) -> FloatArray:
+    """Return the load's angle about the core, from the stretched gauge's change λ² − 1.
+
+    The load moves by the lengthening of a quarter of the ring, π/2 (λ − 1).
+    """
+    turned: FloatArray = np.pi / 2 * (np.sqrt(np.maximum(1 + stretched, 0.0)) - 1)
+    return turned
+
+
+def _tensions(forces: FloatArray, friction: float) -> FloatArray:
+    """Return the net tension (rows,) at the gauges, in N, for rows (loading, shear force, normal force, load's angle).
+
+    Each loading starts from the unstretched skin.
+    """
+    belt = Belt(friction, PAPER_SECTION.gauge_angle_rad)
+    state, current, found = UNSTRETCHED, 0.0, []
+    for loading, *load in forces.tolist():
+        state = belt.step(state if loading == current else UNSTRETCHED, *load)
+        current = loading
+        found.append(state.gauge_tension_1_n - state.gauge_tension_2_n)
+    return np.array(found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CurveFit:
+    """Response against tension in straight pieces: one through the origin, others beyond its ends.
+
+    forces are rows as `_tensions` takes them; response (m,) belongs to the rows kept; upper and lower are the tensions
+    where the pieces beyond begin.
+    """
+
+    forces: FloatArray
+    kept: BoolArray
+    response: FloatArray
+    upper: FloatArray
+    lower: FloatArray
+
+    @property
+    def freedom(self) -> int:
+        """The degrees of freedom of the residuals."""
+        return len(self.response) - 1 - len(self.upper) - len(self.lower)
+
+    def squares(self, friction: float) -> float:
+        """Return the sum of squared residuals with the best curve for this friction."""
+        return self._best_curve(friction)[3] ** 2
+
+    def fit(self, friction: float) -> tuple[FloatArray, FloatArray, float]:
+        """Return the best curve's knots (N) and responses there, and the half width of its prediction interval."""
+        tension, design, slopes, distance = self._best_curve(friction)
+        ends = min(float(tension.min()), 0.0), max(float(tension.max()), 0.0)
+        knots = np.concatenate([[ends[0]], -self.lower[::-1], self.upper, [ends[1]]])
+        if not (slopes > 0).all() or not (np.diff(knots) > 0).all():
+            raise CalibrationError(NOT_RISING)
+        leverage = (np.linalg.qr(design).Q ** 2).sum(axis=1).max()
+        scatter = distance / math.sqrt(self.freedom)
+        half_width = float(stdtrit(self.freedom, 0.975)) * scatter * math.sqrt(1 + leverage)
+        return knots, self._design(knots) @ slopes, half_width
+
+    def best_friction(self) -> float:
+        """Return the friction of the least squares; raises CalibrationError where another one is about as good."""
+        from scipy.optimize import minimize_scalar
+
+        coarse = np.linspace(0.0, MAX_FRICTION, 26)
+        best = coarse[int(np.argmin([self.squares(mu) for mu in coarse]))]
+        bounds = max(best - coarse[1], 0.0), min(best + coarse[1], MAX_FRICTION)
+        friction = float(minimize_scalar(self.squares, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
+        # A wrong friction must make the fit visibly worse.
+        least = self.squares(friction)
+        neighbours = [mu for mu in (friction - FRICTION_STD, friction + FRICTION_STD) if mu >= 0]
+        worse = min(map(self.squares, neighbours)) - least
+        if worse <= max(least / max(self.freedom, 1), 1e-9 * float(self.response @ self.response)):
+            raise CalibrationError(
+                "The table does not determine the friction of the skin; load it under more normal force, load and "
+                "unload it, or give the coefficient (--friction)."
+            )
+        return friction
+
+    def _best_curve(self, friction: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Return the rows' tensions and pieces, the pieces' slopes, and the norm of the residuals."""
+        from scipy.optimize import nnls
+
+        tension = _tensions(self.forces, friction)[self.kept]
+        design = self._design(tension)
+        slopes, distance = nnls(design, self.response)
+        return tension, design, slopes, float(distance)
+
+    def _design(self, tension: FloatArray) -> FloatArray:
+        """Return the part of each tension within each piece; the last pieces are open."""
+        columns = [np.clip(tension, -LINEAR_TO_N, LINEAR_TO_N)]
+        for sign, knots in ((1.0, self.upper), (-1.0, self.lower)):
+            widths = np.append(np.diff(knots), math.inf)
+            columns += [sign * np.clip(sign * tension - at, 0.0, w) for at, w in zip(knots, widths, strict=False)]
+        return np.column_stack(columns)
+
+
+def _knots(tension: FloatArray) -> FloatArray:
+    """Return where the pieces beyond the straight one begin: as many as the rows support, with equal shares."""
+    beyond = np.sort(tension[tension > LINEAR_TO_N])
+    pieces = min(MAX_PIECES, len(beyond) // MIN_ROWS_PER_PIECE)
+    if not pieces:
+        return np.empty(0)
+    begins = beyond[np.arange(1, pieces) * len(beyond) // pieces]
+    return np.unique(np.append(LINEAR_TO_N, begins))
+
+
+class DirectionFinder:
+    """Finds from successive responses whether the magnitude of the force rises, falls, or may do either."""
+
+    def __init__(self, noise: float) -> None:
+        """Take the standard deviation of one response."""
+        self.threshold = STANDARD_DEVIATIONS * noise * math.sqrt(2.0 / AVERAGED)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past after missing responses."""
+        self._latest: deque[float] = deque(maxlen=AVERAGED)
+        self._turning: float | None = None
+        self._direction = Direction.UNKNOWN
+        self._seen_s = -math.inf
+
+    def update(self, time_s: float, response: float) -> Direction:
+        """Return the direction at this time; call in order of time."""
+        self._latest.append(response)
+        if len(self._latest) < AVERAGED:
+            return Direction.UNKNOWN
+        mean = sum(self._latest) / AVERAGED
+        if self._turning is None:
+            self._turning = mean
+        elif self._turning * mean < 0:
+            # The force passed through zero and rises from there.
+            self._turning = 0.0
+        moved = direction_of(self._turning, mean, self.threshold)
+        if moved is not Direction.UNKNOWN:
+            self._turning, self._direction, self._seen_s = mean, moved, time_s
+        elif time_s - self._seen_s > MEMORY_S:
+            self._direction = Direction.UNKNOWN
+            self._turning += (mean - self._turning) / SETTLES_OVER
+        return self._direction
+
+
+class ForceFollower:
+    """Keeps the most plausible force of the band that each response leaves open; begins at zero force."""
+
+    def __init__(self, calibration: SkinCalibration, slack: float) -> None:
+        """Take a calibration, and the change of response that may be noise."""
+        self._calibration = calibration
+        self._slack_n = slack / calibration.slope_per_n
+        self._shear_n = 0.0
+
+    def update(self, response: float, normal_n: float, direction: Direction) -> ShearInterval:
+        """Return the most plausible shear force (N) of a response, within the band that friction leaves.
+
+        The band belongs to an exact response; a known direction gives it no width.
+        """
+        band = self._calibration.band(response, normal_n, direction)
+        if direction is not Direction.UNKNOWN:
+            self._shear_n = band.shear_n
+            return band
+        low_n, high_n = band.low_n - self._slack_n, band.high_n + self._slack_n
+        self._shear_n = min(max(self._shear_n, low_n), high_n)
+        return ShearInterval(self._shear_n, low_n, high_n)

@@ -1,0 +1,23 @@
+"""Mistakes that end a command with one sentence and exit status 2."""
+
+import sys
+from importlib.util import find_spec
+
+
+class UserError(Exception):
+    """Something in a configuration, a file or a command line that its author can mend; the message says how."""
+
+
+class ActionError(Exception):
+    """An action of the devices that cannot be carried out; the message says why, and what to do."""
+
+
+def require(module: str, extra: str, what: str) -> None:
+    """Raise UserError if a module is not installed that `what` needs, and that `extra` of shearloop brings."""
+    if find_spec(module) is None:
+        raise missing(module, extra, what)
+
+
+def missing(module: str | None, extra: str, what: str) -> UserError:
+    """Return the error of a module that is not installed, with the command that installs it for this Python."""
+    return UserError(f"{what} needs {module}: `{sys.executable} -m pip install 'shearloop[{extra}]'`")

@@ -1,0 +1,554 @@
+"""The command line: every mistake is one sentence with its cure and status 2; help and `stop` import little."""
+
+import argparse
+import ctypes
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from io import StringIO
+from pathlib import Path
+from typing import Any, NoReturn
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import zmq.asyncio
+
+from shearloop.bank.models import MODELS
+from shearloop.cli import COMMANDS, command_module, main
+from shearloop.cli.bank import MODEL_NAMES
+from shearloop.cli.completion import full_parser
+from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
+from shearloop.daemon.control.loop_runner import WRENCH
+from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
+from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.daemon.messaging.stop_socket import StopSocket
+from shearloop.daemon.run_summary import RunSummary
+from shearloop.daemon.sensing.frame_estimator import COMBINED
+from shearloop.daemon.sensing.skin_task import SKIN
+from shearloop.tools.task_row import task_row
+from tests.paper_curve import paper_curve
+from tests.sample_messages import sample
+
+
+def test_a_file_that_is_not_there_hides_no_other_mistake(config, tmp_path, mistake):
+    steps = "[{do: wiat}, {do: turn_to, angle_rad: 90}, {do: hold_torque, torque_nm: 9}]"
+    (tmp_path / "experiment.yaml").write_text(f"name: one\nsteps: {steps}\n")
+    tips = {name: {"device": {"path": name}, "bank": f"{name}.bank"} for name in ("right", "left")}
+    files = {"load_cell": {"device": {"path": "load"}, "calibration": "load.yaml"}, "robot": "ur.yaml"}
+    parts = {"fingertips": tips, "experiment": "experiment.yaml", **files}
+    said = mistake("check", str(config(**parts)))
+    for part in ("right.bank: the bank", "left.bank: the bank", "load.yaml: the calibration", "ur.yaml: the robot"):
+        assert f"{tmp_path}/{part}" in said
+    assert "torque_source: `right` is a fingertip without a calibration" in said
+    of_steps = (
+        "steps[0].do: 'wiat' does not exist",
+        "steps[1].angle_rad: 90 is too large",
+        "steps[2].torque_nm: 9 is too large",
+        "steps[2]: hold_torque needs an identified tool",
+    )
+    assert [said.count(one) for one in of_steps] == [1] * 4
+    said = mistake("check", str(config(**parts, fingertip={})))
+    assert [said.count(one) for one in ("fingertip: is not a known key", *of_steps)] == [1] * 5
+
+
+def fingertip(**changes: Any) -> dict[str, Any]:
+    return {"fingertips": {"right": {"device": {"path": "eit"}, "bank": "no.bank", **changes}}}
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        ({"fingertips": {}}, ["fingertips"]),
+        ({"fingertip": {}}, ["fingertip: is not a known key; did you mean fingertips?"]),
+        ({"publish": "tcp://lab-pc:7761"}, ["publish", "loopback"]),
+        ({"publish": "tcp://127.0.0.1:70000"}, ["publish: must end in a port, a whole number up to 65535, as in tcp"]),
+        ({"commands": "tcp://127.0.0.1:7762a"}, ["commands: must end in a port, a whole number"]),
+        ({"commands": "tcp://127.0.0.1"}, ["commands: must end in a port, a whole number"]),
+        ({"publish": "ipc:///tmp/both", "commands": "ipc:///tmp/both"}, ["are both ipc:///tmp/both"]),
+        (
+            {"emulated": True, **fingertip(device={"serial_number": "1"})},
+            ["`fingertips.right.device.serial_number: 1`"],
+        ),
+        (
+            {"emulated": True, **fingertip(device={"path": "/dev/ttyACM0"})},
+            ["device.path: /dev/ttyACM0`, a real device"],
+        ),
+        (
+            {"emulated": True, "robot": "ur.yaml", "gripper": {"socket": {"host": "192.168.1.10"}}},
+            ["`gripper.socket.host"],
+        ),
+        (
+            {"autostart": True, "experiment": "one.yaml", "robot": "ur.yaml"},
+            ["`autostart` moves a robot that nobody has"],
+        ),
+        ({"autostart": True, "emulated": True}, ["`autostart` starts no experiment"]),
+        ({"experiment": "", "robot": "ur.yaml"}, ["experiment: must be the path of a file, not '.'"]),
+        ({"robot": "a\0b"}, ["robot: must be the path of a file"]),
+        ({"fingertips": {"Right Hand": {}}}, ["fingertips"]),
+        ({"fingertips": {"load_cell": {"device": {"path": "eit"}}}}, ["cannot be named 'load_cell', as another part"]),
+        (fingertip(), ["no.bank", "shearloop bank build"]),
+        (fingertip(device={}), ["device", "either serial_number or path"]),
+        (fingertip(device={"path": "eit", "serial_number": "1"}), ["either serial_number or path"]),
+        (fingertip(baseline_frames=1), ["fingertips.right.baseline_frames", "from 2 to 1000"]),
+        (fingertip(matching="best"), ["matching", "all_lags"]),
+        (
+            fingertip(bank=None, estimator="motion_regression", calibration="no.cal"),
+            ["no.cal does not exist; make one", "REC… --sides right --estimator motion_regression --out "],
+        ),
+        (fingertip(baseline_frames=0, average_frames=0), ["baseline_frames", "average_frames"]),
+    ],
+)
+def test_a_configuration_mistake_names_file_key_and_cure(command, changes, parts, config, mistake):
+    path = config(**changes)
+    said = mistake(command, str(path))
+    assert any(str(path.with_name(name)) in said for name in (path.name, "no.bank", "no.cal"))
+    assert [part for part in parts if part not in said] == []
+
+
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_a_real_robot_in_an_emulated_rig_is_refused(command, config, tmp_path, mistake):
+    shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
+    said = mistake(command, str(config(robot="ur.yaml", emulated=True)))
+    assert f"{tmp_path / 'ur.yaml'}: `host: 192.168.1.10` is not this computer" in said
+
+
+@pytest.mark.usefixtures("ur_rtde")
+async def test_fingertip_names_do_not_collide_with_task_names(config, tmp_path):
+    shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
+    (tmp_path / "wait.yaml").write_text("{name: one, torque_source: right, steps: [{do: wait, wait_s: 1}]}")
+    whole = config(
+        robot="ur.yaml",
+        gripper={"socket": {"host": "127.0.0.1"}},
+        load_cell={"device": {"path": "load"}},
+        experiment="wait.yaml",
+        recording={"folder": "recordings"},
+    )
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(whole), context)
+        names = {*daemon.health.tasks(), *daemon._tasks}
+        daemon.stop()
+        await daemon.run()
+    assert {"right", "robot", "gripper", "loop", "load_cell", "recording", "health"} <= names
+    assert (names | {COMBINED, SKIN, WRENCH}) - TAKEN_NAMES == {"right"}
+
+
+def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, mistake):
+    foreign = tmp_path / "foreign.yaml"
+    grid = np.linspace(1, 2, 9)
+    paper_curve("cd" * 32, torque=(grid, grid)).save(foreign)
+    said = mistake("check", str(config(**fingertip(bank=str(tiny_bank), calibration=str(foreign)))))
+    for part in (str(foreign), "made with the bank cdcdcd", "calibrate again"):
+        assert part in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["check", "no-such.yaml"], "no-such.yaml"),
+        (["listen", "eit.torque"], "there is no topic 'eit.torque'; the topics are eit.frame, eit.estimate"),
+        (["listen", "eit.estimat"], "there is no topic 'eit.estimat'; the topics are eit.frame, eit.estimate"),
+        (["evaluate", "rec.mcap", "my.cal"], "rec.mcap is a recording, not a calibration; the calibration comes first"),
+        (["adapt", "rec.mcap.partial", "my.cal", "--out", "new.cal"], "rec.mcap.partial is a recording, not a cal"),
+        (["listen", "--count", "0"], "--count 0"),
+        (["listen", "--timeout", "-1"], "--timeout -1"),
+        (["listen", "--timeout", "inf"], "--timeout inf"),
+        (["command", "status", "--timeout", "nan"], "--timeout nan"),
+        (["command", "status", "--timeout", "-1"], "--timeout -1"),
+        (["listen", "--connect", "here", "--timeout", "1"], "'here' is not an address"),
+        (
+            ["listen", "--connect", "tcp://127.0.0.1:70000", "--timeout", "0.05"],
+            "tcp://127.0.0.1:70000 has no valid port",
+        ),
+        (["command", "stop", "--connect", "tcp://127.0.0.1:7762a", "--timeout", "0.05"], "a whole number up to 65535"),
+        (["listen", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no message came"),
+        (["command", "tare", "--connect", "ipc:///nobody", "--timeout", "0.05"], "no daemon answered at ipc:///nobody"),
+    ],
+)
+def test_a_command_line_mistake_is_one_sentence(arguments, part, mistake):
+    assert part in mistake(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("chart", "the following arguments are required: NAME, --out; NAME is one of speed-accuracy, stability, loop"),
+        ("schema", "the following arguments are required: kind; kind is one of configuration, experiment, robot, bank"),
+        ("import", "the following arguments are required: FORMAT; FORMAT is one of mat"),
+        ("bank info", "the following arguments are required: PATH"),
+        ("chart scene --out DIR --bnak my.bank", "unrecognized arguments: --bnak my.bank; did you mean --bank?"),
+        ("command stauts", "there is no 'stauts'; did you mean status?"),
+        ("listen --cuont", "unrecognized arguments: --cuont; did you mean --count?"),
+        ("evaluate a.cal --cluster README.md", "--cluster README.md is a file and no address; write `--cluster local`"),
+    ],
+)
+def test_a_mistake_in_the_words_names_the_help(arguments, sentence, mistake):
+    said = mistake(*arguments.split())
+    assert f": {sentence}" in said
+    program = "shearloop bank info" if arguments == "bank info" else f"shearloop {arguments.split()[0]}"
+    assert said.endswith(f"; see `{program} --help`\n")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "chart scene --out DIR a.mcap b.mcap",
+        "chart --out DIR scene a.mcap b.mcap",
+        "chart scene a.mcap --out DIR b.mcap",
+        "evaluate a.cal --json a.mcap --out DIR b.mcap",
+        "calibrate a.mcap --out DIR b.mcap",
+        "calibrate recording --out DIR a.mcap b.mcap",
+        "recording info a.mcap --json b.mcap",
+    ],
+)
+def test_options_may_stand_between_recordings(arguments, monkeypatch):
+    name, *words = arguments.split()
+    module = command_module(name)
+    parsed = Mock(return_value=0)
+    for where in ("shearloop.cli.calibrate.recording.run", "shearloop.cli.recording._info"):
+        monkeypatch.setattr(where, parsed)
+    if name in ("chart", "evaluate"):
+        monkeypatch.setattr(module, "run", parsed)
+    assert main([name, *words]) == 0
+    [args] = parsed.call_args.args
+    assert [str(path) for path in args.recordings] == ["a.mcap", "b.mcap"]
+    assert getattr(args, "name", "scene") == "scene"
+
+
+INTERRUPTED = "shearloop evaluate: interrupted before it was done\n"
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_an_interrupted_command_reports_it_unless_it_only_waits(number, status, monkeypatch, tmp_path, ran):
+    def interrupted(*_: object) -> NoReturn:
+        signal.raise_signal(number)
+        raise AssertionError
+
+    monkeypatch.setattr("shearloop.cli.evaluate.run", interrupted)
+    assert ran("evaluate", "a.cal", "b.mcap", status=status) == ("", INTERRUPTED)
+    monkeypatch.setattr("shearloop.daemon.messaging.client.receive_messages", interrupted)
+    assert ran("listen", status=status) == ("", "")
+    # What has started them says that it was interrupted.
+    monkeypatch.setattr("shearloop.cli.view.load_fingertip", interrupted)
+    assert ran("view", "--token-file", tmp_path / "token", status=status) == ("", "")
+    monkeypatch.setattr("shearloop.cli.emulate.rig.robot_make", interrupted)
+    assert ran("emulate", "rig", "--bank", "my.bank", "--run-dir", tmp_path, status=status) == ("", "")
+
+
+def test_a_closed_terminal_causes_no_traceback(monkeypatch, ran):
+    def interrupted(_: object) -> NoReturn:
+        monkeypatch.setattr(sys.stderr, "write", Mock(side_effect=OSError(5, "Input/output error")))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("shearloop.cli.evaluate.run", interrupted)
+    assert ran("evaluate", "a.cal", "b.mcap", status=130) == ("", "")
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(number, status, monkeypatch, ran):
+
+    def loads(_: object) -> int:
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
+        threading.Event().wait(10)
+        return 0
+
+    monkeypatch.setattr("shearloop.cli.evaluate.run", loads)
+    assert ran("evaluate", "a.cal", "b.mcap", status=status) == ("", INTERRUPTED)
+
+
+def test_recording_option_needs_an_emulator(config, mistake):
+    said = mistake("run", str(config()), "--recording", "some.mat")
+    assert "has no eit-kit among its `emulators`" in said
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([name, "--help"])
+    assert ended.value.code == 0
+    printed = capsys.readouterr().out
+    assert f"usage: shearloop {name}" in printed
+    assert "%%" not in printed
+
+
+@pytest.mark.parametrize("arguments", [[], ["help"], ["--help"], ["help", "run"]])
+def test_help_comes_without_a_command_too(arguments, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(arguments)
+    out, err = capsys.readouterr()
+    assert (out.startswith("usage: shearloop run") if "run" in arguments else "\n  run " in out, err) == (True, "")
+
+
+def test_an_unknown_command_lists_the_known_ones(capsys):
+    for name, said in (("fly", " run, "), ("rnu", "; did you mean run?; see `shearloop --help`")):
+        assert main([name]) == 2
+        assert said in capsys.readouterr().err
+
+
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield the parsers of a command's parts, or its own where it has none."""
+    parts = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    for below in (below for action in parts for below in action.choices.values()):
+        yield from parsers(below)
+    if not parts:
+        yield parser
+
+
+def test_every_argument_has_a_help_text():
+    for parser in parsers(full_parser()):
+        unsaid = [one.dest for one in parser._actions if not one.help or one.help.startswith(("default", "(default"))]
+        assert unsaid == [], parser.prog
+
+
+# What a script needs no `--json` of, and why.
+WITHOUT_JSON = {
+    "run": "it logs JSON lines with --json-log, and publishes",
+    "emulate": "its events are JSON lines as they are",
+    "completion": "it prints what a shell reads",
+    "demo": "it prints what `run` prints",
+    "init": "it prints the next steps",
+    "schema": "it prints JSON as it is",
+    "bank design": "it prints the YAML that `bank build` takes",
+    "chart": "it prints the files drawn, one a line; its numbers are a JSON file among them",
+}
+
+
+def test_every_command_has_a_json_option_or_a_reason_for_none():
+    every = {parser.prog.removeprefix("shearloop "): parser for parser in parsers(full_parser())}
+    lacking = {name for name, parser in every.items() if "--json" not in parser._option_string_actions}
+    assert {next((known for known in WITHOUT_JSON if name.startswith(known)), name) for name in lacking} == set(
+        WITHOUT_JSON
+    )
+
+
+def test_help_names_all_basis_models():
+    assert MODEL_NAMES.replace(" or ", ", ").split(", ") == list(MODELS)
+
+
+def test_help_loads_no_heavy_modules():
+    heavy = ("numpy", "scipy", "pydantic", "zmq", "matplotlib", "skfem", "serial", "yaml", "tqdm")
+    program = (
+        "import sys\nfrom shearloop.cli import COMMANDS, main\n"
+        "for arguments in [[], *([name] for name in COMMANDS)]:\n"
+        "    try: main([*arguments, '--help'])\n    except SystemExit: pass\n"
+        f"    loaded = [name for name in {heavy!r} if name in sys.modules]\n"
+        "    if loaded: print(arguments, loaded, file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == ""
+
+
+def test_messages_are_readable():
+    values = {"diameter_mm": 31.0, "k": 3.5, "sigma": 1.5, "score": 0.75, "reason": ""}
+    message = sample(EitEstimate, torque_nm=0.05, torque_low_nm=0.02, torque_high_nm=0.08, **values)
+    content = decode(encode(wire_map(message, timestamp=0.0, seq=1)))
+    line = message_line("eit.estimate", content)
+    assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
+    assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
+    robot = decode(encode(wire_map(sample(RobotStateMessage, blocked=""), timestamp=0.0, seq=1)))
+    shown = message_line("robot.state", {**robot, "safety_mode": None})
+    assert "joints_rad (" in shown
+    assert not any(word in shown for word in ("blocked", "safety_mode", "None"))
+    invalid = {**content, "valid": False, "reason": "no signal"}
+    assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
+
+
+def test_tasks_are_told_in_words_without_what_is_not_known():
+    facts = {"alive": True, "done": False, "restarts": 0, "last_error": "", "rate_hz": None, "errors": {}}
+    for changes, row in (
+        ({}, ("alive", "", "")),
+        ({"rate_hz": 1.85, "expected_hz": 1.849}, ("alive", "1.85 of 1.85 Hz", "")),
+        ({"connected": True, "errors": {"unreachable": 1}}, ("alive", "", "reconnected once")),
+        ({"connected": True, "connections": 3}, ("alive", "", "reconnected twice")),
+        ({"connected": False, "error": "No board."}, ("not connected", "", "No board.")),
+        ({"errors": {"nan": 3}, "restarts": 1}, ("alive", "", "restarted once, nan 3 times")),
+        ({"alive": False, "last_error": "ValueError"}, ("DEAD", "", "ValueError")),
+        ({"alive": False, "done": True}, ("done", "", "")),
+    ):
+        assert task_row("right", {**facts, **changes})[1:] == row
+    assert table(("a", "b"), [("longer", "x")]) == ["a       b", "longer  x"]
+
+
+def test_the_status_line_is_redrawn_in_place(monkeypatch):
+    out = StringIO()
+    state = {"experiment": "one", "step": 2, "steps": 3, "step_name": "grip", "progress": 0.5, "reasons": ""}
+    with StatusLine(out) as line:
+        line("loop.state", {**state, "phase": "running", "activity": "closing", "torque_source": "right"})
+        for source, valid in (("right", True), ("left", True), ("right", False)):
+            line("eit.estimate", {"source": source, "valid": valid, "torque_nm": 0.1})
+    _, starting, *shown, end = out.getvalue().split("\r\x1b[K")
+    running = "running 50 %  step 2 of 3 grip  closing"
+    assert (starting, shown, end) == ("starting", [running, f"{running}   right +0.100 N·m", running], "")
+    narrow = StringIO()
+    monkeypatch.setattr("shutil.get_terminal_size", lambda **_: os.terminal_size((50, 24)))
+    line = StatusLine(narrow)
+    line("loop.state", {**state, "phase": "running", "activity": "closing on a tool", "torque_source": "right"})
+    line("eit.estimate", {"source": "right", "valid": True, "torque_nm": 0.1})
+    assert narrow.getvalue().split("\r\x1b[K")[-1] == "running 50 %  step 2 of 3 gri…   right +0.100 N·m"
+    line = StatusLine(narrow)
+    line("eit.estimate", {"source": "right", "timestamp": 0.0, "valid": False, "reason": "no grip"})
+    assert "eit.estimate  right     no estimat…" in narrow.getvalue(), "without a robot there is no state of the loop"
+    stopped = {**state, "phase": "stopped", "activity": "the operator stopped it"}
+    assert loop_line(stopped) == "stopped: the operator stopped it  step 2 of 3 grip"
+    held = {**state, "phase": "held", "activity": "closing", "reasons": "no estimate"}
+    assert loop_line(held) == "held 50 %: no estimate  step 2 of 3 grip  closing", "what is cut matters less"
+
+
+def test_a_second_daemon_is_refused_before_its_emulators_start(config, tmp_path, monkeypatch, mistake):
+    monkeypatch.setattr("shearloop.cli.emulator_processes.subprocess.Popen", Mock(side_effect=AssertionError))
+    path = str(config(emulators=[{"device": "hx711", "arguments": ["--link", "load"]}]))
+    with closing(StopSocket(f"ipc://{tmp_path}/commands", {}, Refusals())):
+        assert "is another daemon running? Stop it, or choose another port" in mistake("run", path)
+
+
+def test_the_summary_of_a_run_that_ends_with_its_experiment_comes_last(config, monkeypatch, capsys):
+    at_once: list[bool] = []
+
+    async def run_daemon(_config: object, _listeners: object, _on_ready: object, summary: RunSummary) -> bool:
+        summary._add("What happened: nothing.")
+        at_once.append(summary._out is not None)
+        return True
+
+    monkeypatch.setattr("shearloop.daemon.app.run_daemon", run_daemon)
+    path = config()
+    for ends in (False, True):
+        loaded = load_daemon_config(path).model_copy(update={"stop_when_done": ends})
+        monkeypatch.setattr("shearloop.cli.run._config", lambda _, loaded=loaded: loaded)
+        assert main(["run", str(path), "--show"]) == 0
+        assert capsys.readouterr().out == "\nWhat happened: nothing.\n\n"
+    assert at_once == [True, False]
+
+
+def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, tmp_path, mistake):
+    unknown = str(config(emulators=[{"device": "eit-kitt"}]))
+    for command in ("check", "run"):
+        assert "`emulators[0].device` is 'eit-kitt'; there are eit-kit" in mistake(command, unknown)
+    for arguments, part in (
+        (["--bank", "b"], "--bank b: there is no such file; build it with `shearloop bank build --config FILE --out "),
+        (["--speed", "fast"], "--speed fast is not a number above 0; see `shearloop emulate eit-kit --help`"),
+        (["--sped", "2"], "unrecognized arguments: --sped 2"),
+        (["--help"], "unrecognized arguments: --help"),
+    ):
+        wrong = str(config(emulators=[{"device": "eit-kit", "arguments": arguments}]))
+        for command in ("check", "run"):
+            said = mistake(command, wrong)
+            assert "`emulators[0].arguments`: eit-kit: " in said
+            assert part in said
+    known = str(config(emulators=[{"device": "eit-kit"}]))
+    assert "the recording cannot be read" in mistake("run", known, "--recording", str(tmp_path / "none.mat"))
+
+
+def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, capsys, tmp_path):
+    asked: list[tuple[str, float]] = []
+
+    def answers(_address: str, content: dict[str, Any], timeout_s: float, _keys: object) -> dict[str, Any]:
+        asked.append((content["command"], timeout_s))
+        return {"ok": True}
+
+    monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", answers)
+    assert main(["command", "unlock"]) == 0
+    assert main(["command", "unlock", "--timeout", "5"]) == 0
+    assert main(["command", "stop", "--connect", f"ipc://{tmp_path}/commands"]) == 0
+    assert asked == [("status", 2.0), ("unlock", 60.0), ("unlock", 5.0), ("stop", 2.0)]
+    assert "unlock: done" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["check", "run", "demo"])
+def test_a_broken_robot_library_is_one_sentence(config, command, monkeypatch, tmp_path, mistake):
+    (tmp_path / "rtde_control.py").write_text("raise ImportError('librtde.so.1.6: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "rtde_control", raising=False)
+    robot = str(config(robot=str(Path("config/ur.yaml").resolve())))
+    arguments = ["--folder", str(tmp_path / "demo")] if command == "demo" else [robot]
+    said = mistake(command, *arguments)
+    assert "the package ur-rtde, which drives the robot, cannot be loaded: install it again with" in said
+    assert said.endswith("--no-deps ur-rtde` (librtde.so.1.6: cannot open shared object file)\n")
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_a_missing_robot_library_is_one_sentence(config, command, monkeypatch, mistake):
+    monkeypatch.setattr("shearloop.drivers.ur.client.find_spec", lambda _name: None)
+    said = mistake(command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
+    assert "the robot needs the package ur-rtde, which is not installed for Python 3." in said
+    assert "-m pip install ur-rtde" in said
+
+
+def completed(script: Path, *words: str) -> set[str]:
+    """Return what bash would offer at the end of a command line."""
+    line = " ".join(f"'{word}'" for word in words)
+    program = (
+        f'source "{script}"; COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; '
+        'complete -p shearloop >/dev/null || exit 9; _shtab_shearloop "$1"; printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return set(done.stdout.split())
+
+
+def test_bash_completes_commands_and_options(tmp_path, ran):
+    script = tmp_path / "shearloop"
+    script.write_text(ran("completion", "bash").out)
+    assert set(COMMANDS) <= completed(script, "shearloop", "")
+    assert completed(script, "shearloop", "do") == {"doctor"}
+    assert "--geometry" in completed(script, "shearloop", "doctor", "--")
+    assert {"server", "client", "allow", "revoke", "list"} <= completed(script, "shearloop", "keys", "")
+
+
+def test_every_shell_has_its_script(ran):
+    for shell in ("zsh", "tcsh"):
+        assert "doctor" in ran("completion", shell).out
+
+
+def test_file_arguments_complete_file_names():
+    config = next(action for action in _command("check")._actions if action.dest == "config")
+    assert getattr(config, "complete", None)
+
+
+def _command(name: str):
+    return next(action for action in full_parser()._actions if action.dest == "command").choices[name]
+
+
+# Each costs tens of megabytes and tenths of a second, and none is needed to run.
+HEAVY = ("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.interpolate", "skfem", "numba", "matplotlib")
+
+
+def test_the_daemon_imports_no_heavy_modules():
+    says = f"import sys, shearloop.daemon.app; print([name for name in {HEAVY} if name in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_a_stop_imports_little():
+    """On a busy computer, imports are most of the time that `shearloop command stop` takes."""
+    says = """if True:
+        import os, socket, sys, threading
+        import msgpack
+        from shearloop.cli import main
+        from shearloop.daemon.messaging.stop_client import stop_name
+
+        address = f"ipc:///lean-{os.getpid()}"
+        daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        daemon.bind(stop_name(address))
+
+        def reply():
+            request, client = daemon.recvfrom(1024)
+            assert msgpack.unpackb(request) == {"command": "stop"}
+            daemon.sendto(msgpack.packb({"ok": True, "stopped": "one"}), client)
+
+        threading.Thread(target=reply, daemon=True).start()
+        main(["command", "stop", "--connect", address])
+        print([name for name in ("numpy", "zmq", "asyncio", "structlog", "tqdm") if name in sys.modules])
+    """
+    found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
+    assert found.stdout == "stop: stopped one\n[]\n"

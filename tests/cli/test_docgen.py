@@ -1,0 +1,116 @@
+"""The generated pages match the code, and their programs run."""
+
+import asyncio
+import dataclasses
+import re
+import subprocess
+import sys
+
+import pytest
+import zmq
+
+from shearloop.cli.config_schema import MODELS, schema_of
+from shearloop.cli.docgen import DOCS, pages
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.safety import TABLE
+from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame
+from shearloop.daemon.messaging.publisher import Publisher
+from tests.fixtures.daemons import DEADLINE_S
+from tests.sample_messages import sample
+
+PAGES = pages()
+
+
+@pytest.fixture(scope="module")
+def written() -> dict[str, str]:
+    """Return the generated pages by name."""
+    return {path.name: text for path, text in PAGES.items()}
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_a_generated_file_is_up_to_date(path):
+    assert path.read_text(encoding="utf-8") == PAGES[path], f"{path} is out of date: run `make docs` and commit it"
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_key_of_a_file_is_described_and_listed(written, kind):
+    schema = schema_of(kind)
+    for section in (schema, *schema.get("$defs", {}).values()):
+        assert section["description"]
+        for key, described in section["properties"].items():
+            assert described["description"], key
+            assert f"| `{key}` |" in written["configuration.md"]
+
+
+def test_the_schema_of_a_configuration_has_units_ranges_and_defaults():
+    loop = schema_of("configuration")["$defs"]["LoopConfig"]["properties"]
+    assert loop["wrist_speed_rad_per_s"] == {
+        "description": "largest wrist speed of the loop [rad/s]",
+        "default": 0.5,
+        "exclusiveMinimum": 0,
+        "maximum": 3.14,
+        "type": "number",
+    }
+
+
+def test_every_topic_and_key_is_listed(written):
+    for topic, kind in TOPICS.items():
+        assert f"### `{topic}`" in written["messages.md"]
+        for key in (item.name for item in dataclasses.fields(kind)):
+            assert f"| `{key}` |" in written["messages.md"]
+
+
+def test_every_row_of_the_safety_table_is_on_the_page(written):
+    for rule in TABLE.values():
+        assert rule.cure in written["faults.md"]
+
+
+async def test_the_python_subscriber_prints_estimates(tmp_path):
+    program = (DOCS / "examples/subscriber.py").read_text()
+    address = f"ipc://{tmp_path}/publish"
+    script = tmp_path / "subscriber.py"
+    script.write_text(program.replace("tcp://127.0.0.1:7761", address))
+    frame, estimate = sample(EitFrame), sample(EitEstimate)
+    with zmq.Context() as context:
+        publisher = Publisher(context, address, Clock())
+        process = await asyncio.create_subprocess_exec(sys.executable, str(script), stdout=subprocess.PIPE)
+        try:
+            async with asyncio.timeout(DEADLINE_S):
+                seen = asyncio.create_task(process.stdout.readline())
+                while not seen.done():
+                    # Until it has subscribed.
+                    publisher.publish(estimate)
+                    await asyncio.wait([seen], timeout=0.05)
+                assert b"text 0.5 " in seen.result()
+                publisher.publish(frame)
+                while b"text 5.0" not in (line := await process.stdout.readline()):
+                    assert line, "the program has ended"
+        finally:
+            process.kill()
+            await process.communicate()
+            await asyncio.sleep(0)
+            publisher.close()
+
+
+@pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
+def test_subscribers_use_existing_topics_and_keys(name):
+    """MATLAB is on no machine of ours, so what its subscriber reads is held to the schema of the messages."""
+    program = (DOCS / "examples" / name).read_text()
+    topics = set(re.findall(r'"((?:eit|load|skin|robot|gripper|loop)\.[a-z]*)"', program))
+    assert topics
+    assert all(any(topic.startswith(beginning) for topic in TOPICS) for beginning in topics)
+    assert f"{PUBLISH_ADDRESS}" in program
+    reads = set(re.findall(r'message\["(\w+)"\]|message\.(\w+)', program))
+    named = {key.removesuffix("_shape") for pair in reads for key in pair if key}
+    assert "timestamp" in named
+    known = {item.name for topic in ("eit.estimate", "eit.frame") for item in dataclasses.fields(TOPICS[topic])}
+    assert named - {"timestamp", "seq"} <= known
+
+
+@pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
+def test_subscribers_are_short(name):
+    lines = (DOCS / "examples" / name).read_text().splitlines()
+    code = [line for line in lines if line.strip() and not line.lstrip().startswith(("//", "%", '"""', "#", "import"))]
+    assert len(code) <= 15
+    assert "eit." in "".join(code)

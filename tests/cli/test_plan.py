@@ -1,0 +1,133 @@
+"""The rehearsal: `check` prints an experiment's plan, and what the configured devices do not allow."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from shearloop.cli import main
+from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
+from shearloop.drivers.robotiq.models import MODELS
+from shearloop.drivers.ur.settings import read_settings
+from tests.fixtures.daemons import collector, running_daemon, shearloop
+
+ROOT = Path(__file__).parents[2]
+ROBOT = ROOT / "config" / "ur.yaml"
+GRIP = {"do": "grip", "width_mm": 5, "force_n": 60}
+TIGHTEN = {"do": "tighten", "direction": "clockwise", "until_torque_nm": 0.08, "until_angle_rad": 2.0}
+
+
+def written(folder: Path, *steps: dict[str, object], **keys: object) -> Path:
+    path = folder / "experiment.yaml"
+    path.write_text(yaml.safe_dump({"name": "one", "torque_source": "load_cell", **keys, "steps": list(steps)}))
+    return path
+
+
+def rig(folder: Path, model: str = "2F-140") -> Path:
+    content = {
+        "load_cell": {"device": {"path": "load"}},
+        "robot": str(ROBOT),
+        "gripper": {"model": model, "socket": {"host": "192.168.1.10"}},
+    }
+    path = folder / "rig.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "config" / "experiments").glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_plan_of_every_delivered_experiment_is_in_words_and_in_numbers(path, ran, result_of):
+    steps = yaml.safe_load(path.read_text(encoding="utf-8"))["steps"]
+    said = ran("check", path).out.splitlines()
+    planned = result_of("check", path)["plan"]
+    assert [step["do"] for step in planned["steps"]] == [step["do"] for step in steps]
+    assert all(any(line.split()[:2] == [str(n), step["do"]] for line in said) for n, step in enumerate(steps, 1))
+    assert planned["force_n"] == max(step.get("force_n", 0) for step in steps)
+    assert planned["torque_nm"] == max(step.get("torque_nm", step.get("until_torque_nm", 0)) for step in steps)
+    assert planned["duration_s"] == pytest.approx(sum(step["duration_s"] for step in planned["steps"]))
+    assert not any(step["refused"] or step["notes"] for step in planned["steps"])
+
+
+def test_a_reversal_is_pointed_out_at_its_step(tmp_path, result_of, ran):
+    back = {"do": "hold_torque", "torque_nm": 0.05, "direction": "counterclockwise"}
+    path = written(tmp_path, GRIP, {"do": "identify"}, TIGHTEN, back)
+    notes = result_of("check", path)["plan"]["steps"][3]["notes"]
+    assert notes == ["reversal: hold_torque turns counterclockwise, against step 3 (tighten), which turned clockwise"]
+    assert "1 reversal of a held tool" in ran("check", path).out
+
+
+def test_turns_that_add_up_to_more_than_the_limit_are_pointed_out(tmp_path, result_of):
+    path = written(tmp_path, GRIP, TIGHTEN, TIGHTEN, limits={"angle_rad": 3.0})
+    assert "4 rad (229°) from the grip: the limit stops it at 3 rad" in "".join(
+        result_of("check", path)["plan"]["steps"][2]["notes"]
+    )
+
+
+OUTSIDE = [
+    ({"do": "approach", "pose_m_rad": [0.4, 0.1, 1.2, 0, 3.1, 0]}, "approach ends at z = 1.2 m, outside the robot's"),
+    ({"do": "retreat", "pose_m_rad": [0.4, -0.79, 0.2, 0, 3.1, 0]}, "retreat ends at y = -0.79 m, outside the robot's"),
+    ({"do": "turn_to", "angle_rad": 6.15}, "turn_to turns to 6.15 rad, and the robot's wrist has -6.1 to 6.1 rad"),
+    ({"do": "twist", "absolute": True, "angles_rad": [0.1, -6.2]}, "twist turns to -6.2 rad, and the robot's wrist"),
+    ({**GRIP, "force_n": 230}, "grip asks for a force of 230 N, and a 2F-140 has 10 to 125 N"),
+    ({**GRIP, "speed_mm_per_s": 25}, "grip asks for a speed of 25 mm/s, and a 2F-140 has 30 to 250 mm/s"),
+]
+
+
+@pytest.mark.parametrize(("step", "said"), OUTSIDE)
+async def test_what_lies_outside_the_devices_is_refused_by_check_and_by_start(step, said, tmp_path, capsys):
+    path = written(tmp_path, {"do": "release"}, step)
+    assert main(["check", str(path), "--config", str(rig(tmp_path))]) == 2
+    out, err = capsys.readouterr()
+    assert f"REFUSED: {said}" in out, "the plan shows where"
+    assert f"steps[1]: {said}" in err
+    # As `command start` does, before the experiment begins.
+    with pytest.raises(InvalidExperimentError):
+        await ExperimentFiles((tmp_path,), read_settings(ROBOT).limits, MODELS["2F-140"]).read(path)
+
+
+@pytest.mark.parametrize(
+    ("model", "step", "said"),
+    [
+        ("2F-85", {**GRIP, "width_mm": 100}, "a width of 100 mm, and a 2F-85 has 0 to 85 mm"),
+        ("Hand-E", {"do": "release", "width_mm": 60}, "a width of 60 mm, and a Hand-E has 0 to 50 mm"),
+        ("2F-85", {"do": "release"}, ""),
+    ],
+)
+def test_a_smaller_gripper_has_its_own_ranges(model, step, said, tmp_path, capsys):
+    path = written(tmp_path, step)
+    assert main(["check", str(path), "--config", str(rig(tmp_path, model))]) == (2 if said else 0)
+    out, err = capsys.readouterr()
+    assert said in err
+    assert said or "opens the fingers to 85 mm" in out
+
+
+def test_what_the_robot_slows_down_is_said(tmp_path, ran):
+    steps = ({"do": "turn_to", "angle_rad": 1, "speed_rad_per_s": 3}, {"do": "approach", "along_tool_m": 0.1,
+             "speed_m_per_s": 0.5})  # fmt: skip
+    said = ran("check", written(tmp_path, *steps), "--config", rig(tmp_path)).out
+    assert "the robot's limit allows 0.5 rad/s" in said
+    assert "the robot's limit allows 0.1 m/s" in said
+
+
+def test_an_option_for_experiments_is_refused_for_a_configuration(tmp_path, mistake):
+    assert "--config names a configuration for an experiment" in mistake("check", rig(tmp_path), "--config", "a.yaml")
+
+
+SKIN = yaml.safe_load((ROOT / "config" / "skin_demo.yaml").read_text(encoding="utf-8"))["skin"]
+SKIN["calibration"] = str(ROOT / "config" / SKIN["calibration"])
+
+
+@pytest.mark.parametrize("name", ["load_cell", "fingertips", "skin"])
+def test_a_sensor_alone_is_a_configuration(name, config, ran):
+    alone = {"load_cell": {"device": {"path": "load"}}, "skin": SKIN}.get(name)
+    path = config() if alone is None else config(**{name: alone}, fingertips={})
+    said = ran("check", path).out
+    assert said.endswith(f"{path} is in order\n")
+    assert "plan of" not in said
+
+
+async def test_a_load_cell_alone_runs_and_publishes(config, tmp_path):
+    path = config(load_cell={"device": {"path": str(tmp_path / "load")}}, fingertips={})
+    board = shearloop("emulate", "hx711", "--link", str(tmp_path / "load"), "--speed", "20")
+    async with board, running_daemon(path) as daemon:
+        message = await collector(daemon, "load.torque").get()
+    assert message["source"] == "load_cell"

@@ -1,0 +1,114 @@
+"""What a user starts with: `init`, `schema`, and the files of `demo`."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from jsonschema import Draft202012Validator
+
+from shearloop.cli import demo
+from shearloop.cli.config_schema import MODELS
+from shearloop.cli.emulator_processes import running
+from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.estimation.skin.calibration import load_calibration
+
+CONFIG = Path(__file__).parents[2] / "config"
+# A calibration is written by a command, not by people.
+WRITTEN_BY_PEOPLE = sorted(set(CONFIG.rglob("*.yaml")) - set(CONFIG.glob("calibrations/*")))
+
+
+def schema_for(path: Path) -> Draft202012Validator:
+    """Return the schema that a file names for editors."""
+    first = path.read_text(encoding="utf-8").splitlines()[0]
+    named = path.parent / first.removeprefix("# yaml-language-server: $schema=")
+    return Draft202012Validator(json.loads(named.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("path", WRITTEN_BY_PEOPLE, ids=lambda path: path.name)
+def test_an_editor_accepts_the_files_of_config_and_refuses_an_unknown_key(path):
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    schema_for(path).validate(content)
+    assert not schema_for(path).is_valid({**content, "unknown": 1})
+
+
+@pytest.mark.parametrize(
+    ("angles", "accepted"), [("1.45:1.65:10", True), (0.1, True), ([0.1], True), ([], False), ("1", False)]
+)
+def test_an_editor_accepts_angles_as_the_program_does(angles, accepted):
+    step = {"do": "twist", "angles_rad": angles}
+    schema = schema_for(CONFIG / "experiments" / "tighten.yaml")
+    assert schema.is_valid({"name": "twists", "steps": [step]}) == accepted
+
+
+def test_the_calibration_of_config_is_of_this_version():
+    assert load_calibration(CONFIG / "calibrations" / "skin_demo.yaml").rows
+
+
+def test_schema_prints_every_kind(ran):
+    for kind in MODELS:
+        Draft202012Validator.check_schema(json.loads(ran("schema", kind).out))
+
+
+def test_init_writes_files_that_load_and_changes_none(tmp_path, ran, mistake):
+    folder = tmp_path / "my" / "rig"
+    assert f"shearloop check {folder / 'rig.yaml'}" in ran("init", folder).out
+    config = load_daemon_config(folder / "rig.yaml")
+    assert config.robot == folder / "ur.yaml"
+    assert not config.emulators
+    assert load_yaml_model(folder / "experiments" / "tighten.yaml", ExperimentFile).steps
+    build = f"shearloop bank build --config {folder / 'banks' / 'paper.yaml'} --out {folder / 'paper.bank'}"
+    assert f"build it with `{build}`" in mistake("check", folder / "rig.yaml")
+    schema_for(folder / "banks" / "paper.yaml")
+    (folder / "rig.yaml").write_text("mine")
+    (folder / "ur.yaml").unlink()
+    assert "nothing was written; choose another folder" in mistake("init", folder)
+    assert (folder / "rig.yaml").read_text() == "mine"
+    assert not (folder / "ur.yaml").exists()
+    assert "cannot be written: Not a directory; choose another path" in mistake("init", folder / "rig.yaml")
+
+
+def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys):
+    """The page's address is printed before the loop starts."""
+    aiohttp = pytest.importorskip("aiohttp", reason="the live view needs the extra `view`")
+    import asyncio
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    content = {"fingertips": {"right": {"device": {"path": "/dev/null"}}}}
+    config = DaemonConfig(publish=f"ipc://{tmp_path}/publish", commands=f"ipc://{tmp_path}/commands", **content)
+
+    async def status(url: str) -> int:
+        async with aiohttp.ClientSession() as http, http.get(url) as page:
+            return page.status
+
+    with demo.page(config):
+        url = capsys.readouterr().out.rsplit(" ", 1)[1].strip()
+        assert asyncio.run(status(url)) == 200
+    with pytest.raises(aiohttp.ClientConnectorError):
+        asyncio.run(status(url))
+
+
+def test_ctrl_c_reaches_no_process_of_the_demo(capfd):
+    with running([sys.executable, "-c", "import os; print(os.getpgrp())"]) as process:
+        assert process.wait() == 0
+    assert int(capfd.readouterr().out) != os.getpgrp()
+    with running([sys.executable, "-c", "import time; time.sleep(60)"], stdout=subprocess.PIPE) as process:
+        pass
+    assert process.returncode == -signal.SIGTERM
+
+
+def test_the_demo_refuses_a_recording_that_is_not_there_at_once(tmp_path, mistake):
+    said = mistake("demo", "--folder", tmp_path, "--recording", tmp_path / "none.mat")
+    assert "none.mat: the recording cannot be read: No such file" in said
+
+
+def test_the_demo_without_aiohttp_says_what_the_page_needs(monkeypatch, capsys):
+    monkeypatch.setattr(demo, "find_spec", lambda _: None)
+    with demo.page(DaemonConfig(fingertips={"right": {"device": {"path": "/dev/null"}}})):
+        assert "pip install 'shearloop[view]'" in capsys.readouterr().out

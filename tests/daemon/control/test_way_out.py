@@ -1,0 +1,196 @@
+"""The way out: a gripped tool can be released by an explicit command; and nothing is tared, or torn, that is held."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from shearloop.daemon.control.control_loop import LOADED_NM, ControlLoop
+from shearloop.daemon.control.experiment import ExperimentPhase
+from shearloop.daemon.control.experiment_check import check_steps
+from shearloop.daemon.control.experiment_schema import ExperimentFile, first_motion
+from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample
+from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
+from shearloop.drivers.errors import DriverError
+from tests.daemon.control.cell import TWIST, Cell, driven, experiment
+from tests.daemon.control.loop_rig import GRIP, LOAD, Rig, new_loop, phase, started, stop
+from tests.drivers.ur.flight import SETTINGS
+
+WAIT = {"do": "wait", "wait_s": 60}
+
+
+@asynccontextmanager
+async def with_gripper(*steps: dict[str, Any]) -> AsyncIterator[Cell]:
+    loop = ControlLoop(LoopConfig(), {WRENCH: wrench_source(SETTINGS.rate_hz)}, ("robot", "gripper"))
+    async with driven(cell=Cell(loop)) as cell:
+        if steps:
+            await cell.start(*steps)
+        yield cell
+
+
+async def released(cell: Cell) -> str | None:
+    releasing = asyncio.create_task(cell.runner.release())
+    while not releasing.done():
+        await cell.cycles(1)
+    return releasing.result()
+
+
+def emergency_stop(cell: Cell) -> None:
+    cell.robot.flight.arm.be(safety_mode=7, robot_mode=3)
+
+
+@pytest.mark.parametrize(
+    "befalls", [None, emergency_stop, Cell.exceed_torque, lambda cell: cell.runner.stop(also_idle=True)]
+)
+async def test_a_tool_is_released_after_any_stop_and_without_an_experiment(befalls):
+    async with with_gripper() as cell:
+        if befalls is not None:
+            befalls(cell)
+        await cell.cycles(10)
+        assert "its fingers hold something 30.0 mm wide, with an unknown force" in cell.control_loop.release_question()
+        assert await released(cell) is None
+        assert cell.gripper.asked == ["open"]
+
+
+async def test_no_release_while_the_wrist_moves_or_an_experiment_runs():
+    async with with_gripper({**TWIST, "angles_rad": [3.0]}) as cell:
+        await cell.cycles(60)
+        assert cell.state.motion != "idle"
+        assert "is moving" in (cell.runner.release_refusal() or "")
+        cell.runner.stop()
+        while cell.state.motion != "idle" or not cell.state.rests:
+            assert "is moving" in (await released(cell) or "")
+            await cell.cycles(1)
+        await cell.cycles(5)
+        assert await released(cell) is None
+    async with with_gripper(WAIT) as cell:
+        assert await released(cell) == "the experiment 'test' is running; stop it first"
+        assert cell.gripper.asked == []
+
+
+async def test_a_stop_ends_a_release_and_halts_the_fingers():
+    async with with_gripper() as cell:
+        cell.gripper.there.clear()
+        releasing = asyncio.create_task(cell.runner.release())
+        await cell.cycles(5)
+        assert "wait for the end" in (await cell.runner.start(experiment(WAIT)) or "")
+        assert cell.runner.stop() == "unlock"
+        await cell.cycles(5)
+        assert await releasing == "the release was stopped; send `release` again"
+        assert cell.gripper.asked == ["open", "halt"]
+
+
+async def test_a_release_that_failed_says_why():
+    async with with_gripper() as cell:
+        cell.gripper.error = DriverError("the gripper does not answer")
+        assert await released(cell) == "the gripper does not answer"
+
+
+def held(**sense: bool) -> Rig:
+    rig = Rig(new_loop())
+    rig.hand, rig.force_n = replace(rig.hand, **sense), 0.0 if sense else 60.0
+    rig.run(0.6)
+    return rig
+
+
+def test_no_tare_while_something_is_held():
+    rig = held()
+    refusal = rig.control_loop.tare_refusal(confirmed=True) or ""
+    assert "its fingers hold something" in refusal
+    assert "shearloop command release" in refusal
+
+
+@pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
+def test_a_tare_with_an_uncertain_gripper_has_to_be_confirmed(sense):
+    rig = held(**sense)
+    assert "does not say whether it holds a tool" in (rig.control_loop.tare_refusal() or "")
+    assert rig.control_loop.tare_refusal(confirmed=True) is None
+
+
+@pytest.mark.parametrize(("torque_nm", "refused"), [(2 * LOADED_NM, True), (0.5 * LOADED_NM, False)])
+def test_a_tare_under_load_has_to_be_confirmed(torque_nm, refused):
+    loop = ControlLoop(LoopConfig(), {"load_cell": LOAD}, ("robot",))
+    loop.on_torque(TorqueSample("load_cell", torque_nm, "", 0, 0))
+    assert ("load_cell measures +0.100 N·m" in (loop.tare_refusal() or "")) is refused
+    assert loop.tare_refusal(confirmed=True) is None
+
+
+def test_a_running_experiment_refuses_a_tare():
+    rig = started(Rig(new_loop()), WAIT)
+    assert "is running" in (rig.control_loop.tare_refusal(confirmed=True) or "")
+
+
+def test_a_tare_step_with_a_held_tool_is_refused():
+    file = ExperimentFile.model_validate({"name": "test", "steps": [GRIP, {"do": "tare"}]})
+    assert "tare would make the gripped tool's torque the zero" in dict(check_steps(file))["steps", 1]
+    rig = held()
+    started(rig, {"do": "tare"})
+    rig.run(1)
+    assert phase(rig) is ExperimentPhase.STOPPED
+    assert "step 1 (tare) cannot be done: its fingers hold" in rig.control_loop.experiment.stop_reason
+    assert rig.begun == []
+
+
+def test_the_angle_since_the_grip_belongs_to_the_grip():
+    """Each start counted anew: three runs turned the tool by three times the limit."""
+    rig = started(Rig(new_loop()), GRIP, WAIT)
+    rig.run(2)
+    gripped_rad = rig.wrist_rad
+    stop(rig)
+    rig.wrist_rad += 0.5
+    rig.run(0.1)
+    rig.control_loop.acknowledge()
+    started(rig, WAIT, limits={"angle_rad": 0.3})
+    rig.run(0.1)
+    turned = f"turned by {rig.wrist_rad - gripped_rad:+.3f} rad since the grip, the limit is 0.3 rad"
+    assert turned in rig.control_loop.experiment.stop_reason
+    rig.step()
+    assert rig.control_loop.status.decision.reasons[-1].startswith("the gripper still holds something: its fingers")
+
+
+def test_a_new_grip_has_an_angle_of_its_own():
+    rig = started(Rig(new_loop()), GRIP, {"do": "release"})
+    rig.meets = False
+    rig.run(10)
+    assert phase(rig) is ExperimentPhase.DONE
+    rig.force_n = 0.0
+    rig.run(0.1)
+    rig.wrist_rad += 0.5
+    rig.run(0.1)
+    started(rig, {"do": "release"}, GRIP, {"do": "wait", "wait_s": 1}, limits={"angle_rad": 0.3})
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+
+
+@pytest.mark.parametrize("sense", [{}, {"uncertain": True}])
+def test_no_straight_move_begins_with_a_tool_that_is_or_may_be_gripped(sense):
+    rig = held(**sense)
+    move = {"do": "approach", "along_tool_m": 0.03}
+
+    def refusal(*steps: dict[str, Any]) -> str | None:
+        return rig.control_loop.start(ExperimentFile.model_validate({"name": "test", "steps": list(steps)}), rig.t_ns)
+
+    said = refusal({"do": "wait", "wait_s": 1}, move) or ""
+    assert said.endswith("put a `grip` or a `release` before step 2 (approach), which moves the arm")
+    assert refusal({"do": "release"}, move) is None
+
+
+@pytest.mark.parametrize(
+    ("steps", "said"),
+    [
+        ([WAIT], "no step moves anything"),
+        ([{"do": "tare"}, {"do": "release"}], "step 2 of 2 (release): the fingers open to"),
+        ([{"do": "approach", "along_tool_m": 0.03}], "the arm moves +30 mm along the tool's axis, at 0.1 m/s"),
+        ([{"do": "retreat", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0]}], "the arm moves to x 400, y 0, z 300 mm"),
+        ([{"do": "turn_to", "angle_rad": 1.5}], "the wrist turns to 1.5 rad"),
+        ([{"do": "identify"}], "the wrist turns to and fro"),
+        ([TWIST], "the wrist twists to 1 rad, at 0.3 rad/s"),
+        ([GRIP], "the fingers close to 10 mm, or onto a tool with at most 60 N"),
+        ([{"do": "hold_torque", "torque_nm": 0.1}], "until the torque is +0.1 N·m"),
+    ],
+)
+def test_the_first_motion_is_told_before_a_start(steps, said):
+    assert said in first_motion(ExperimentFile.model_validate({"name": "test", "steps": steps}))

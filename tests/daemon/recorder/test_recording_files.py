@@ -1,0 +1,347 @@
+"""Recordings as files: written, read, inspected, repaired, exported, imported."""
+
+import csv
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from scipy.io import loadmat, savemat
+
+import shearloop
+from shearloop.bank.channels import PAPER_TABLE
+from shearloop.daemon.config import RecordingConfig, load_daemon_config
+from shearloop.daemon.recorder import schema
+from shearloop.daemon.recorder.recorder import daemon_identity
+from shearloop.daemon.recorder.schema import LOAD_DOUBT_NOTE
+from shearloop.daemon.recorder.writer import new_recording
+from shearloop.errors import UserError
+from shearloop.tools.frame_series import part_of, read_series, series_of
+from shearloop.tools.recordings.matlab_import import import_mat
+from shearloop.tools.recordings.reader import read_messages, read_recording
+from shearloop.tools.recordings.replay import RecordedRun
+from shearloop.tools.recordings.tables import RecordedTopics, arrays
+from tests.fixtures.recordings import START_DATENUM
+
+LINES = PAPER_TABLE.line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
+
+
+def written(path: Path) -> Path:
+    with new_recording(path, "a bench", {"tool": "driver"}) as writer:
+        for i, line in enumerate(LINES):
+            writer.add_frame("right", 10**18 + i * 541_000_000, 10**18 + i * 541_000_000 + 300_000_000, line)
+            writer.add_torque(10**18 + i, 0.01 * i)
+    return path
+
+
+@pytest.fixture
+def recording(tmp_path) -> Path:
+    return written(tmp_path / "twist.mcap")
+
+
+def test_info_shows_the_content(recording, ran, result_of):
+    printed = ran("recording", "info", recording).out
+    assert "a bench" in printed
+    assert "eit.frame.right               4 messages     1.85 Hz" in printed
+    assert "the same code as here" in printed
+    printed = result_of("recording", "info", recording)
+    assert printed["topics"]["load.torque"]["messages"] == 4
+    assert (printed["closed"], printed["same_code"], printed["size_bytes"]) == (True, True, recording.stat().st_size)
+
+
+def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, ran, mistake):
+    whole = recording.read_bytes()
+    torn = tmp_path / "torn.mcap.partial"
+    torn.write_bytes(whole[: len(whole) - 400])
+    mistake("evaluate", "x.cal", torn)
+    assert f"shearloop recording repair {torn}" in mistake("recording", "export", torn)
+    assert "It was not closed" in ran("recording", "info", torn).out
+    assert "torn.mcap: 8 messages are saved" in ran("recording", "repair", torn).out
+    assert torn.exists(), "the original stays"
+    found = read_recording(tmp_path / "torn.mcap")
+    np.testing.assert_array_equal(found.sides["right"].lines, LINES)
+    assert found.source == "a bench"
+    assert "exists already" in mistake("recording", "repair", torn)
+
+
+def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, ran, result_of, monkeypatch):
+    monkeypatch.setattr("shearloop.daemon.recorder.writer._FLUSH_EVERY", 1)
+    path = tmp_path / "a.mcap"
+    with new_recording(path, "a bench") as writer:
+        for i in range(100):
+            writer.add_torque(10**18 + i, 0.01 * i)
+    content = bytearray(path.read_bytes())
+    # In the packed data of a chunk: zstd's magic number begins it.
+    at = content.index(b"\x28\xb5\x2f\xfd", len(content) // 4) + 8
+    content[at : at + 4] = bytes(255 - byte for byte in content[at : at + 4])
+    path.write_bytes(content)
+    assert "  1 chunk is damaged and left out.\n" in ran("recording", "info", path).out
+    printed = result_of("recording", "repair", path)
+    assert (printed["path"], printed["damaged_chunks"]) == (str(tmp_path / "a.repaired.mcap"), 1)
+    kept = read_recording(tmp_path / "a.repaired.mcap").torque_nm
+    assert set(np.round(kept, 2)) < set(np.round(0.01 * np.arange(100), 2))
+    assert len(kept) == printed["messages"] >= 24
+
+
+def test_csv_parquet_and_matlab_exports_agree(recording, tmp_path, result_of):
+    pyarrow_parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    for form in ("csv", "parquet", "mat"):
+        files = result_of("recording", "export", recording, "--format", form)["files"]
+        assert all(Path(file).stat().st_size for file in files)
+    with (tmp_path / "twist_csv" / "eit.frame.right.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    assert rows[0][:3] == ["log_time_ns", "arrival_unix_ns", "line_0"]
+    np.testing.assert_array_equal(np.array(rows[1:])[:, 2:].astype(float), LINES)
+    table = pyarrow_parquet.read_table(tmp_path / "twist_parquet" / "eit.frame.right.parquet").to_pydict()
+    np.testing.assert_array_equal(np.array(table["line"]), LINES)
+    assert table["log_time_ns"][1] == 10**18 + 541_000_000
+    struct = loadmat(tmp_path / "twist.mat", simplify_cells=True)
+    np.testing.assert_array_equal(struct["eit_frame_right"]["line"], LINES)
+    np.testing.assert_allclose(struct["load_torque"]["torque_nm"], 0.01 * np.arange(4))
+    assert struct["load_torque"]["log_time_ns"].tolist() == [10**18 + i for i in range(4)]
+
+
+def test_csv_is_refused_where_a_later_array_is_longer(tmp_path, mistake):
+    with new_recording(tmp_path / "x.mcap", "a bench") as file:
+        for length in (3, 4):
+            file.add_frame("right", 10**18, 10**18, np.zeros(length))
+    assert "3 values of line and a later one 4; use --format mat" in mistake(
+        "recording", "export", tmp_path / "x.mcap", "--format", "csv"
+    )
+
+
+def test_a_recording_is_read_into_arrays_and_frames(recording, monkeypatch):
+    read = shearloop.read(recording)
+    assert dict(read.counts) == {"eit.frame.right": 4, "load.torque": 4}
+    assert read.metadata["source"] == "a bench"
+    np.testing.assert_array_equal(read["eit.frame.right"]["line"], LINES)
+    np.testing.assert_array_equal(read["load.torque"]["log_time_ns"], 10**18 + np.arange(4))
+    with pytest.raises(KeyError, match=r"has no topic 'health'; it has eit.frame.right, load.torque"):
+        read["health"]
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pandas", None)
+        with pytest.raises(UserError, match=r"needs pandas: `.* -m pip install 'shearloop\[notebook\]'`"):
+            read.frame("load.torque")
+    pandas = pytest.importorskip("pandas", reason="frames need the extra `notebook`")
+    frame = read.frame("eit.frame.right")
+    assert list(frame.columns[:2]) == ["arrival_unix_ns", "line_0"]
+    np.testing.assert_array_equal(frame.iloc[:, 1:], LINES)
+    assert frame.index[1] - frame.index[0] == pandas.Timedelta(541, "ms")
+    assert frame.index[0] == pandas.Timestamp("2001-09-09T01:46:40Z")
+
+
+@pytest.mark.parametrize(
+    ("values", "kind", "expected"),
+    [
+        ([1, 2], np.int64, [1, 2]),
+        ([1, None], np.float64, [1, np.nan]),
+        ([True, False], np.bool_, [True, False]),
+        (["a", None], np.object_, ["a", ""]),
+        ([np.array([1.0, np.nan]), np.array([2.0])], np.float64, [[1, np.nan], [2, np.nan]]),
+        ([None], np.float64, [np.nan]),
+    ],
+)
+def test_arrays_have_the_types_of_their_values(values, kind, expected):
+    found = arrays([{"key": value} for value in values])["key"]
+    assert found.dtype == kind
+    np.testing.assert_array_equal(found, np.array(expected, dtype=kind))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["info", "nowhere.mcap"], "nowhere.mcap: the recording cannot be read: No such file"),
+        (["info", "{folder}/text.mcap"], "is not an MCAP file"),
+        (["repair", "{folder}/text.mcap"], "is not an MCAP file"),
+        (["export", "{recording}", "--topic", "eit.frame.left"], "it has eit.frame.right, load.torque"),
+        (["export", "{recording}", "--out", "{folder}/text.mcap"], "the export cannot be written: File exists"),
+        (
+            ["export", "{recording}", "--format", "mat", "--out", "{folder}/no/where.mat"],
+            "no/where.mat: the export cannot be written: No such file or directory",
+        ),
+    ],
+)
+def test_mistakes_end_in_one_sentence(arguments, message, recording, tmp_path, mistake):
+    (tmp_path / "text.mcap").write_text("not a recording at all")
+    given = [one.format(folder=tmp_path, recording=recording) for one in arguments]
+    assert message in mistake("recording", *given)
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_a_topic_of_another_version_is_named(tmp_path, mistake, monkeypatch):
+    path = tmp_path / "new.mcap"
+    with monkeypatch.context() as newer:
+        newer.setattr("shearloop.daemon.recorder.schema.schema_name", lambda _: "load.torque")
+        newer.setattr("shearloop.daemon.recorder.schema.software_version", lambda: "99.1")
+        with new_recording(path, "a bench") as writer:
+            writer.add("arm.temperature", 10**18, 10**18, b'{"torque_nm": 0.5}')
+    said = mistake("recording", "export", path)
+    assert "has no topic 'arm.temperature'; version 99.1 wrote this recording" in said
+    assert "KeyError" not in said
+
+
+def test_a_recording_round_trips(recording):
+    found = read_recording(recording)
+    assert (found.source, found.notes) == ("a bench", {"tool": "driver"})
+    np.testing.assert_array_equal(found.sides["right"].lines, LINES)
+    np.testing.assert_array_equal(np.diff(found.sides["right"].t_mid_ns), 541_000_000)
+    arrivals = [content["arrival_unix_ns"] for _, content, _ in read_messages(recording, ["eit.frame.right"])]
+    np.testing.assert_array_equal(arrivals, found.sides["right"].t_mid_ns + 300_000_000)
+    np.testing.assert_allclose(found.torque_nm, 0.01 * np.arange(4))
+    assert list(recording.parent.iterdir()) == [recording]
+
+
+def test_messages_out_of_order_are_sorted(tmp_path):
+    with new_recording(tmp_path / "a.mcap", "x") as writer:
+        for t in (3, 1, 2):
+            writer.add_torque(t, float(t))
+    np.testing.assert_array_equal(read_recording(tmp_path / "a.mcap").torque_nm, [1, 2, 3])
+
+
+def test_an_unfinished_recording_stays_partial(tmp_path):
+    def interrupted():
+        with new_recording(tmp_path / "a.mcap", "x") as writer:
+            writer.add_torque(1, 1.0)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.partial"]
+    assert read_recording(tmp_path / "a.mcap.partial").torque_nm.tolist() == [1.0]
+
+
+@pytest.mark.parametrize("read", [read_recording, RecordedRun, RecordedTopics])
+def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
+    (tmp_path / "text.mcap").write_text("hello")
+    with (tmp_path / "other.mcap").open("wb") as file:
+        other = Writer(file)
+        other.start()
+        other.finish()
+    # The digest is cached in the table once it is read.
+    for name, owner, key, value in (("stale", PAPER_TABLE, "digest", "0" * 64), ("old", schema, "FORMAT_VERSION", "1")):
+        with monkeypatch.context() as outdated:
+            outdated.setitem(vars(owner), key, value)
+            written(tmp_path / f"{name}.mcap")
+    for name, why in (
+        ("text", r"text\.mcap: this is not an MCAP file"),
+        ("other", "not a recording of shearloop"),
+        ("none", "No such file"),
+        ("stale", "channel table 000000000000…"),
+        ("old", "format version 1, expected 2; record it again, or import it again"),
+    ):
+        with pytest.raises(UserError, match=why):
+            read(tmp_path / f"{name}.mcap")
+
+
+def test_an_unwritable_recording_is_an_error(tmp_path):
+    with pytest.raises(UserError, match="choose another --out"), new_recording(tmp_path / "no" / "where.mcap", "x"):
+        pass
+
+
+def test_a_side_that_no_file_has_is_not_to_be_imported(recording):
+    for side, cure in (("left", "import those files as well"), ("up", "name a side that it has")):
+        with pytest.raises(UserError, match=f"has frames of right, not of {side}; {cure}"):
+            read_series(recording, (side,))
+
+
+def test_a_folder_name_that_is_not_utf8_is_an_error(config):
+    recorded = RecordingConfig(folder=Path(os.fsdecode(b"caf\xe9")))
+    with pytest.raises(
+        UserError, match=r"not UTF-8 \(the folder of the recordings is 'caf\\udce9'\); choose another name"
+    ):
+        daemon_identity(load_daemon_config(config()).model_copy(update={"recording": recorded}))
+
+
+PERIOD_S = 0.5408
+
+
+def test_late_frames_get_the_middle_of_their_acquisition(mat_folder, tmp_path):
+    late = [(20, 0.3), (21, 0.12), (40, 1.4), (41, 0.9), (42, 0.35)]
+    import_mat([mat_folder(late=late)], tmp_path / "a.mcap")
+    frames = read_recording(tmp_path / "a.mcap").sides["right"]
+    expected = (START_DATENUM - 719529) * 86400 + PERIOD_S * (np.arange(60) + 0.5)
+    np.testing.assert_allclose(frames.t_mid_ns / 1e9, expected, rtol=0, atol=0.01)
+
+
+def test_a_load_read_once_per_frame_gets_its_own_period(mat_folder, tmp_path):
+    imported = import_mat([mat_folder(one_loop=True)], tmp_path / "a.mcap")
+    assert "read once per frame" in imported.remarks[0]
+    found = read_recording(tmp_path / "a.mcap")
+    np.testing.assert_allclose(np.diff(found.torque_t_ns) / 1e9, 0.0916, atol=1e-6)
+    assert "read once per frame" in found.notes["remarks"]
+
+
+def test_a_loop_that_waits_for_its_load_gives_the_times_of_both(mat_folder, tmp_path):
+    """A row is stamped, then waits for its frame and for its load value; the load cell begins late."""
+    frame_s, load_s, stamps = 0.8 + PERIOD_S * np.arange(60), 2.6 + 0.0916 * np.arange(60), [0.0]
+    for ends in zip(frame_s[:-1], load_s[:-1], strict=True):
+        stamps.append(max(stamps[-1], *ends))
+    late = list(enumerate(np.array(stamps) - PERIOD_S * np.arange(1, 61)))
+    imported = import_mat([mat_folder(one_loop=True, late=late)], tmp_path / "a.mcap")
+    found = read_recording(tmp_path / "a.mcap")
+    start_ns = found.torque_t_ns[0] - 2.6e9
+    np.testing.assert_allclose((found.torque_t_ns - start_ns) / 1e9, load_s, atol=1e-3)
+    middle_s = (found.sides["right"].t_mid_ns - start_ns) / 1e9
+    assert np.abs(frame_s - PERIOD_S / 2 - middle_s).max() <= PERIOD_S / 2 + 0.01
+    assert "the load's times were moved by 2.33 ± 0.27 s against the frames" in imported.remarks[1]
+    assert LOAD_DOUBT_NOTE not in found.notes
+    import_mat([mat_folder("regular", one_loop=True)], tmp_path / "b.mcap")
+    assert "times may be seconds off" in read_series(tmp_path / "b.mcap")[0].load_doubt
+
+
+def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path):
+    imported = import_mat([mat_folder(glitches=(0, 8))], tmp_path / "a.mcap")
+    found = read_recording(tmp_path / "a.mcap")
+    assert imported.torques == len(found.torque_nm) == 353
+    assert np.abs(found.torque_nm).max() < 0.06
+    assert "2 damaged load values beyond 20 N·m" in imported.remarks[0]
+
+
+def test_the_diameter_in_the_files_names_is_noted(mat_folder, tmp_path):
+    folder = mat_folder()
+    for path in list(folder.iterdir()):
+        path.rename(folder / f"12.5mm_1_{path.name}")
+    import_mat([folder], tmp_path / "a.mcap")
+    (series,) = read_series(tmp_path / "a.mcap")
+    assert (series.diameter_mm == 12.5).all()
+    one = next(folder.glob("*load*"))
+    one.rename(folder / "20mm_1_load.mat")
+    with pytest.raises(UserError, match=r"of cylinders of 12\.5 and 20 mm"):
+        import_mat([folder], tmp_path / "b.mcap")
+
+
+def test_two_sides_are_paired_by_time(mat_folder, tmp_path):
+    import_mat([mat_folder()], tmp_path / "a.mcap")
+    both = series_of(read_recording(tmp_path / "a.mcap"))
+    assert both.sides == ("right", "left")
+    assert both.channels.shape == (60, 2, 896)
+    left = series_of(read_recording(tmp_path / "a.mcap"), ("left",))
+    np.testing.assert_array_equal(left.channels[:, 0], both.channels[:, 1])
+    # Times count from the first right frame; the left ones arrived 0.05 s later.
+    np.testing.assert_allclose(left.t_s, PERIOD_S * np.arange(60) + 0.05, atol=1e-6)
+    np.testing.assert_allclose(both.t_s, PERIOD_S * np.arange(60) + 0.025, atol=1e-6)
+    import_mat([mat_folder("alone", sides=("Left_Data",))], tmp_path / "b.mcap")
+    np.testing.assert_allclose(series_of(read_recording(tmp_path / "b.mcap")).t_s[0], 0.0, atol=1e-9)
+    assert np.isfinite(both.torque_at_frames()[2:55]).all()
+    early, later = part_of(both, 0, 0.25), part_of(both, 0.25, 1)
+    assert (len(early.t_s), len(later.t_s)) == (15, 45)
+    with pytest.raises(UserError, match=r"none of 60 frames lies between the shares 0 and 0\.001"):
+        part_of(both, 0, 0.001)
+
+
+def test_unusable_files_are_refused_by_name(mat_folder, tmp_path):
+    (tmp_path / "empty").mkdir()
+    savemat(tmp_path / "other.mat", {"x": np.zeros((2, 2))})
+    folder = mat_folder()
+    for sources, why in (
+        ([tmp_path / "empty"], r"holds no \.mat files"),
+        ([tmp_path / "other.mat"], r"other\.mat holds x, expected one of Right_Data"),
+        ([folder, folder / "device0.mat"], "second stream of right"),
+        ([folder / "load.mat"], "no frames"),
+    ):
+        with pytest.raises(UserError, match=why):
+            import_mat(sources, tmp_path / "a.mcap")
+    with pytest.raises(UserError, match="without slices"):
+        read_series(tmp_path / "empty")

@@ -1,0 +1,89 @@
+"""What people write in a configuration is answered in its own words: quotes, names, addresses, hosts and paths."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from shearloop.daemon.config import load_daemon_config
+from shearloop.drivers.hosts import why_no_host
+from shearloop.errors import UserError
+
+PORT = "{path: port}"
+
+
+def refusal(folder: Path, text: str) -> str:
+    path = folder / "config.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(UserError) as refused:
+        load_daemon_config(path)
+    return str(refused.value)
+
+
+@pytest.mark.parametrize("written", ["12345670", "8551E10", "012345670", "1e5", ".5", "yes", "no", "on"])
+def test_a_text_without_quotes_is_quoted_as_it_was_written(written, tmp_path):
+    said = refusal(tmp_path, f"load_cell: {{device: {{serial_number: {written}}}}}\n")
+    assert said.startswith(f"{tmp_path}/config.yaml:1: load_cell.device.serial_number: {written} without quotes is ")
+    assert said.endswith(f'put it in quotes: "{written}"')
+
+
+@pytest.mark.parametrize("written", ["no", "on", "True"])
+def test_a_name_without_quotes_is_quoted_as_it_was_written(written, tmp_path):
+    said = refusal(tmp_path, f"fingertips:\n  right: {{device: {PORT}}}\n  {written}: {{device: {PORT}}}\n")
+    assert f"config.yaml:3: fingertips: the key {written} without quotes is " in said
+    assert said.endswith("put it in quotes")
+
+
+@pytest.mark.parametrize(
+    ("written", "hint"), [("Right", "did you mean right?"), ("r t", "did you mean r_t?"), ("1", "")]
+)
+def test_the_form_of_a_name_is_said(written, hint, tmp_path):
+    said = refusal(tmp_path, f'fingertips: {{"{written}": {{device: {PORT}}}}}\n')
+    assert f"{written!r} is no name of a fingertip: a name is a lower-case letter, then up to 31" in said
+    assert said.endswith(hint)
+
+
+@pytest.mark.parametrize("key", ["publish", "commands"])
+@pytest.mark.parametrize(
+    ("address", "part"),
+    [
+        ("tcp://localhost:7761", "names localhost, and a socket is bound to an address: write 127.0.0.1"),
+        (f"ipc:///tmp/{'a' * 120}", "has a path of 125 bytes, and a socket's has at most 107"),
+        (f"ipc:///tmp/{'ä' * 60}", "has a path of 125 bytes"),
+    ],
+)
+def test_an_address_that_cannot_be_bound_is_refused_with_the_cause(key, address, part, tmp_path):
+    said = refusal(tmp_path, f"{key}: {address}\nload_cell: {{device: {PORT}}}\n")
+    assert part in said
+    assert "network" not in said
+
+
+@pytest.mark.parametrize("host", ["192.168.1.300", "192.168.1", "1.2.3.4.5", "", " ", "a..b"])
+def test_a_host_that_is_no_address_is_refused_everywhere(host, tmp_path):
+    assert why_no_host(host)
+    gripper = {"gripper": {"socket": {"host": host}}, "robot": "ur.yaml", "load_cell": {"device": {"path": "port"}}}
+    assert "gripper.socket.host: " in refusal(tmp_path, yaml.safe_dump(gripper))
+
+
+@pytest.mark.parametrize("host", ["192.168.1.30", "robot", "robot-2.lab.example", "3com", "10.0.0.1", "::1"])
+def test_names_and_addresses_are_hosts(host):
+    assert why_no_host(host) == ""
+
+
+def test_check_names_paths_that_are_no_ports_and_no_folders(tmp_path, ran):
+    (tmp_path / "file").touch()
+    devices = {"right": "/dev/null", "left": str(tmp_path / "file"), "third": str(tmp_path)}
+    content = {
+        "fingertips": {name: {"device": {"path": path}, "calibration": "a.cal"} for name, path in devices.items()},
+        "recording": {"folder": str(tmp_path / "file" / "recordings")},
+    }
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    said = ran("check", path, status=2).err
+    for part in (
+        "`fingertips.right.device.path: /dev/null` is no serial port",
+        f"`fingertips.left.device.path: {tmp_path}/file` is a file",
+        f"`fingertips.third.device.path: {tmp_path}` is a folder",
+        f"`recording.folder: {tmp_path}/file/recordings`: {tmp_path}/file is a file; name a folder",
+    ):
+        assert part in said

@@ -1,0 +1,203 @@
+"""Experiments that a request names: bounded in place, kind, size and time, and read beside the event loop."""
+
+import asyncio
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+
+from shearloop.cli import command, main
+from shearloop.daemon import experiment_files
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.experiment_files import ExperimentFiles
+from shearloop.daemon.rig import Rig
+from shearloop.errors import UserError
+from tests.fixtures.daemons import deadline
+
+SECRET = "host:5432:lab:ada:hunter2"  # noqa: S105 - the content that no reply may have
+VALID = {"name": "one", "steps": [{"do": "wait", "wait_s": 1}]}
+
+
+def write(path: Path, content: object) -> Path:
+    path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    (tmp_path / "experiments").mkdir()
+    return tmp_path / "experiments"
+
+
+async def refusal(folder: Path, path: Path) -> str:
+    async with deadline("the file was not refused"):
+        with pytest.raises(UserError) as refused:
+            await ExperimentFiles((folder,)).read(path)
+    return str(refused.value)
+
+
+async def test_an_experiment_in_a_folder_or_below_it_is_read_once(folder):
+    (folder / "more").mkdir()
+    path = write(folder / "more" / "one.yaml", VALID)
+    found = await ExperimentFiles((folder,)).read(path)
+    assert (found.file.name, found.data) == ("one", path.read_bytes())
+
+
+def linked(folder: Path) -> Path:
+    (folder / "link.yaml").symlink_to(write(folder.parent / "secret", SECRET))
+    return folder / "link.yaml"
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        lambda folder: write(folder.parent / "secret", SECRET),
+        lambda folder: folder / ".." / write(folder.parent / "secret", SECRET).name,
+        linked,
+        lambda _: Path("/etc/shadow"),
+        lambda _: Path("/proc/kmsg"),
+        lambda _: Path("one.yaml"),
+    ],
+)
+async def test_a_file_elsewhere_is_not_read(place: Callable[[Path], Path], folder, monkeypatch):
+    monkeypatch.setattr(experiment_files, "read_file", lambda *_: pytest.fail("it is read"))
+    assert "is in none of the folders of experiments" in await refusal(folder, place(folder))
+
+
+def fifo(folder: Path) -> Path:
+    os.mkfifo(folder / "pipe")
+    return folder / "pipe"
+
+
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [
+        (lambda folder: folder / "none.yaml", "No such file"),
+        (lambda folder: folder, "Is a directory"),
+        (fifo, "it is a device or a pipe"),
+        (lambda folder: write(folder / "large.yaml", "#" * 200_000), "it is larger than 128 kB"),
+        (lambda folder: folder / ("x" * 300), "File name too long"),
+        (lambda folder: folder / "a\0b", "null"),
+    ],
+)
+async def test_what_is_no_small_file_is_refused(place, why, folder):
+    assert why in await refusal(folder, place(folder))
+
+
+@pytest.mark.parametrize("path", ["/dev/zero", "/proc/kmsg", "/proc/self/environ"])
+async def test_files_without_an_end_are_refused_also_in_a_configured_folder(path):
+    assert path in await refusal(Path("/"), Path(path))
+
+
+@pytest.mark.parametrize(
+    "text", [SECRET, f"name: {SECRET}\n", f"{SECRET!r}: 1\n", f"steps: [{{do: {SECRET!r}}}]", f"\t{SECRET}", "*hunter2"]
+)
+async def test_a_reply_has_no_content_of_a_file(text, folder, log):
+    said = await refusal(folder, write(folder / "one.yaml", text))
+    assert said == f"{folder}/one.yaml is not a valid experiment; the daemon's log names each mistake"
+    assert log.said == ["the experiment is not valid"]
+
+
+async def test_the_event_loop_goes_on_while_a_large_file_is_read(folder):
+    steps = [{"do": "wait", "wait_s": number % 7 + 0.5} for number in range(1500)]
+    files, beats = ExperimentFiles((folder,)), 0
+    reading = asyncio.create_task(files.read(write(folder / "large.yaml", {**VALID, "steps": steps})))
+    while not reading.done():
+        await asyncio.sleep(0)
+        beats += 1
+    assert len(reading.result().file.steps) == 1500
+    assert beats > 10
+
+
+@pytest.fixture
+def slow_drive(monkeypatch):
+    """Lets no file be read until the event is set."""
+    answers = threading.Event()
+    read = experiment_files.read_file
+
+    def wait(path: Path, most_bytes: int) -> bytes:
+        answers.wait()
+        return read(path, most_bytes)
+
+    monkeypatch.setattr(experiment_files, "read_file", wait)
+    yield answers
+    answers.set()
+
+
+async def test_a_drive_that_does_not_answer_ends_the_start_and_keeps_one_thread(folder, slow_drive, monkeypatch):
+    monkeypatch.setattr(experiment_files, "READ_WITHIN_S", 0.05)
+    files, path = ExperimentFiles((folder,)), write(folder / "one.yaml", VALID)
+    with pytest.raises(UserError, match=r"was not read within 0\.05 s"):
+        await files.read(path)
+    for _ in range(16):
+        with pytest.raises(UserError, match="the file of another start is being read"):
+            await files.read(path)
+    slow_drive.set()
+    async with deadline("the next start was not read"):
+        while True:
+            try:
+                assert (await files.read(path)).file.name == "one"
+            except UserError:
+                await asyncio.sleep(0.01)
+            else:
+                break
+
+
+class Runner:
+    """Knows why nothing can start, and counts stops; keeps what was started with how many stops before it."""
+
+    def __init__(self, refusal: str | None = None) -> None:
+        self.refusal = refusal
+        self.stop_count = 0
+        self.started: list[tuple[str, int]] = []
+
+    def start_refusal(self) -> str | None:
+        return self.refusal
+
+    async def start(self, file: Any, stops_before: int) -> None:
+        self.started.append((file.name, stops_before))
+
+
+def rig(folder: Path, runner: Runner) -> Rig:
+    return Rig(SimpleNamespace(), runner, {}, ExperimentFiles((folder,)), None)
+
+
+async def test_no_file_is_read_while_none_can_start(folder, monkeypatch):
+    monkeypatch.setattr(experiment_files, "read_file", lambda *_: pytest.fail("it is read"))
+    path = write(folder / "one.yaml", VALID)
+    assert await rig(folder, Runner("the experiment 'two' is still running")).start(path) is not None
+
+
+async def test_a_stop_while_the_file_is_read_counts_for_the_start(folder, slow_drive):
+    runner = Runner()
+    starting = asyncio.create_task(rig(folder, runner).start(write(folder / "one.yaml", VALID)))
+    await asyncio.sleep(0)
+    runner.stop_count += 1
+    slow_drive.set()
+    await starting
+    assert runner.started == [("one", 0)]
+
+
+def test_the_folder_of_the_configuration_is_the_default(tmp_path):
+    content = {"fingertips": {"right": {"device": {"path": "a"}}}, "robot": "ur.yaml"}
+    for more, folders in (
+        ({}, ["."]),
+        ({"experiments": ["one", "/two"]}, ["one", "/two"]),
+        ({"experiment": "three/tighten.yaml"}, [".", "three"]),
+    ):
+        config = load_daemon_config(write(tmp_path / "rig.yaml", {**content, **more}))
+        assert config.experiment_folders == tuple(tmp_path / folder for folder in folders)
+
+
+def test_the_mistakes_are_shown_to_the_person_whose_file_it_is(tmp_path, monkeypatch, capsys):
+    reply = {"ok": False, "reason": "one.yaml is not a valid experiment", "invalid": True}
+    monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", lambda *_: reply)
+    path = write(tmp_path / "one.yaml", {**VALID, "speed": 3})
+    assert main(["command", "start", "--experiment", str(path)]) == 1
+    assert "one.yaml:2: speed: is not a known key" in capsys.readouterr().err
+    assert command._mistakes(tmp_path / "elsewhere.yaml").startswith(str(tmp_path))

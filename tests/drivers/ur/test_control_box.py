@@ -1,0 +1,157 @@
+"""Closed ports, the dashboard's own words, and the names of modes."""
+
+import asyncio
+import json
+import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.control_box import (
+    SERVICES,
+    check_ports,
+    closed_ports_sentence,
+    command_dashboard,
+    probe_controller,
+    probe_ports,
+    query_controller,
+)
+from shearloop.drivers.ur.messages import ROBOT_MODES, RUNTIME_STATES, SAFETY_MODES, RobotLostError, Unlock
+from shearloop.drivers.ur.motion import why_unfit
+from shearloop.emulators.ur_controller import Controller
+from shearloop.emulators.ur_robot import Robot
+from tests.drivers.ur.flight import AT_REST, SETTINGS, flying
+from tests.emulator_process import own_address
+
+HOST = own_address(7)
+TIMEOUT_S = 2.0
+MENU = "Settings → Security → Services"
+
+
+@asynccontextmanager
+async def serving(robot: Robot | None = None, closed_ports: tuple[int, ...] = ()) -> AsyncIterator[Controller]:
+    """Serve a robot, and close its ports only when no connection is being accepted any more."""
+    controller = Controller(robot or Robot(), host=HOST, closed_ports=closed_ports)
+    async with controller.open():
+        yield controller
+        await asyncio.sleep(0)
+        while left := asyncio.all_tasks() - {asyncio.current_task()}:
+            await asyncio.wait(left)
+
+
+@pytest.mark.parametrize("port", list(SERVICES))
+@pytest.mark.parametrize("version", [(5, 12, 0, 0), (5, 4, 0, 0), (3, 15, 0, 0)])
+async def test_a_closed_port_is_named_with_the_menu_that_opens_it(port, version):
+    robot = Robot()
+    robot.change(replace(robot.spec, version=version))
+    async with serving(robot, closed_ports=(port,)):
+        found = await asyncio.to_thread(probe_ports, HOST, TIMEOUT_S)
+        with pytest.raises(RobotLostError) as refused:
+            await asyncio.to_thread(check_ports, HOST, TIMEOUT_S)
+    assert {one for one, reason in found.items() if reason} == {port}
+    assert found[port] == "Connection refused"
+    said = str(refused.value)
+    assert f"does not serve port {port} ({SERVICES[port]})" in said
+    assert (f"enable {SERVICES[port]} under {MENU}" in said) == (version >= (5, 10))
+    assert ("has no menu for them" in said) == (version < (5, 10))
+    assert ("a CB3" in said) == (version[0] == 3)
+    assert "; " in said, "a cure of its own"
+
+
+async def test_every_way_to_a_closed_port_names_it():
+    async with serving(closed_ports=(29999,)):
+        for ask in (query_controller, lambda *args: command_dashboard(*args, ("power on",))):
+            with pytest.raises(RobotLostError, match=rf"29999 \(Dashboard Server\).*{MENU}"):
+                await asyncio.to_thread(ask, HOST, TIMEOUT_S)
+    async with serving(closed_ports=(30004,)):
+        with pytest.raises(RobotLostError, match=rf"30004 \(RTDE\).*{MENU}"):
+            await asyncio.to_thread(probe_controller, HOST, TIMEOUT_S)
+
+
+async def test_a_controller_that_serves_all_or_none_of_its_ports():
+    async with serving():
+        await asyncio.to_thread(check_ports, HOST, TIMEOUT_S)
+    await asyncio.to_thread(check_ports, HOST, TIMEOUT_S)
+    with pytest.raises(RobotLostError, match=f"switched on.*{MENU}"):
+        await asyncio.to_thread(probe_controller, HOST, TIMEOUT_S)
+
+
+def test_several_closed_ports_are_told_together():
+    said = closed_ports_sentence("arm", [30004, 29999], ())
+    assert "30004 (RTDE) and 29999 (Dashboard Server)" in said
+    assert f"enable RTDE and Dashboard Server under {MENU}" in said
+    assert "CB3" in said
+
+
+@pytest.mark.parametrize("request_", ["power on", "brake release", "unlock protective stop", "stop", "close popup"])
+async def test_local_control_is_told_at_once_in_the_controllers_own_words(request_):
+    async with serving() as controller:
+        controller.command("local-control")
+        with pytest.raises(DriverError) as refused:
+            await asyncio.to_thread(command_dashboard, HOST, TIMEOUT_S, (request_,))
+    assert "in local control: switch it to remote control" in str(refused.value)
+    assert "Settings → System → Remote Control" in str(refused.value)
+    assert f"Command is not allowed: the robot is in local control ({request_})" in str(refused.value)
+
+
+async def test_what_is_carried_out_says_nothing_and_a_refused_necessity_says_why():
+    robot = Robot()
+    async with serving(robot):
+        for requests in (("close popup", "close safety popup"), ("stop",), ("power on",), ("brake release",)):
+            assert await asyncio.to_thread(command_dashboard, HOST, TIMEOUT_S, requests) == ""
+        robot.protective_stop("a test")
+        with pytest.raises(DriverError, match="“Cannot unlock protective stop until 5s") as refused:
+            await asyncio.to_thread(command_dashboard, HOST, TIMEOUT_S, ("unlock protective stop",))
+    assert "local control" not in str(refused.value)
+
+
+def test_a_refused_request_ends_the_recovery_at_once_with_its_words():
+    flight = flying()
+    flight.arm.be(robot_mode=3, runtime_state=1)
+    flight.arm.refuses["power on"] = "The controller answered “not now” to `power on`: look at the teach pendant."
+    since_ns = flight.now_ns
+    assert flight.ask(Unlock()).refusal == flight.arm.refuses["power on"]
+    assert flight.now_ns - since_ns < 1e9
+
+
+def test_a_recovery_that_times_out_names_the_modes_and_quotes_the_last_refusal(monkeypatch):
+    flight = flying()
+    flight.arm.be(robot_mode=3, runtime_state=4)
+    flight.arm.ignores["close popup"] = "The controller answered “no popup” to `close popup`"
+    monkeypatch.setattr(flight.arm, "ask_dashboard", lambda *requests: flight.arm.ignores.get(requests[0], ""))
+    refusal = flight.ask(Unlock()).refusal
+    assert "robot mode: power off, safety mode: normal, program: paused" in refusal
+    assert "“no popup” to `close popup`" in refusal
+
+
+@pytest.mark.parametrize("mode", [*range(1, 14), -1, 99])
+def test_every_safety_mode_has_its_words(mode):
+    sample = replace(AT_REST, safety_mode=mode)
+    why = why_unfit(sample, SETTINGS)
+    assert (why == "") == (mode in (1, 2))
+    if mode in SAFETY_MODES:
+        assert not re.search(r"\d+\.|mode \d", why)
+        assert sample.safety_mode_name == SAFETY_MODES[mode]
+    else:
+        assert f"unknown mode {mode}" in why
+
+
+@pytest.mark.parametrize("mode", [*range(-1, 9), 99])
+def test_every_robot_mode_has_its_words(mode):
+    sample = replace(AT_REST, robot_mode=mode)
+    assert ROBOT_MODES.get(mode, f"unknown mode {mode}") == sample.robot_mode_name
+    assert (sample.robot_mode_name in why_unfit(sample, SETTINGS)) == (mode != 7)
+
+
+def test_the_tables_are_complete_and_the_page_has_the_same_words():
+    assert (set(ROBOT_MODES), set(SAFETY_MODES)) == ({*range(-1, 9)}, {*range(1, 14)})
+    assert set(RUNTIME_STATES) == {*range(6)}
+    text = (Path(__file__).parents[3] / "daemon/web/assets/panels.js").read_text()
+    for name, expected in (("ROBOT_MODES", ROBOT_MODES), ("SAFETY_MODES", SAFETY_MODES)):
+        (table,) = re.findall(rf"const {name} = ({{.*?}});", text)
+        shown = json.loads(re.sub(r"(?<=[{ ])(\d+):", r'"\1":', table))
+        assert {int(mode): words for mode, words in shown.items()} == expected

@@ -1,0 +1,136 @@
+"""RTDE bytes in and out of the emulated controller."""
+
+import asyncio
+import struct
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shearloop.emulators import ur_controller
+from shearloop.emulators.ur_robot import Robot
+from shearloop.emulators.ur_rtde import RtdeSession, pack, package, unpack, variable
+from tests.slices import slices
+
+GREETING = package(ord("V"), b"\x00\x02") + package(ord("v"), b"")
+COMMAND = b"input_int_register_0,input_double_register_0,"
+CONVERSATION = (
+    GREETING
+    + package(ord("O"), struct.pack(">d", 125.0) + b"timestamp,actual_q,safety_mode,")
+    + package(ord("I"), COMMAND)
+    + package(ord("S"), b"")
+    + package(ord("U"), struct.pack(">Bid", 1, 9, 0.25))
+)
+
+
+def session() -> RtdeSession:
+    return RtdeSession(Robot(), 500.0, set())
+
+
+def replies(data: bytes) -> list[tuple[int, bytes]]:
+    found = []
+    while data:
+        size, kind = struct.unpack_from(">HB", data)
+        found.append((kind, data[3:size]))
+        data = data[size:]
+    return found
+
+
+def test_conversation_of_a_client():
+    rtde = session()
+    assert replies(rtde.receive(CONVERSATION)) == [
+        (ord("V"), b"\x01"),
+        (ord("v"), struct.pack(">4I", 5, 17, 3, 0)),
+        (ord("O"), b"\x01DOUBLE,VECTOR6D,INT32"),
+        (ord("I"), b"\x01INT32,DOUBLE"),
+        (ord("S"), b"\x01"),
+    ]
+    assert rtde.robot.registers["input_int_register_0"] == 9
+    assert rtde.robot.registers["input_double_register_0"] == 0.25
+    ((kind, data),) = replies(rtde.data())
+    assert kind == ord("U")
+    assert data[:1] == b"\x01"
+    timestamp_s, *_q, safety_mode = struct.unpack(">d6di", data[1:])
+    assert (timestamp_s, safety_mode) == (0.0, 1)
+
+
+@given(st.lists(st.integers(0, len(CONVERSATION)), max_size=20))
+def test_bytes_may_arrive_in_any_pieces(cuts):
+    whole, pieces = session(), session()
+    answer = whole.receive(CONVERSATION)
+    got = b"".join(pieces.receive(part) for part in slices(CONVERSATION, cuts))
+    assert got == answer
+    assert pieces.robot.registers["input_double_register_0"] == 0.25
+
+
+def test_data_comes_at_the_rate_asked_for_and_not_before_the_start():
+    rtde = session()
+    rtde.receive(GREETING + package(ord("O"), struct.pack(">d", 125.0) + b"timestamp"))
+    packages = 0
+    for _ in range(100):
+        rtde.robot.step(0.002)
+        packages += bool(rtde.data())
+    assert packages == 0
+    rtde.receive(package(ord("S"), b""))
+    for _ in range(500):
+        rtde.robot.step(0.002)
+        packages += bool(rtde.data())
+    # One at once, then one every 8 ms.
+    assert packages == 126
+
+
+def test_registers_in_use_and_unknown_variables_are_refused_by_name():
+    rtde = RtdeSession(Robot(), 500.0, {"registers-in-use"})
+    ((_, answer),) = replies(rtde.receive(package(ord("I"), COMMAND)))
+    assert answer == b"\x00IN_USE,IN_USE"
+    ((_, answer),) = replies(rtde.receive(package(ord("O"), struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench")))
+    assert answer == b"\x00DOUBLE,NOT_FOUND"
+
+
+def test_reported_tool_speed_is_the_change_of_the_pose():
+    robot = Robot()
+    robot.arm.turn(np.array([0.2, -0.1, 0.3, 0.1, -0.2, 0.4]), 100.0)
+    robot.arm.advance(0.1)
+    before, speed = np.array(variable(robot, "actual_TCP_pose")), np.array(variable(robot, "actual_TCP_speed"))
+    robot.arm.advance(1e-5)
+    change = (np.array(variable(robot, "actual_TCP_pose")) - before)[:3] / 1e-5
+    assert speed[:3] == pytest.approx(change, abs=1e-4)
+    assert np.linalg.norm(speed[:3]) > 0.1
+
+
+def test_short_vector_is_dropped():
+    rtde = session()
+    rtde.receive(CONVERSATION)
+    rtde.receive(package(ord("U"), struct.pack(">Bi", 1, 11)))
+    assert rtde.robot.registers["input_int_register_0"] == 9
+
+
+@given(st.lists(st.floats(allow_nan=False), min_size=7, max_size=7), st.integers(-(2**31), 2**31 - 1))
+def test_values_survive_the_wire(numbers, integer):
+    kinds = ["VECTOR6D", "INT32", "DOUBLE"]
+    data = pack(kinds, [numbers[:6], integer, numbers[6]])
+    assert unpack(kinds, data) == [*numbers[:6], integer, numbers[6]]
+    assert unpack(kinds, data[:-1]) is None
+
+
+async def test_clock_runs_on_while_the_emulator_is_paused(monkeypatch):
+    """Samples carry the present time; the robot's time, which the watchdog uses, stands still."""
+    robot, now_s, pauses_s = Robot(), 50.0, iter([0.002, 0.3, 0.002])
+
+    async def sleep(_seconds: float) -> None:
+        nonlocal now_s
+        try:
+            now_s += next(pauses_s)
+        except StopIteration:
+            raise asyncio.CancelledError from None
+
+    monkeypatch.setattr(ur_controller, "time", SimpleNamespace(monotonic=lambda: now_s))
+    controller = ur_controller.Controller(robot, rate_hz=500.0)
+    monkeypatch.setattr(ur_controller, "asyncio", SimpleNamespace(sleep=sleep))
+    with pytest.raises(asyncio.CancelledError):
+        async for _ in controller.run():
+            pass
+    assert variable(robot, "timestamp") == pytest.approx(0.304, abs=0.004)
+    assert robot.time_s == pytest.approx(0.024, abs=0.004)

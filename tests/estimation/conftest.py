@@ -1,0 +1,168 @@
+"""A rig that is played by formulas: fingertips with a pattern of their own, a gel that creeps, a one-sided lever."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.bank_file import Bank, BankDefinition, write_bank
+from shearloop.bank.channels import PAPER_TABLE
+from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame, fit
+
+PERIOD_S = 0.54
+IDLE_S, CYCLE_S = 20.0, 30.0
+CREEP_S = 4.0
+
+
+@dataclass(frozen=True)
+class Tip:
+    """A fingertip's idle voltages, and how grip, twist and drift change them."""
+
+    idle: FloatArray
+    grip: FloatArray
+    twist: FloatArray
+    touch: FloatArray
+    drift: FloatArray
+
+
+def tip(number: int) -> Tip:
+    rng = np.random.default_rng(1000 + number)
+    idle = rng.uniform(0.05, 0.5, PAPER_TABLE.n_channels)
+    return Tip(idle, *(idle * rng.normal(0, scale, PAPER_TABLE.n_channels) for scale in (0.06, 0.04, 0.02, 0.01)))
+
+
+def twisting(
+    cycles: int = 4, tips: tuple[int, ...] = (1, 2), seed: int = 0, peak_nm: float = 0.06, noise_v: float = 0.001
+) -> FrameSeries:
+    """Return idle, gripped and twisted `cycles` times, and idle again; torque is there for a short part of a cycle."""
+    rng = np.random.default_rng(seed)
+    gripped_s = cycles * CYCLE_S
+    t = np.arange(0.0, 2 * IDLE_S + gripped_s, PERIOD_S)
+    fine = np.arange(-PERIOD_S, t[-1] + PERIOD_S, 0.09)
+
+    def angle(at: FloatArray) -> FloatArray:
+        within = (at > IDLE_S) & (at < IDLE_S + gripped_s)
+        return np.where(within, 0.5 - 0.5 * np.cos(2 * np.pi * (at - IDLE_S) / CYCLE_S), 0.0)
+
+    cycle = np.clip((fine - IDLE_S) // CYCLE_S, 0, cycles - 1)
+    torque = np.maximum(angle(fine) - 0.9, 0.0) / 0.1 * peak_nm * (1 + 0.03 * cycle)
+    follows = 0.09 / CREEP_S
+    crept = lfilter([follows], [1.0, follows - 1.0], angle(fine))
+    grip = ((t > IDLE_S) & (t < IDLE_S + gripped_s)).astype(float)
+    at = {name: np.interp(t, fine, values) for name, values in (("torque", torque), ("crept", crept))}
+    slow = np.cumsum(rng.normal(0, 0.02, len(t)))
+    layers = []
+    for number in tips:
+        one = tip(number)
+        clean = (
+            one.idle
+            + grip[:, None] * one.grip
+            + at["crept"][:, None] * one.twist
+            + (at["torque"] / 0.06)[:, None] * one.touch
+            + slow[:, None] * one.drift * 0.1
+        )
+        layers.append(clean + rng.normal(0, noise_v, clean.shape))
+    sides = ("right", "left")[: len(tips)]
+    channels = np.stack(layers, axis=1)
+    return FrameSeries("raw", sides, t, channels, fine, torque, np.full(len(t), np.nan))
+
+
+def sliced(n_repeats: int = 5, seed: int = 0, noise_v: float = 0.0008) -> FrameSeries:
+    """Return |differences| of ten rising torques, repeated, with a drift that grows from repeat to repeat."""
+    rng = np.random.default_rng(seed)
+    shape = np.random.default_rng(77)
+    base, slope, bend, drift = (
+        np.abs(shape.normal(0, scale, PAPER_TABLE.n_channels)) for scale in (6e-3, 1e-3, 2e-4, 6e-4)
+    )
+    torque = np.tile(np.linspace(0.01, 0.14, 10), n_repeats) + rng.normal(0, 0.002, 10 * n_repeats)
+    z = (torque - 0.075) / 0.04
+    wandering = np.linspace(0, 1, len(torque)) + rng.normal(0, 0.1, len(torque))
+    frames = base + z[:, None] * slope + (z**2)[:, None] * bend + wandering[:, None] * drift
+    return slices_of(frames + rng.normal(0, noise_v, frames.shape), torque)
+
+
+def slices_of(frames: FloatArray, torque: FloatArray) -> FrameSeries:
+    """Return the magnitudes of (n, 896) differences as slices of one fingertip, one a second."""
+    t = np.arange(len(torque), dtype=float)
+    return FrameSeries("difference", ("right",), t, np.abs(frames)[:, None], t, torque, np.full(len(t), np.nan))
+
+
+def kept(whole: FrameSeries, rows: BoolArray) -> FrameSeries:
+    """Return the frames of a series that are not lost."""
+    return replace(whole, t_s=whole.t_s[rows], channels=whole.channels[rows], diameter_mm=whole.diameter_mm[rows])
+
+
+def mixed(own: FrameSeries, share: float) -> FrameSeries:
+    """Return slices mixed with a share of a foreign one."""
+    foreign = own.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(PAPER_TABLE.n_channels)]
+    return replace(own, channels=(1 - share) * own.channels + share * foreign)
+
+
+class Judged(NamedTuple):
+    """Valid torques of known truth: how many, correlation, error in N·m, share within intervals, median width."""
+
+    n: int
+    r: float
+    rmse: float
+    coverage: float
+    width: float
+
+
+def judged(estimates: list[Estimate], played: FrameSeries) -> Judged:
+    """Return how estimates compare with the truth."""
+    rows = [
+        (one.torque_nm, one.torque_low_nm, one.torque_high_nm, truth)
+        for one, truth in zip(estimates, played.torque_at_frames(), strict=True)
+        if one.valid and np.isfinite(truth)
+    ]
+    if not rows:
+        return Judged(0, np.nan, np.nan, 1.0, np.nan)
+    value, low, high, truth = np.array(rows, dtype=np.float64).T
+    inside = (low <= truth) & (truth <= high)
+    r, rmse = np.corrcoef(value, truth)[0, 1], np.sqrt(((value - truth) ** 2).mean())
+    return Judged(len(rows), r, rmse, inside.mean(), float(np.median(high - low)))
+
+
+def follow(
+    calibration: Calibration | EstimatorSession, played: FrameSeries, usable: BoolArray | bool = True
+) -> list[Estimate]:
+    """Return the estimates of a session; `usable` is of each (m, 896) frame, or of all (n, m, 896)."""
+    session = calibration if isinstance(calibration, EstimatorSession) else EstimatorSession(calibration)
+    masks = np.broadcast_to(usable, played.channels.shape)
+    frames = zip(played.t_s, played.channels, masks, strict=True)
+    return [session.estimate(TactileFrame.of(float(t), *each)) for t, *each in frames]
+
+
+@pytest.fixture(scope="session")
+def recorded() -> FrameSeries:
+    """One recording that tests share."""
+    return twisting()
+
+
+@pytest.fixture(scope="session")
+def motion_calibration(recorded) -> Calibration:
+    """An estimator calibrated on the shared recording."""
+    return fit("motion_regression", [recorded], "rig")
+
+
+@pytest.fixture(scope="session")
+def sliced_calibration() -> Calibration:
+    """An estimator calibrated on fifty slices."""
+    return fit("motion_regression", [sliced()], "all")
+
+
+@pytest.fixture(scope="session")
+def bank(tmp_path_factory) -> Bank:
+    """Signals that move smoothly along the channels with k and widen with sigma."""
+    k, sigma = np.linspace(1, 3, 21), np.linspace(0.5, 2, 16)
+    channel = np.linspace(0, 4, 896)
+    signals = np.exp(-0.5 * ((channel - k[:, None, None]) / (0.3 * sigma[None, :, None])) ** 2)
+    path = tmp_path_factory.mktemp("bank") / "smooth.bank"
+    shape = (21, 16)
+    homogeneous = np.random.default_rng(0).normal(size=896)
+    definition = BankDefinition("ab" * 32, "gaussian_derivative", k, sigma)
+    write_bank(path, definition, homogeneous, np.ones(shape), np.ones(shape, bool), signals.astype(np.float32))
+    return Bank.open(path)

@@ -1,0 +1,156 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.gain import PRIOR_SPREAD, GainSpread, ToolLaw, find_twists, gains_of_recordings, loaded_gain
+from shearloop.estimation.interval_regressor import CensoredRidge, Ridge, fit_interval_regressor
+
+TWISTS = np.tile([0.0, 0.0, 0.0, 0.03, 0.05, 0.04, 0.0, 0.0], 10)
+
+
+def twisted(gains, seed):
+    """Return (n, 2) features of two fingertips whose torques are these factors too small, and (n,) torques."""
+    rng = np.random.default_rng(seed)
+    features = TWISTS[:, None] / gains + rng.normal(0.0, 0.001, (len(TWISTS), 2))
+    return features, TWISTS
+
+
+def calibrated():
+    numbers = np.zeros(len(TWISTS), dtype=int)
+    return fit_interval_regressor(
+        *twisted([1.0, 1.0], 0), Ridge.fit, strengths=(1e-6,), recordings=numbers, fingertips=2
+    )
+
+
+def rmse(regressor, features, torque_nm):
+    return float(
+        np.sqrt(np.mean([(regressor.predict(x)[0] - y) ** 2 for x, y in zip(features, torque_nm, strict=True)]))
+    )
+
+
+def test_intervals_grow_with_the_load_alone():
+    regressor = calibrated()
+    free, loaded = regressor.predict(np.zeros(2)), regressor.predict(np.full(2, 0.05))
+    factor = math.exp(1.96 * PRIOR_SPREAD / math.sqrt(2))
+    assert loaded[1] == pytest.approx(0.05 * (1 - 1 / factor), rel=0.1)
+    assert loaded[2] == pytest.approx(0.05 * (factor - 1), rel=0.1)
+    assert max(free[1:]) < 0.1 * loaded[1]
+
+
+@pytest.mark.parametrize(("gains", "bounds"), [([1.0] * 6, (0.0, 0.7)), ([0.4, 2.5] * 3, (1.5, 6.0))])
+def test_the_spread_is_learned_from_recordings(gains, bounds):
+    low, high = (bound * PRIOR_SPREAD for bound in bounds)
+    zero = np.zeros(0)
+    assert low <= GainSpread.fit(zero, zero, gains, 1).between <= high
+
+
+@pytest.mark.parametrize("gain", [0.6, 1.0, 1.5])
+def test_one_twist_corrects_the_gain_and_narrows_the_interval(gain):
+    before = calibrated()
+    features, torque_nm = twisted([gain, gain], 1)
+    after, correction = before.adapt(features[:8], torque_nm[:8], np.array([0, 1]))
+    assert rmse(after, features, torque_nm) < max(0.3 * rmse(before, features, torque_nm), 0.0015)
+    assert correction.twists == 1
+    assert after.gain.between < 0.5 * before.gain.between
+    assert after.predict(features[4])[1] < before.predict(features[4])[1]
+
+
+def test_each_fingertip_has_its_own_gain():
+    before = calibrated()
+    rng = np.random.default_rng(3)
+    shares = rng.uniform(0.0, 2.0, 80)
+    features = np.column_stack([shares * TWISTS / 1.3, (2 - shares) * TWISTS / 0.8])
+    _, correction = before.adapt(features, TWISTS, np.array([0, 1]))
+    np.testing.assert_allclose(correction.factors, [1.3, 0.8], atol=0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_intervals_grow_with_the_gain_where_twists_go_both_ways(seed):
+    rng = np.random.default_rng(seed)
+    torque_nm = np.concatenate([TWISTS[:16], -TWISTS[:16]])
+    share = rng.uniform(0.5, 1.5, len(torque_nm))
+    features = np.column_stack([share, 2 - share]) * torque_nm[:, None] / 1.5 + rng.normal(0, 0.001, (32, 2))
+    before = calibrated()
+    after, _ = before.adapt(features, torque_nm, np.array([0, 1]))
+    assert after.intervals.half_widths / before.intervals.half_widths == pytest.approx(1.5, rel=0.05)
+
+
+def test_twists_that_disagree_correct_little():
+    """A correction is right on average only as far as the twists of one recording agree."""
+    spread = GainSpread(between=0.3, within=0.05, noise_nm=0.001)
+    parts, twists = TWISTS[:8, None] / 1.5, find_twists(TWISTS[:8])
+    factors = [
+        float(replace(spread, within=within).correct(parts, TWISTS[:8], twists, bounded=False).factors[0])
+        for within in (0.05, 0.3, 1.0)
+    ]
+    assert factors[0] > 1.4 > factors[1] > factors[2] > 1.0
+    assert factors[2] < 1.05
+
+
+def test_corrections_lower_the_error_in_expectation():
+    """Over gains drawn from the prior, and twists that scatter as much, the corrected gain is nearer than 1 is."""
+    rng, spread = np.random.default_rng(5), GainSpread(between=0.3, within=0.3, noise_nm=0.003)
+    before, after = [], []
+    for _ in range(400):
+        gain, scatter = np.exp(0.3 * rng.normal()), np.exp(0.3 * rng.normal(size=2))
+        parts = TWISTS[:8, None] / (gain * scatter[0]) + rng.normal(0.0, 0.003, (8, 1))
+        factor = spread.correct(parts, TWISTS[:8], find_twists(TWISTS[:8]), bounded=False).factors[0]
+        later = 1.0 / (gain * scatter[1])
+        before.append((later - 1) ** 2)
+        after.append((factor * later - 1) ** 2)
+    assert np.mean(after) < 0.9 * np.mean(before)
+
+
+def test_bounds_that_do_not_bind_count_for_nothing():
+    """A lever that does not touch reads 0 however far the gel has turned away from it."""
+    features = (TWISTS - np.where(TWISTS > 0, 0.0, 0.04))[:, None] + np.random.default_rng(0).normal(0, 5e-4, (80, 1))
+    regressor = fit_interval_regressor(
+        features, TWISTS, CensoredRidge.fit, strengths=(1e-6,), recordings=np.zeros(80, dtype=int)
+    )
+    _, correction = regressor.adapt(features[:16] / 1.4, TWISTS[:16], np.array([0]))
+    assert correction.factors[0] == pytest.approx(1.4, abs=0.06)
+
+
+def test_loads_too_small_to_show_a_gain_are_refused():
+    features, torque_nm = twisted([1.0, 1.0], 1)
+    with pytest.raises(CalibrationError, match=r"no twist reaches 0\.005 N·m"):
+        calibrated().adapt(features, 0.05 * torque_nm, np.array([0, 1]))
+
+
+def test_the_gain_of_a_missed_load_is_bounded():
+    assert loaded_gain(np.zeros(80), TWISTS) == 5.0
+    assert loaded_gain(-TWISTS, TWISTS) == 0.2
+    assert loaded_gain(TWISTS / 1.5, TWISTS) == pytest.approx(1.5)
+
+
+def test_a_law_over_tools_predicts_those_left_out_and_says_how_far_it_is_off():
+    diameters_mm = np.array([10.0, 20.0, 30.0, 40.0])
+    exact = ToolLaw.fit(diameters_mm, 5.0 * diameters_mm**-3.0)
+    assert exact.gain(25.0) == pytest.approx(5.0 * 25.0**-3)
+    assert exact.spread < 1e-9
+    scattered = ToolLaw.fit(diameters_mm, 5.0 * diameters_mm**-3.0 * [1.5, 1 / 1.5, 1.5, 1 / 1.5])
+    assert scattered.spread > math.log(1.5)
+    assert ToolLaw.fit(diameters_mm[1:], diameters_mm[1:]).gain(10.0) is None
+
+
+def test_gains_of_recordings_make_their_torques_one():
+    rng = np.random.default_rng(2)
+    true, numbers = np.array([1.0, 0.2, 0.03]), np.repeat([0, 1, 2], 50)
+    motion = rng.uniform(0, 1, 150)
+    gains = gains_of_recordings(
+        numbers, true[numbers] * motion, lambda kept, out, values: motion[out] * (values[kept] / motion[kept]).mean()
+    )
+    np.testing.assert_allclose(gains / gains[0], true, rtol=1e-3)
+
+
+def test_the_shape_of_a_twist_does_not_count_as_gain():
+    """Estimates that fall earlier than the torque have the right gain all the same."""
+    truth = np.array([0.0, 0.025, 0.056, 0.058, 0.053, 0.028, 0.0])
+    early = np.array([0.0, 0.050, 0.058, 0.057, 0.033, 0.005, 0.0])
+    spread = GainSpread(between=0.3, within=0.2, noise_nm=0.006)
+    assert loaded_gain(early, truth) == pytest.approx(1.0, abs=0.06)
+    factor = spread.correct(early[:, None], truth, find_twists(truth), bounded=True).factors[0]
+    assert factor == pytest.approx(1.0, abs=0.1)

@@ -1,0 +1,151 @@
+"""The paper's method in a session: idle frame, average, match, curves."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from shearloop.bank.matching import Match, best_match
+from shearloop.estimation import Calibration, Estimate, EstimatorSession, TactileFrame
+from shearloop.estimation.bank_match import PaperMatcher
+from shearloop.estimation.session_state import PaperState
+from tests.paper_curve import paper_curve
+
+K_GRID, SIGMA_GRID = np.linspace(3.0, 4.0, 11), np.linspace(1.0, 2.0, 11)
+RANDOM = np.random.default_rng(4)
+HOMOGENEOUS = RANDOM.uniform(0.05, 0.3, 896)
+PATTERN = RANDOM.normal(0.0, 0.01, 896)
+SIGMA, K = np.linspace(1.3, 1.9, 20), np.linspace(3.3, 3.8, 20)
+TORQUE, DIAMETER = (SIGMA, 0.4 - 0.2 * SIGMA), (K, 100.0 - 20.0 * K)
+
+
+class OneCell:
+    """A matcher that always finds the same cell, and keeps its inputs."""
+
+    def __init__(self, cell: tuple[int, int] = (5, 5)) -> None:
+        self.cell = cell
+        self.asked: list[NDArray[np.float64]] = []
+
+    def match(self, difference: NDArray[np.float64]) -> Match:
+        self.asked.append(difference)
+        scores = np.full((11, 11), 0.2)
+        scores[self.cell] = 0.9
+        return best_match(scores, K_GRID, SIGMA_GRID)
+
+
+def noisy(signal: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
+    return HOMOGENEOUS + signal + RANDOM.normal(0.0, 0.002, 896)
+
+
+def estimated(session: EstimatorSession, number: int, channels: NDArray[np.float64], unusable: int = 0) -> Estimate:
+    return session.estimate(TactileFrame.of(0.541 * number, channels[None], np.arange(896)[None] >= unusable))
+
+
+def tared(matcher: OneCell, calibration: Calibration | None = None, average: int = 1) -> EstimatorSession:
+    """Return a session that has its idle frame."""
+    session = EstimatorSession(
+        calibration or paper_curve("bank", torque=TORQUE, diameter=DIAMETER),
+        matcher=PaperMatcher(matcher),
+        average_frames=average,
+    )
+    for number in range(10):
+        assert session.taring
+        reasons = estimated(session, number, noisy()).reasons
+        assert reasons == (f"taking the idle frame, {number + 1} of 10",)
+    return session
+
+
+def test_the_baseline_is_the_mean_of_its_frames_and_has_their_noise():
+    state = PaperState(400, 1, 3.0)
+    for number in range(400):
+        state.process(TactileFrame.of(float(number), noisy()[None]))
+    assert not state.taring
+    np.testing.assert_allclose(state._idle_frame, HOMOGENEOUS, atol=6 * 0.002 / 20)
+    assert np.median(state._noise) == pytest.approx(0.002, rel=0.02)
+
+
+def test_channels_that_do_not_move_have_the_converters_noise():
+    state = PaperState(2, 1, 3.0)
+    for number in range(2):
+        state.process(TactileFrame.of(float(number), HOMOGENEOUS[None]))
+    np.testing.assert_allclose(state._noise, 0.00215 / np.sqrt(12))
+
+
+def test_a_channel_that_reads_0_in_some_frames_disturbs_neither_idle_frame_nor_average():
+    state, silent = PaperState(10, 4, 3.0), np.arange(896) < 56
+    for number in range(30):
+        channels = np.where(silent & (number % 3 == 2), 0.0, noisy(PATTERN if number > 9 else 0.0))
+        processed = state.process(TactileFrame.of(float(number), channels[None]))
+        assert processed.usable[0].tolist() == (channels != 0).tolist()
+        if number > 13:
+            np.testing.assert_allclose(processed.difference[0], PATTERN, atol=0.01)
+
+
+def test_a_channel_that_read_0_when_the_tare_began_stays_out_until_the_next_tare():
+    state, silent = PaperState(3, 1, 3.0), np.arange(896) < 56
+    for number in range(6):
+        channels = np.where(silent & (number == 0), 0.0, noisy(PATTERN if number > 2 else 0.0))
+        processed = state.process(TactileFrame.of(float(number), channels[None]))
+        assert processed.usable[0].tolist() == (~silent).tolist()
+    assert not processed.difference[0, silent].any()
+
+
+def test_a_signal_becomes_torque_and_diameter_with_their_intervals():
+    matcher = OneCell()
+    estimate = estimated(tared(matcher), 10, noisy(PATTERN))
+    assert estimate.valid
+    assert estimate.torque_nm == pytest.approx(0.4 - 0.2 * 1.5, abs=1e-5)
+    assert estimate.diameter_mm == pytest.approx(100 - 20 * 3.5)
+    # At the least an interval is a thousandth of the calibrated range to either side.
+    assert (estimate.torque_low_nm, estimate.torque_high_nm) == pytest.approx((0.09988, 0.10012), abs=1e-5)
+    assert (estimate.diameter_low_mm, estimate.diameter_high_mm) == pytest.approx((29.99, 30.01))
+    assert (estimate.k, estimate.sigma) == pytest.approx((3.5, 1.5))
+    np.testing.assert_allclose(matcher.asked[0], PATTERN, atol=0.02)
+
+
+def test_a_frame_like_the_homogeneous_one_gives_no_estimate():
+    matcher = OneCell()
+    estimate = estimated(tared(matcher), 10, noisy())
+    assert "no signal above the noise" in estimate.reasons[0]
+    assert (estimate.torque_nm, estimate.k, matcher.asked) == (None, None, [])
+
+
+def test_a_match_outside_of_the_calibration_is_shown_without_an_estimate():
+    estimate = estimated(tared(OneCell((0, 0))), 10, noisy(PATTERN))
+    assert (estimate.valid, estimate.torque_nm, estimate.diameter_mm) == (False, None, None)
+    assert estimate.k is not None
+    assert len(estimate.reasons) == 2, "both k and sigma lie outside"
+
+
+def test_without_a_calibration_the_match_alone_is_shown():
+    estimate = estimated(tared(OneCell(), Calibration.uncalibrated("bank")), 10, noisy(PATTERN))
+    assert estimate.reasons == ("no calibration is configured: k and sigma have no torque",)
+    assert (estimate.valid, estimate.torque_nm, estimate.diameter_mm) == (False, None, None)
+    assert estimate.sigma == pytest.approx(1.5)
+
+
+def test_too_many_unusable_channels_give_no_estimate():
+    estimate = estimated(tared(OneCell()), 10, noisy(PATTERN), unusable=90)
+    assert estimate.reasons[0].startswith("90 of 896 channels are saturated or dead; check the ribbon cable")
+    assert estimated(tared(OneCell()), 10, noisy(PATTERN), unusable=89).valid
+
+
+def test_the_latest_frames_are_averaged_and_a_tare_forgets_them():
+    matcher = OneCell()
+    session = tared(matcher, average=3)
+    for number, scale in enumerate((1.0, 2.0, 3.0, 4.0), start=10):
+        estimate = estimated(session, number, HOMOGENEOUS + scale * PATTERN)
+    offset = matcher.asked[0] - PATTERN
+    np.testing.assert_allclose(matcher.asked[-1] - offset, 3.0 * PATTERN, atol=1e-12)
+    assert estimate.lag_s == pytest.approx(0.541)
+    session.tare()
+    assert estimated(session, 20, noisy(PATTERN)).reasons == ("taking the idle frame, 1 of 10",)
+
+
+def test_frames_before_a_gap_are_not_averaged_with_those_after_it():
+    matcher = OneCell()
+    session = tared(matcher, average=2)
+    estimated(session, 10, noisy(PATTERN))
+    after = noisy(-PATTERN)
+    estimate = estimated(session, 5000, after)
+    np.testing.assert_allclose(matcher.asked[-1] + session._state._idle_frame, after, atol=1e-12)
+    assert estimate.lag_s == 0

@@ -1,0 +1,108 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from shearloop.bank.channels import PAPER_TABLE
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.forward import ForwardModel
+from shearloop.estimation import EstimatorSession, Physics, TactileFrame, fit
+from shearloop.estimation.bank_match import (
+    NOT_TURNED,
+    ElectrodeNumbering,
+    RefinedMatcher,
+    find_numberings,
+    image_matrix,
+    resolve_symmetry,
+)
+from tests.estimation.conftest import slices_of
+
+
+@pytest.mark.parametrize("reflected", [False, True])
+@pytest.mark.parametrize("rotation", [0, 3, 11])
+def test_the_numbering_of_the_electrodes_is_found(rotation, reflected):
+    rng = np.random.default_rng(1)
+    homogeneous = rng.normal(size=896)
+    turned = ElectrodeNumbering(rotation, reflected).model_channels(PAPER_TABLE)
+    idle = np.abs(homogeneous[turned]) + 0.2 * np.abs(rng.normal(size=896))
+    found = find_numberings(idle, homogeneous, PAPER_TABLE)
+    assert [(one.rotation, one.reflected) for one in found] == [(rotation, reflected), (rotation + 16, reflected)]
+
+
+@pytest.mark.parametrize("turned", [ElectrodeNumbering(5, False), ElectrodeNumbering(9, True)])
+def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
+    electrode = (turned.rotation + (-1 if turned.reflected else 1) * PAPER_TABLE.electrodes) % 32
+    model = PAPER_TABLE.electrodes[turned.model_channels(PAPER_TABLE)]
+    assert sorted(turned.model_channels(PAPER_TABLE)) == list(range(896))
+    np.testing.assert_array_equal(np.sort(model[:, :2]), np.sort(electrode[:, :2]))
+    np.testing.assert_array_equal(np.sort(model[:, 2:]), np.sort(electrode[:, 2:]))
+
+
+@pytest.mark.parametrize("rotation", [5, 21])
+def test_a_touch_settles_the_half_turn(bank, rotation):
+    true = ElectrodeNumbering(rotation, False)
+    touch = np.abs(bank.signals[4, 7].astype(np.float64))[true.model_channels(PAPER_TABLE)]
+    numberings = [true, ElectrodeNumbering((rotation + 16) % 32, False)]
+    for found in (numberings, numberings[::-1]):
+        assert resolve_symmetry(found, touch, bank).rotation == rotation
+
+
+def test_a_place_between_cells_is_found_to_a_fraction_of_one(bank):
+    channel = np.linspace(0, 4, 896)
+    locator = RefinedMatcher(bank, NOT_TURNED)
+    for k, sigma in ((1.83, 1.04), (2.26, 0.77)):
+        place = locator.match(-2.5 * np.exp(-0.5 * ((channel - k) / (0.3 * sigma)) ** 2))
+        assert place.k == pytest.approx(k, abs=0.02)
+        assert place.sigma == pytest.approx(sigma, abs=0.02)
+        assert place.log_amplitude == pytest.approx(np.log(2.5), abs=0.1)
+        assert not place.ambiguous
+
+
+def test_two_places_that_fit_alike_are_ambiguous(bank):
+    signals = bank.signals.copy()
+    signals[2], signals[18] = signals[10], signals[10]
+    twice = dataclasses.replace(bank, signals=signals)
+    assert RefinedMatcher(twice, NOT_TURNED).match(signals[10, 8]).ambiguous
+
+
+@pytest.mark.parametrize("name", ["paper", "bank"])
+def test_torque_by_the_place_in_the_bank(bank, name):
+    rng = np.random.default_rng(4)
+    torque = np.tile(np.linspace(0.0, 0.14, 8), 4)
+    channel = np.linspace(0, 4, 896)
+    sigma = 1.8 - 7 * torque
+    frames = np.exp(-0.5 * ((channel - 2.0) / (0.3 * sigma[:, None])) ** 2) + np.abs(rng.normal(0, 0.01, (32, 896)))
+    whole = slices_of(frames, torque)
+    calibration = fit(name, [whole.between(0, 24)], "earlier", Physics(bank=bank))
+    tracker = EstimatorSession(calibration, bank)
+    for i in range(24, 32):
+        estimate = tracker.estimate(TactileFrame.of(float(i), frames[i][None]))
+        assert estimate.torque_nm == pytest.approx(torque[i], abs=0.015)
+        assert estimate.sigma == pytest.approx(sigma[i], abs=0.15)
+        assert estimate.score > 0.95
+    with pytest.raises(CalibrationError, match="needs its bank"):
+        EstimatorSession(calibration)
+
+
+def test_another_bank_is_refused(bank):
+    rng = np.random.default_rng(5)
+    series = slices_of(rng.normal(1, 0.1, (20, 896)), rng.uniform(0, 1, 20))
+    calibration = fit("bank", [series], "x", Physics(bank=bank))
+    with pytest.raises(CalibrationError, match="name the bank it was made with"):
+        EstimatorSession(calibration, dataclasses.replace(bank, geometry_hash="0" * 64))
+
+
+def test_an_image_shows_where_and_which_way(fingertip):
+    """A patch that conducts better comes back as the image's largest change, near where it is."""
+    model = ForwardModel(fingertip)
+    centres = fingertip.nodes[fingertip.triangles].mean(axis=1)
+    matrix = image_matrix(fingertip, PAPER_TABLE)
+    low = fingertip.nodes.min(axis=0)
+    size = float(np.ptp(fingertip.nodes, axis=0).max()) / 12
+    cells = np.unique(np.floor((centres - low) / size).astype(int) @ [1, 1000])
+    places = low + (np.column_stack([cells % 1000, cells // 1000]) + 0.5) * size
+    for spot in ([0.8, 0.9], [2.2, 1.6]):
+        patch = np.linalg.norm(centres - spot, axis=1) < 0.3
+        image = matrix @ (model.voltages(1 + 0.1 * patch) - model.homogeneous())
+        assert image.max() > -2 * image.min()
+        assert np.linalg.norm(places[image.argmax()] - spot) < 0.45

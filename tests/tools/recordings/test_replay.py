@@ -1,0 +1,315 @@
+import asyncio
+import contextlib
+import json
+import math
+import os
+import re
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+import zmq.asyncio
+
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
+from shearloop.daemon.messaging.messages import EitEstimate, wire_map, with_packed_arrays
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.recorder.schema import message_json, recorded_topic
+from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
+from shearloop.drivers.serial_sensor import InputKind
+from shearloop.estimation import EstimatorSession, Measured
+from shearloop.tools.recordings.columns import read_content
+from shearloop.tools.recordings.matlab_import import import_mat
+from shearloop.tools.recordings.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
+from tests.fixtures.daemons import ask, emulated_kit, running_daemon
+from tests.sample_messages import sample
+
+Messages = list[tuple[str, dict[str, Any]]]
+# Of the real recording's estimates with the tests' bank: what they were when it was last looked at with care.
+REFERENCE = Path(__file__).parents[2] / "data" / "replayed_stream.json"
+RELATIVE = 1e-9
+
+
+class Gripper:
+    """Holds a tool while the number of estimates is within a range."""
+
+    def __init__(self, estimates: FingertipPipeline, tool: Measured, held: range) -> None:
+        self._estimates, self._tool, self._held = estimates, tool, held
+        self.diameters = FingertipDiameters("combined")
+
+    def held_tool(self, _t_ns: int) -> Measured | None:
+        return self._tool if self._estimates.count in self._held else None
+
+
+async def replayed(path: Path, speed: float, config: DaemonConfig | None = None) -> tuple[Messages, ReplayComparison]:
+    """Return all that a replay publishes, and how it compares."""
+    run, clock, seen = RecordedRun(path), ReplayClock(), []
+    with contextlib.ExitStack() as opened:
+        config = config or opened.enter_context(run.configuration())
+        publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), "tcp://127.0.0.1:*", clock)
+        opened.callback(publisher.close)
+        publisher.add_listener(lambda topic, content: seen.append((topic, content)))
+        replay = Replay(run, config, publisher, clock)
+        await replay.play(speed)
+    return seen, replay.comparison
+
+
+def measured(messages: Messages) -> Messages:
+    """Return the messages without what says how long they took and how clocks were read."""
+    return [(t, {k: v for k, v in c.items() if k not in ("latency_s", "timestamp")}) for t, c in messages]
+
+
+@asynccontextmanager
+async def recording_daemon(
+    config: Path,
+) -> AsyncIterator[tuple[Daemon, asyncio.subprocess.Process, Messages, Callable[[int], Awaitable[None]]]]:
+    """Run a daemon on an emulated board of 60 frames; give both, what was published, and a wait for a frame."""
+    published: Messages = []
+    news = asyncio.Event()
+
+    def listen(topic: str, content: dict[str, Any]) -> None:
+        published.append((topic, content))
+        news.set()
+
+    async def until(frame: int) -> None:
+        while not any(t == "eit.estimate" and c["frame"] >= frame for t, c in published):
+            news.clear()
+            await news.wait()
+
+    async with running_daemon(config) as daemon:
+        daemon.publisher.add_listener(listen)
+        async with emulated_kit(config.parent, 60, "--once") as board:
+            yield daemon, board, published, until
+
+
+async def record(config: Path) -> Messages:
+    """Record a board with faults and a tare on the way; return what the daemon published."""
+    async with recording_daemon(config) as (daemon, board, published, until):
+        await until(5)
+        board.stdin.write(b"wrong-count\nunplug 0.3\n")
+        await until(25)
+        assert (await ask(daemon, "tare"))["ok"]
+        await until(50)
+    return published
+
+
+def test_a_replay_equals_the_recording_at_any_speed(config, tmp_path, tiny_calibration, ran):
+    live = asyncio.run(record(config(recording={"folder": "recordings"})))
+    (path,) = (tmp_path / "recordings").iterdir()
+    # The recording holds the calibration that was used, whatever becomes of it.
+    kept = tiny_calibration.rename(tmp_path / "kept.yaml")
+    try:
+        _same_at_any_speed(path, live, tmp_path, ran)
+    finally:
+        kept.rename(tiny_calibration)
+    # And what changed is found out.
+    changed = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    changed["fingertips"]["right"]["average_frames"] = 2
+    (tmp_path / "changed.yaml").write_text(yaml.safe_dump(changed))
+    arguments = ["replay", str(path), "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check"]
+    assert "eit.estimate of right, number" in ran(*arguments, "--config", tmp_path / "changed.yaml", status=1).err
+
+
+def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, ran: Callable[..., Any]) -> None:
+    fast, comparison = asyncio.run(replayed(path, math.inf))
+    assert comparison.compared["eit.frame"] > 50
+    assert comparison.compared["eit.estimate"] > 50
+    assert comparison.different == Counter(), comparison.examples
+    slow, _ = asyncio.run(replayed(path, 5.0))
+    assert measured(slow) == measured(fast)
+    assert [c["latency_s"] for t, c in slow if t == "eit.estimate"] == [0.0] * comparison.compared["eit.estimate"]
+    # And the same as what subscribers saw, but for messages under way when the daemon was stopped.
+    for topic in ("eit.frame", "eit.estimate"):
+        then = measured([one for one in live if one[0] == topic])
+        again = measured([one for one in fast if one[0] == topic])
+        assert again[: len(then)] == then
+    zeros = [c for t, c in fast if t == "eit.estimate" and c["reason"].startswith("taking the idle frame, 1 of")]
+    assert len(zeros) == 2, "the operator's tare is replayed"
+    errors = ran("replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
+    assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in errors
+
+
+def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path):
+    """Guards parser, frame clock, baseline and matching. Renew: run with SHEARLOOP_RENEW=1, and say why it changed."""
+    path = tmp_path / "stream.mcap"
+    folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
+    import_mat([folder / "device1.mat", folder / "device3.mat"], path)
+    configured = load_daemon_config(config())
+    averaging = {"right": configured.fingertips["right"].model_copy(update={"average_frames": 5})}
+    configured = configured.model_copy(update={"fingertips": averaging})
+    messages, _ = asyncio.run(replayed(path, math.inf, configured))
+    estimates = [content for topic, content in messages if topic == "eit.estimate"]
+    assert [content["frame"] for content in estimates] == list(range(832))
+    torques = [content for topic, content in messages if topic == "load.torque"]
+    assert len(torques) == 4882
+    seen = {
+        "valid": sum(content["valid"] for content in estimates),
+        "estimates": [
+            {key: content[key] for key in ("frame", "t_mono_ns", "k", "sigma", "score", "torque_nm", "reason")}
+            for content in estimates[::52]
+        ],
+    }
+    if os.environ.get("SHEARLOOP_RENEW"):
+        REFERENCE.write_text(json.dumps(seen, indent=1))
+    reference = json.loads(REFERENCE.read_text())
+    assert seen["valid"] == reference["valid"]
+    for now, then in zip(seen["estimates"], reference["estimates"], strict=True):
+        assert now["frame"] == then["frame"]
+        assert now["reason"] == then["reason"]
+        # To a microsecond, and to what another processor's arithmetic may do.
+        assert now["t_mono_ns"] == pytest.approx(then["t_mono_ns"], abs=1000)
+        for key in ("k", "sigma", "score", "torque_nm"):
+            assert now[key] == (None if then[key] is None else pytest.approx(then[key], rel=RELATIVE)), key
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.mcap"], "nowhere.mcap: the recording cannot be read: No such file"),
+        (["{imported}"], "has no configuration because"),
+        (["{imported}", "--speed", "0"], "--speed 0 is not a number above 0, or max"),
+        (["{imported}", "--speed", "fast"], "--speed fast is not a number above 0, or max"),
+    ],
+)
+def test_mistakes_end_in_one_sentence(arguments, message, imported, mistake):
+    assert message in mistake("replay", *(one.format(imported=imported) for one in arguments))
+
+
+def test_nan_is_restored():
+    on_wire = with_packed_arrays({"seq": 3, "joints_rad": [1.5, None, 2.5], "reason": ""})
+    assert on_wire["joints_rad_shape"] == [3]
+    np.testing.assert_array_equal(np.frombuffer(on_wire["joints_rad"], "<f4"), np.float32([1.5, np.nan, 2.5]))
+    assert on_wire["seq"] == 3
+
+
+TOPIC = EitEstimate.topic
+
+
+def estimate(**changes: Any) -> dict[str, Any]:
+    content = wire_map(sample(EitEstimate), Clock().unix_s(0), 7)
+    return content | {"source": "right", "t_mono_ns": 5} | changes
+
+
+def recorded(content: dict[str, Any]) -> RecordedEvent:
+    """Return a message as it comes back from a recording, which leaves out what has no value."""
+    data = message_json(TOPIC, content, 0)
+    plain = read_content(recorded_topic(TOPIC, content["source"]), data)
+    return RecordedEvent(TOPIC, content["t_mono_ns"], plain, content["source"])
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "difference"),
+    [
+        ({}, {}, ""),
+        ({"latency_s": 0.1, "timestamp": 1.0, "seq": 3}, {"latency_s": 0.7, "timestamp": 2.0, "seq": 4}, ""),
+        ({"torque_nm": 0.1}, {"torque_nm": 0.1 + 1e-16}, "torque_nm was 0.1, is 0.100000000000000"),
+        ({"k": None}, {"k": 1.5}, "k was None, is 1.5"),
+        ({"k": 1.5}, {"k": None}, "k was 1.5, is None"),
+        ({"reason": ""}, {"reason": "no grip"}, "reason was"),
+    ],
+)
+def test_a_difference_is_described(then, now, difference):
+    comparison = ReplayComparison(("eit.estimate.right",))
+    comparison.add_computed(TOPIC, estimate(**now))
+    comparison.compare(recorded(estimate(**then)))
+    assert comparison.compared[TOPIC] == 1
+    assert comparison.different[TOPIC] == bool(difference)
+    assert difference in "".join(comparison.examples)
+    assert comparison.unrecorded == 0
+
+
+def test_a_missing_message_is_a_difference():
+    comparison = ReplayComparison(("eit.estimate.right", "eit.estimate.left"))
+    comparison.add_computed(TOPIC, estimate(source="left"))
+    comparison.compare(recorded(estimate()))
+    assert comparison.different[TOPIC] == 1
+    assert "the replay did not compute it" in comparison.examples[0]
+    assert comparison.unrecorded == 1, "the left one has no message beside it"
+
+
+def test_messages_of_unrecorded_topics_are_only_counted():
+    comparison = ReplayComparison(("eit.estimate.right",))
+    for _ in range(3):
+        comparison.add_computed(TOPIC, estimate(source="left"))
+        comparison.add_computed("health", {"source": "daemon"})
+    assert comparison.unrecorded == 3
+    assert comparison._computed == {}
+
+
+OTHER_TOOL = Measured(14.0, 0.5)
+# The frames after which another tool is held, a further experiment is begun, and a zero is taken.
+HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
+
+
+async def record_experiments(config: Path) -> list[dict[str, Any]]:
+    """Run a daemon through two experiments; return what was published as estimates."""
+    async with recording_daemon(config) as (daemon, _, published, until):
+        recorder, right = daemon.recorder, daemon.sensors.tasks["right"].pipeline
+        right.gripper = Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH))
+        recorder.record_experiment("first")
+        await until(BEGUN)
+        recorder.record_experiment("second")
+        await until(ZEROED)
+        right.tare()
+        await until(ENOUGH)
+    return [content for topic, content in published if topic == "eit.estimate"]
+
+
+def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, monkeypatch):
+    live = asyncio.run(record_experiments(config(recording={"folder": "recordings"})))
+    (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
+    before = RecordedRun(later).replay_events().before_frames["right"]
+    (zeroed,) = (frame for frame, kind, _ in before if kind is InputKind.TARE)
+    assert zeroed >= ZEROED
+    held: list[object] = []
+    set_tool = EstimatorSession.set_tool
+
+    def noted(self: EstimatorSession, tool: Measured | None) -> None:
+        held.append(tool)
+        set_tool(self, tool)
+
+    monkeypatch.setattr(EstimatorSession, "set_tool", noted)
+    again, _ = asyncio.run(replayed(later, math.inf))
+    assert held == [None, OTHER_TOOL], "the second one came before the file began"
+    estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}
+    assert min(estimates) >= BEGUN
+    said = ("reason", "valid", "k", "sigma", "score", "torque_nm")
+    after = [one for one in live if one["frame"] >= zeroed]
+    assert len(after) > ENOUGH - ZEROED - 10
+    for one in after:
+        assert [estimates[one["frame"]][key] for key in said] == [one[key] for key in said]
+    assert estimates[zeroed]["reason"].startswith("taking the idle frame, 1 of")
+
+
+async def record_run(config: Path, per_experiment: int) -> None:
+    """Run a daemon through three experiments, with a tare, lost bytes and a board that is gone for a moment."""
+    async with recording_daemon(config) as (daemon, board, published, until):
+        recorder = daemon.recorder
+        for number in range(3):
+            recorder.record_experiment(f"run {number}")
+            begin = number * per_experiment
+            await until(begin + per_experiment // 3)
+            if number == 0:
+                board.stdin.write(b"wrong-count\nunplug 0.3\n")
+            elif number == 1:
+                assert (await ask(daemon, "tare"))["ok"]
+            await until(begin + per_experiment - 2)
+            assert published
+
+
+def test_each_of_a_daemons_recordings_replays_bit_for_bit(config, tmp_path, ran):
+    asyncio.run(record_run(config(recording={"folder": "recordings"}), 18))
+    paths = list((tmp_path / "recordings").iterdir())
+    assert {path.stem.rpartition("_")[2] for path in paths} == {"run-0", "run-1", "run-2"}
+    for path in paths:
+        said = ran("replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
+        frames, estimates = (re.search(rf"{topic}: (\d+) of \1 equal", said) for topic in ("eit.frame", "eit.estimate"))
+        assert int(frames[1]) > 8, path
+        assert int(estimates[1]) > 8, path

@@ -1,0 +1,215 @@
+"""The guided calibrations and the emulators from the command line, each as a process of its own."""
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+from itertools import cycle
+
+import pytest
+
+from shearloop.cli.calibrate import load
+from shearloop.cli.terminal import Operator
+from shearloop.drivers.calibration_files import load_device_calibration
+from shearloop.drivers.connection import SerialPort
+from shearloop.drivers.errors import DeviceLostError
+from shearloop.drivers.load_cell import LoadCalibration
+from shearloop.drivers.robotiq.gripper import WidthCalibration
+from shearloop.emulators.boards import Hx711Board
+from tests.running import running
+
+SHEARLOOP = (sys.executable, "-m", "shearloop")
+COUNTS_PER_NM = 420e3 / (9.80665 * 0.035)
+
+
+class Silent(Operator):
+    """An operator who presses no key."""
+
+    def __enter__(self) -> "Silent":
+        return self
+
+
+class Process(contextlib.AbstractContextManager["Process", None]):
+    """A command with pipes; the end of its input ends it."""
+
+    def __init__(self, *arguments: str) -> None:
+        self._child = subprocess.Popen(
+            [*SHEARLOOP, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        self.said: list[str] = []
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def tell(self, line: str) -> None:
+        self._child.stdin.write(f"{line}\n")
+        self._child.stdin.flush()
+
+    def carry_out(self, line: str) -> None:
+        """Tell an emulator something, and wait until it has been done: commands are taken in order."""
+        self.tell(line)
+        self.tell("?")
+        assert "'?'" in self._child.stderr.readline()
+
+    def hear(self, beginning: str, *, on_stderr: bool = False) -> str:
+        """Return the next line that begins like this."""
+        stream = self._child.stderr if on_stderr else self._child.stdout
+        for line in stream:
+            self.said.append(line.strip())
+            if line.startswith(beginning):
+                return line.strip()
+        raise AssertionError(
+            f"never said {beginning!r}: {self.said}, {self._child.stderr and self._child.stderr.read()}"
+        )
+
+    def end(self) -> tuple[int, str, str]:
+        out, err = self._child.communicate(timeout=30)
+        return self._child.returncode, out, err
+
+
+@pytest.mark.parametrize("script", [False, True], ids=["for a person", "for a script"])
+def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_path, script):
+    link, out = tmp_path / "load", tmp_path / "load.yaml"
+    with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
+        board.hear(str(link))
+        arguments = ("--port", str(link), "--mass-g", "100", "--mass-g", "200", "--out", str(out))
+        with Process("calibrate", "load", *arguments, *["--json"] * script) as calibrate:
+            calibrate.hear("Take every load off", on_stderr=script)
+            calibrate.tell("")
+            calibrate.hear("  0 g:", on_stderr=script)
+            # The mass was forgotten: the step is refused and asked for again.
+            calibrate.hear("Put 100 g on", on_stderr=script)
+            calibrate.tell("")
+            calibrate.hear("Put 100 g on", on_stderr=script)
+            board.carry_out("mass 100")
+            calibrate.tell("")
+            calibrate.hear("  100 g:", on_stderr=script)
+            calibrate.hear("Put 200 g on", on_stderr=script)
+            board.carry_out("mass 200")
+            calibrate.tell("")
+            status, said, refused = calibrate.end()
+        board.tell("nonsense")
+        assert "there is no fault 'nonsense'" in board.end()[2]
+    assert status == 0
+    assert "Refused: The reading did not change with 100 g" in "\n".join([*calibrate.said, refused])
+    calibration = load_device_calibration(out, LoadCalibration)
+    if script:
+        result = json.loads(said)
+        assert result["path"] == str(out)
+        assert [level["mass_g"] for level in result["levels"]] == [0, 100, 200]
+        assert result["calibration"] == calibration.model_dump(mode="json")
+    else:
+        assert f"Written to {out}." in said
+    assert calibration.nm_per_count * COUNTS_PER_NM == pytest.approx(1.0, rel=2e-3)
+    assert calibration.torque_nm(81_250) == pytest.approx(0.0, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("lines", "parts"),
+    [
+        ((b"0,091\r\n",), ("'0,091'", "decimal comma", "firmware/hx711_torque")),
+        ((b"0.1234, " * 1024 + b"\n",), ("An EIT-kit sends such lines", "shearloop ports")),
+        ((b"0.1",), ("'0.10.10.1", "without a line end")),
+        ((b"",), ("HX711 has power",)),
+    ],
+)
+async def test_the_load_cells_calibration_gives_up_with_what_came(tmp_path, monkeypatch, lines, parts):
+    monkeypatch.setattr(load, "GIVE_UP_S", 0.3)
+    board = Hx711Board(cycle(lines), period_s=0.03, link=tmp_path / "load")
+    async with running(board.run()):
+        await board.port.appearances.get()
+        with SerialPort(str(tmp_path / "load")) as port, pytest.raises(DeviceLostError) as gave_up:
+            await load._measure(port, [100.0], Silent())
+    assert "within 0.3 s" in str(gave_up.value)
+    assert all(part in str(gave_up.value) for part in parts), gave_up.value
+
+
+@pytest.mark.parametrize("way", ["socket", "modbus"])
+def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
+    out, link = tmp_path / "gripper.yaml", tmp_path / "gripper"
+    arguments = ("--port", "0") if way == "socket" else ("--link", str(link))
+    with Process("emulate", f"gripper-{way}", "--speed", "20", *arguments) as gripper:
+        where = gripper.hear("127.0.0.1:" if way == "socket" else str(link))
+        host, _, port = where.partition(":")
+        reach = ("--host", host, "--socket-port", port) if way == "socket" else ("--port", where)
+        diameters = ("--diameter-mm", "10", "--diameter-mm", "40")
+        # One of the two ways as a script would: what is asked of the operator is then on stderr.
+        script = way == "modbus"
+        with Process("calibrate", "gripper", *reach, *diameters, "--out", str(out), *["--json"] * script) as calibrate:
+            calibrate.hear("The fingers will open", on_stderr=script)
+            calibrate.tell("")
+            calibrate.hear("Hold the object of 10 mm", on_stderr=script)
+            calibrate.tell("")
+            if script:
+                calibrate.hear("Refused: the fingers closed without meeting anything", on_stderr=True)
+            calibrate.hear("Hold the object of 10 mm", on_stderr=script)
+            for diameter in (10, 40):
+                gripper.carry_out(f"object {diameter}")
+                calibrate.tell("")
+                calibrate.hear(f"  {diameter} mm:", on_stderr=script)
+            status, said, refused = calibrate.end()
+    assert status == 0
+    if script:
+        assert [gauge["diameter_mm"] for gauge in json.loads(said)["gauges"]] == [10, 40]
+    else:
+        assert "without meeting anything" in refused
+    found = load_device_calibration(out, WidthCalibration)
+    # Two positions, each rounded to a count: the true gripper goes from 3 to 230 counts over 140 mm.
+    assert found.width_mm(3) == pytest.approx(140, abs=5)
+    assert found.width_mm(230) == pytest.approx(0, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("load --port /dev/none --mass-g 100 --out load.yaml", "no serial port /dev/none"),
+        ("load --port /dev/none --mass-g -1 --out load.yaml", "mass in grams"),
+        ("load --port /dev/none --mass-g 1 --out no/load.yaml", "does not exist"),
+        ("load --port /dev/none --mass-g 1 --lever-arm-mm 0 --out l.yaml", "--lever-arm-mm 0"),
+        ("gripper --port /dev/none --diameter-mm 20 --out g.yaml", "two different"),
+        ("gripper --port /dev/none --diameter-mm 2 --diameter-mm 4 --out g.yaml", "/dev/none"),
+    ],
+)
+def test_a_mistake_ends_in_one_sentence(arguments, said, tmp_path, mistake, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    message = mistake("calibrate", *arguments.split())
+    assert said in message
+    assert message.count("\n") == 1
+
+
+def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path):
+    link = tmp_path / "load"
+    with Process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
+        board.hear(str(link))
+        arguments = f"calibrate load --port {link} --mass-g 100 --out {tmp_path / 'l.yaml'}".split()
+        # From a file, which no event loop can wait for.
+        answers = tmp_path / "answers"
+        answers.write_text("\n")
+        with answers.open() as stdin:
+            done = subprocess.run(
+                [*SHEARLOOP, *arguments], stdin=stdin, capture_output=True, text=True, timeout=30, check=False
+            )
+    assert done.returncode == 2
+    assert "the input ended before all was measured" in done.stderr
+    assert not (tmp_path / "l.yaml").exists()
+
+
+def test_a_gripper_socket_fails_on_request():
+    with Process("emulate", "gripper-socket", "--port", "0", "--speed", "10") as gripper:
+        host, _, port = gripper.hear("127.0.0.1:").partition(":")
+        with socket.create_connection((host, int(port)), timeout=10) as client:
+            client.sendall(b"GET FLT\n")
+            assert client.recv(64) == b"FLT 00\n"
+            gripper.tell("fault 14")
+            gripper.tell("what")
+            gripper.tell("unplug 0.01")
+            # The connection breaks, and the address is listened on again.
+            with contextlib.suppress(ConnectionResetError):
+                while client.recv(64):
+                    pass
+        assert gripper.hear("127.0.0.1:") == f"{host}:{port}"
+        with socket.create_connection((host, int(port)), timeout=10) as client:
+            client.sendall(b"GET FLT\n")
+            assert client.recv(64) == b"FLT 14\n"
+        assert "'what' is no command" in gripper.end()[2]

@@ -1,0 +1,94 @@
+import csv
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shearloop.estimation import Estimate, FrameSeries
+from shearloop.tools.evaluate import EstimateTrack, figures_by_load, figures_of, write_estimates
+
+torques = st.floats(-0.2, 0.2).map(lambda one: round(one, 4))
+frames = st.tuples(torques, st.none() | st.tuples(torques, st.floats(0, 0.1), st.floats(0, 0.1)))
+COLUMNS = "recording,frame,t_s,truth_nm,torque_nm,torque_low_nm,torque_high_nm,diameter_mm,diameter_low_mm"
+COLUMNS += ",diameter_high_mm,valid,reason"
+
+
+def track_of(rows):
+    estimates = [
+        Estimate(False, ("no grip", "dead")) if found is None else
+        Estimate(True, (), found[0], found[0] - found[1], found[0] + found[2])
+        for _, found in rows
+    ]  # fmt: skip
+    t = np.arange(float(len(rows)))
+    truth = np.array([one for one, _ in rows])
+    series = FrameSeries("raw", ("right",), t, np.zeros((len(rows), 1, 896)), t, truth, np.full(len(rows), np.nan))
+    return EstimateTrack(series, tuple(estimates), np.ones(len(rows)))
+
+
+def winkler_by_hand(truth, low, high):
+    score = high - low
+    if truth < low:
+        score += 2 / 0.05 * (low - truth)
+    if truth > high:
+        score += 2 / 0.05 * (truth - high)
+    return score
+
+
+@given(st.lists(frames, min_size=1, max_size=12), st.floats(0.0, 0.1))
+def test_figures_are_those_of_a_slow_loop(rows, loaded_nm):
+    tracks = [track_of(rows[:5]), track_of(rows[5:])]
+    by_load, whole = figures_by_load(tracks, loaded_nm), figures_of(tracks)
+    assert (whole["latency_ms_p50"], whole["frames"]) == (1.0, len(rows))
+    assert "diameter_rmse_mm" not in whole
+    strata = {
+        "loaded": [row for row in rows if abs(row[0]) >= loaded_nm],
+        "unloaded": [row for row in rows if abs(row[0]) < loaded_nm],
+        "all": rows,
+    }
+    for name, chosen in strata.items():
+        figures = by_load.get(name, whole)
+        judged = [(truth, *found) for truth, found in chosen if found is not None]
+        n = len(judged)
+        if chosen:
+            assert figures["valid_fraction"] == pytest.approx(n / len(chosen))
+        assert figures.get("n", len(chosen)) == len(chosen)
+        if n < 2:
+            assert figures["rmse_nm"] is figures["winkler_nm"] is figures["zero_rmse_nm"] is None
+            continue
+        if name == "all" and min(np.ptp(judged, axis=0)[:2]) > 0:
+            assert figures["r"] == pytest.approx(np.corrcoef(*np.array(judged)[:, :2].T)[0, 1])
+        ends = [(truth, value - below, value + above) for truth, value, below, above in judged]
+        assert figures["rmse_nm"] == pytest.approx(math.sqrt(sum((one[1] - one[0]) ** 2 for one in judged) / n))
+        assert figures["zero_rmse_nm"] == pytest.approx(math.sqrt(sum(one[0] ** 2 for one in judged) / n))
+        assert figures["bias_nm"] == pytest.approx(sum(one[1] - one[0] for one in judged) / n, abs=1e-12)
+        assert figures["coverage_95"] == pytest.approx(sum(low <= truth <= high for truth, low, high in ends) / n)
+        assert figures["interval_nm"] == pytest.approx(np.median([high - low for _, low, high in ends]), abs=1e-12)
+        assert figures["winkler_nm"] == pytest.approx(sum(winkler_by_hand(*one) for one in ends) / n, abs=1e-12)
+
+
+def test_the_gain_is_along_the_truth():
+    rows = [(0.1, (0.08, 0.0, 0.0)), (-0.1, (-0.08, 0.0, 0.0)), (0.0, (0.03, 0.0, 0.0)), (0.2, None)]
+    assert figures_by_load([track_of(rows)])["loaded"]["gain"] == pytest.approx(0.8)
+    assert figures_by_load([track_of(rows[2:])])["loaded"]["gain"] is None
+
+
+def test_the_table_of_estimates_has_every_frame_by_its_number_in_the_recording(tmp_path):
+    rows = [(0.1, (0.08, 0.01, 0.02)), (math.nan, (0.05, 0.0, 0.0)), (0.2, None), (0.3, None)]
+    track = track_of(rows)
+    part = EstimateTrack(track.series.between(1, 4), track.estimates[1:], track.latency_ms[1:])
+    write_estimates([track, part], ["a.mcap", "b.mcap"], tmp_path / "e.csv")
+    with (tmp_path / "e.csv").open(newline="") as file:
+        assert file.readline().strip() == COLUMNS
+        file.seek(0)
+        table = list(csv.DictReader(file))
+    assert [(one["recording"], int(one["frame"]), float(one["t_s"])) for one in table] == [
+        *(("a.mcap", i, float(i)) for i in range(4)),
+        *(("b.mcap", i, float(i)) for i in range(1, 4)),
+    ]
+    first, unknown, refused = table[:3]
+    assert [float(first[name]) for name in COLUMNS.split(",")[3:7]] == pytest.approx([0.1, 0.08, 0.07, 0.1])
+    assert (first["diameter_mm"], first["valid"], first["reason"]) == ("", "True", "")
+    assert (unknown["truth_nm"], unknown["torque_nm"]) == ("", "0.05")
+    assert [refused[name] for name in COLUMNS.split(",")[4:]] == [*[""] * 6, "False", "no grip; dead"]

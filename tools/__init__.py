@@ -1,0 +1,1 @@
+"""What a person runs at the desk: recordings, calibrations, evaluation, checks."""

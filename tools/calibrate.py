@@ -1,0 +1,151 @@
+"""Calibrates an estimator on recordings."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from shearloop.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
+from shearloop.estimation.estimator_names import EstimatorName
+from shearloop.estimation.gain import GainCorrection
+from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.values import Measured, distinct
+from shearloop.tools.frame_series import check_no_copies, check_paths_differ, part_of, read_series, series_of
+from shearloop.tools.recordings.reader import read_recording
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationResult:
+    """A calibration, the number of frames behind it, the load cell's timing, named doubts about it, and the tools."""
+
+    calibration: Calibration
+    frames: int
+    timing: LoadTiming = TRUSTED
+    doubts: Sequence[str] = ()
+    tools: Sequence[Measured] = ()
+
+    @property
+    def regressor(self) -> IntervalRegressor | None:
+        """The torque's regressor, None without a torque."""
+        return None if self.calibration.torque is None else self.calibration.torque.regressor
+
+    @property
+    def reads_beyond(self) -> bool | None:
+        """Whether torques beyond the calibrated ones are seen to be beyond; None where that was not tested."""
+        one, calibration = self.regressor, self.calibration
+        if one is None or calibration.kind == "raw" or "full range" in calibration.assumptions:
+            return None
+        return not (one.range.low_end > one.range.low or one.range.high_end < one.range.high)
+
+    @property
+    def tool_mm(self) -> float | None:
+        """The diameter of the only tool in the recordings, None where it is not known."""
+        return None if math.isnan(self.calibration.tool_mm) else self.calibration.tool_mm
+
+    @property
+    def widening(self) -> float | None:
+        """The factor on the loads' intervals for unknown times, None where they are known."""
+        one = self.regressor
+        return round(one.timing_widening, 2) if one is not None and self.timing.uncertainty_s else None
+
+    def figures(self) -> dict[str, object]:
+        """Return the result for scripts."""
+        calibration, timing = self.calibration, self.timing
+        found: dict[str, object] = {
+            "estimator": calibration.estimator.name,
+            "quantities": list(calibration.outputs),
+            "frames": self.frames,
+            "sides": list(calibration.sides),
+            "source": calibration.source,
+            "assumptions": list(calibration.assumptions),
+        }
+        if self.regressor is not None:
+            found["sees_loads"] = not self.regressor.misses_loads
+        if self.reads_beyond is not None:
+            found["reads_beyond"] = self.reads_beyond
+        if timing.references:
+            found["load_cell_delay_s"] = [one and round(one.delay_s, 3) for one in timing.delays]
+            found["load_cell_warnings"] = list(self.doubts)
+            found["timing_uncertainty_s"] = round(timing.uncertainty_s, 3)
+        if self.widening is not None:
+            found["widening"] = self.widening
+        return found | ({"tool_mm": self.tool_mm} if calibration.kind == "raw" else {})
+
+
+def calibrate(
+    paths: Sequence[Path],
+    estimator: EstimatorName,
+    physics: Physics,
+    *,
+    time_range: tuple[float, float],
+    sides: tuple[str, ...] | None = None,
+    load_cell_delay_s: float | None = None,
+    assume_full_range: bool = False,
+    tool_mm: float | None = None,
+) -> CalibrationResult:
+    """Fit an estimator to these shares (0 to 1) of recordings or of folders of slices, oldest first.
+
+    A `load_cell_delay_s` is subtracted from the load cell's times, which are then not checked. With `assume_full_range`
+    no torque will exceed the slices. Raises UserError for recordings that are given twice, and CalibrationError for
+    those that determine no calibration.
+    """
+    check_paths_differ(paths)
+    chosen: list[tuple[Path, FrameSeries]] = []
+    others: list[tuple[str, FrameSeries]] = []
+    all_live = True
+    for path in paths:
+        not_fitted: list[FrameSeries] = []
+        if path.is_dir():
+            own, all_live = read_series(path), False
+        else:
+            recording = read_recording(path)
+            own, all_live = [series_of(recording, sides, tool_mm)], all_live and recording.live
+            if sides is not None and load_cell_delay_s is None:
+                # Other sides may show the load cell's delay better.
+                not_fitted = [series_of(recording, (side,), tool_mm) for side in recording.sides if side not in sides]
+        chosen += [(path, part_of(one, *time_range)) for one in own]
+        others += [(f"{path.name}, {one.sides[0]}", part_of(one, *time_range)) for one in not_fitted]
+    parts = [part for _, part in chosen]
+    check_no_copies([(str(path), part) for path, part in chosen])
+    if load_cell_delay_s:
+        parts = [replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s) for one in parts]
+    timing = TRUSTED if load_cell_delay_s is not None else measure_timing(parts, [one for _, one in others])
+    if all_live:
+        # One clock stamped frames and torques as they arrived, whatever the motion shows.
+        timing = replace(timing, uncertainty_s=0.0)
+    source = _source(paths, time_range, load_cell_delay_s)
+    calibration = fit(estimator, parts, source, physics, timing=timing, full_range=assume_full_range)
+    named = [*((path.name, one) for path, one in chosen), *others]
+    warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]
+    doubts = [f"{name}: {why}" for name, one in named for reference, why in warned if one is reference]
+    tools = distinct([one.tool_mm for one in parts if one.tool_mm is not None])
+    return CalibrationResult(calibration, sum(len(one.t_s) for one in parts), timing, doubts, tools)
+
+
+def adapt_to_recordings(
+    calibration: Calibration,
+    paths: Sequence[Path],
+    physics: Physics,
+    *,
+    time_range: tuple[float, float],
+    load_cell_delay_s: float = 0.0,
+    tool_mm: float | None = None,
+) -> tuple[Calibration, GainCorrection]:
+    """Return a calibration adapted to the twists within these shares of recordings, and the correction of its gain.
+
+    Raises UserError for recordings that are given twice, and CalibrationError for those that show no gain.
+    """
+    check_paths_differ(paths)
+    start, stop = time_range
+    series = [one for path in paths for one in read_series(path, calibration.sides, tool_mm)]
+    # Earlier frames show the session the idle fingertip.
+    until = [part_of(replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s), 0.0, stop) for one in series]
+    first = [part_of(one, start, stop).first_frame for one in series]
+    return adapt(calibration, until, _source(paths, time_range, load_cell_delay_s), physics, first_frames=first)
+
+
+def _source(paths: Sequence[Path], time_range: tuple[float, float], delay_s: float | None) -> str:
+    source = ", ".join(path.name for path in paths)
+    if time_range != (0.0, 1.0):
+        source += " from {:g} to {:g}".format(*time_range)
+    return source + (f", load cell {delay_s:g} s late" if delay_s else "")

@@ -1,0 +1,217 @@
+"""What each part of a configuration is, or what is wrong with it; every file that it names is opened."""
+
+import math
+import os
+import stat
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from shearloop.daemon.errors import USER_ERRORS
+from shearloop.errors import UserError
+from shearloop.words import counted
+
+if TYPE_CHECKING:
+    from shearloop.daemon.config import CurveConfig, DaemonConfig, EmulatorConfig, SkinConfig
+    from shearloop.daemon.control.experiment_schema import Mistake
+    from shearloop.daemon.sensing.frame_estimator import FrameEstimator
+    from shearloop.drivers.robotiq.models import GripperModel
+    from shearloop.drivers.ur.settings import UrLimits, UrSettings
+    from shearloop.tools.plan import Plan
+    from shearloop.yaml_files import Document
+
+# Raises UserError for an emulator of a configuration that cannot be started; the emulators are no affair of this room.
+CheckEmulators = Callable[[tuple["EmulatorConfig", ...], Path], object]
+
+
+# Linux: Documentation/admin-guide/devices.txt.
+_MEMORY_DEVICES = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """A sentence on each part of a configuration, or its mistakes, so that one hides no other."""
+
+    texts: dict[str, str] = field(default_factory=dict)
+    mistakes: dict[str, str] = field(default_factory=dict)
+    # Of the experiment, if there is one that can be read; also of one that is refused.
+    plans: "list[Plan]" = field(default_factory=list)
+
+    @contextmanager
+    def of(self, name: str) -> Iterator[None]:
+        """Keep the mistake that ends the context."""
+        try:
+            yield
+        except USER_ERRORS as error:
+            self.mistakes[name] = str(error)
+
+
+def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulators) -> Parts:
+    """Return what each part of the configuration in this file is; opens every file that it names."""
+    from shearloop.daemon.control.loop_inputs import TorqueSource
+    from shearloop.daemon.experiment_files import read_document
+    from shearloop.daemon.rig import check_experiment, experiment_mistakes, gripper_model
+    from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources
+
+    parts, estimators, combined = Parts(), {}, None
+    with parts.of("emulators"):
+        check_emulators(config.emulators, path)
+    if config.curve is not None:
+        with parts.of("keys"):
+            parts.texts["keys"] = f"{_clients(config.curve)} may connect"
+    for name, fingertip in config.fingertips.items():
+        with parts.of(name):
+            estimator = estimators[name] = open_estimator(fingertip, name)
+            grids, torque = estimator.grids, _torque(estimator)
+            bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
+            parts.texts[name] = f"{bank}, {torque}"
+    if config.combined is not None:
+        with parts.of(COMBINED):
+            combined = open_combined(config.combined, config.fingertips)
+            sides = " and ".join(combined.calibration.sides)
+            parts.texts[COMBINED] = f"{sides} together, {_torque(combined)}"
+    if config.skin is not None:
+        with parts.of("skin"):
+            parts.texts["skin"] = _skin(config.skin)
+    robot = _check_rig(config, parts)
+    _check_paths(config, parts)
+    # What cannot be opened yet counts as what it is configured to be.
+    files = {name: fingertip.calibration for name, fingertip in config.fingertips.items()}
+    files |= {COMBINED: config.combined.calibration} if config.combined is not None else {}
+    unopened = {
+        name: TorqueSource(name=name, period_s=1.0, measures_torque=bool(file), has_gain=bool(file))
+        for name, file in files.items()
+    }
+    sources = unopened | torque_sources(config, estimators, combined)
+    with parts.of("experiment"):
+        warm_up_s = max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0)
+        if config.experiment is not None:
+            document = read_document(config.experiment)
+            mistakes = experiment_mistakes(document.content, config, sources, robot)
+            limits = robot.limits if robot is not None else None
+            _add_plan(parts, document, mistakes, limits, gripper_model(config), warm_up_s)
+        experiment = check_experiment(config, sources, robot)
+        if experiment is not None:
+            text = (
+                f"{experiment.name!r}, {counted(len(experiment.steps), 'step')}, driven by {experiment.torque_source}"
+            )
+            if warm_up_s:
+                text += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
+            parts.texts["experiment"] = text
+    return parts
+
+
+def check_experiment_alone(path: Path) -> Parts:
+    """Return the plan of an experiment, or its mistakes, without a configuration."""
+    from shearloop.daemon.control.experiment_check import check_steps
+    from shearloop.daemon.control.experiment_schema import outline
+    from shearloop.daemon.experiment_files import read_document, without_mistakes
+
+    parts = Parts()
+    with parts.of("experiment"):
+        document = read_document(path)
+        mistakes = check_steps(outline(document.content))
+        _add_plan(parts, document, mistakes)
+        without_mistakes(document, mistakes)
+    return parts
+
+
+def _add_plan(
+    parts: Parts,
+    document: "Document",
+    mistakes: "Sequence[Mistake]",
+    robot: "UrLimits | None" = None,
+    gripper: "GripperModel | None" = None,
+    warm_up_s: float = 0.0,
+) -> None:
+    """Add the plan of an experiment whose keys and values are valid."""
+    from shearloop.daemon.control.experiment_schema import ExperimentFile
+    from shearloop.tools.plan import plan_of
+
+    refused: dict[int, tuple[str, ...]] = {}
+    for (section, *place), why in mistakes:
+        if section == "steps" and place and isinstance(place[0], int):
+            refused[place[0]] = (*refused.get(place[0], ()), why)
+    # A file that cannot be read is named with its mistakes.
+    with suppress(UserError):
+        parts.plans.append(plan_of(document.model(ExperimentFile), robot, gripper, refused, warm_up_s))
+
+
+def _torque(estimator: "FrameEstimator") -> str:
+    if not estimator.measures_torque:
+        return "without torque: no calibration is configured"
+    assumed = estimator.calibration.assumption_text
+    return f"with torque, assuming that {assumed}" if assumed else "with torque"
+
+
+def _check_rig(config: "DaemonConfig", parts: Parts) -> "UrSettings | None":
+    """Check load cell, gripper and robot; return the robot's settings, if there are any."""
+    from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, open_settings
+
+    if (cell := config.load_cell) is not None:
+        with parts.of("load_cell"):
+            load_cell_calibration(cell)
+            own = f"calibration {cell.calibration}" if cell.calibration else "torques in N·m from the board"
+            parts.texts["load_cell"] = own
+    if (hand := config.gripper) is not None:
+        with parts.of("gripper"):
+            gripper_calibration(hand)
+            own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
+            parts.texts["gripper"] = f"{hand.model}, {own}"
+    with parts.of("robot"):
+        if (settings := open_settings(config)) is not None:
+            text = f"{settings.host}, limits of {config.robot}"
+            parts.texts["robot"] = f"{text}. {settings.warning}" if settings.warning else text
+            return settings
+    return None
+
+
+def _check_paths(config: "DaemonConfig", parts: Parts) -> None:
+    """Check that ports are none of files, and the recordings' folder no file; what does not exist may come."""
+    from shearloop.daemon.config import SerialDevice
+
+    for key, section in config.walk():
+        if isinstance(section, SerialDevice) and section.path is not None and (kind := _no_port(section.path)):
+            parts.mistakes[key] = f"`{key}.path: {section.path}` is {kind}; name a serial port: `shearloop ports`"
+    if (recording := config.recording) is not None:
+        exists = next((path for path in (recording.folder, *recording.folder.parents) if path.exists()), None)
+        if exists is not None and not exists.is_dir():
+            parts.mistakes["recording"] = f"`recording.folder: {recording.folder}`: {exists} is a file; name a folder"
+
+
+def _no_port(path: Path) -> str:
+    """Return what a path is instead of a serial port, or an empty string, also where nothing exists."""
+    try:
+        status = path.stat()
+    except OSError:
+        return ""
+    if not stat.S_ISCHR(status.st_mode):
+        return "a folder" if stat.S_ISDIR(status.st_mode) else "a file"
+    # Character devices without a terminal: /dev/null, /dev/zero and their kind.
+    return "no serial port" if os.major(status.st_rdev) == _MEMORY_DEVICES else ""
+
+
+def _clients(curve: "CurveConfig") -> str:
+    from shearloop.daemon.messaging.keys import check_allowed_clients, load_server_keys
+
+    load_server_keys(curve.server_key)
+    return ", ".join(sorted(check_allowed_clients(curve.clients).values()))
+
+
+def _skin(config: "SkinConfig") -> str:
+    from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE
+    from shearloop.daemon.sensing.skin_task import check_circuit
+    from shearloop.estimation.skin.calibration import load_calibration
+
+    calibration = load_calibration(config.calibration)
+    check_circuit(config, calibration)
+    radius = "without torque: no tool_radius_mm" if config.tool_radius_mm is None else "with torque"
+    text = (
+        f"calibration {config.calibration} to {calibration.tension_n[0]:+.1f} … {calibration.tension_n[-1]:+.1f} N, "
+        f"± {calibration.prediction_half_width_n:.3f} N, {radius}"
+    )
+    if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MAX_CHANGE:
+        text += "; its gauges are too similar at rest to detect swapped wires: check the sign of a push"
+    return text

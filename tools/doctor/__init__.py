@@ -1,0 +1,208 @@
+"""`shearloop doctor`: checks the computer, files and devices, and names the next step for each fault."""
+
+import asyncio
+import ctypes
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from shearloop.bank.bank_file import Bank
+from shearloop.bank.errors import BankError
+from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
+from shearloop.drivers.ur.client import missing_library
+from shearloop.errors import UserError
+from shearloop.tools.check import CheckEmulators, check_parts
+from shearloop.tools.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
+from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, trouble
+from shearloop.tools.serial_ports import HiddenBoard, has_brltty, list_hidden_boards, list_serial_ports
+
+__all__ = ["Finding", "examine"]
+
+# An hour of recording takes some 80 MB.
+LOW_DISK_BYTES, NO_DISK_BYTES = 2e9, 2e8
+# An earlier time means that the clock was never set.
+FIRST_SANE_UNIX_S = 1_704_067_200
+# adjtimex(2): the clock is not synchronised.
+_TIME_ERROR = 5
+
+
+def examine(
+    config_path: Path | None, seconds: float, check_emulators: CheckEmulators, geometry: Path | None = None
+) -> Iterator[Finding]:
+    """Yield one finding after another; listen to all devices at once for `seconds`."""
+    yield from check_computer()
+    yield from check_ports()
+    if config_path is None:
+        yield check_disk(Path())
+        yield note("configuration", "not given", "files and devices were not checked", "`shearloop doctor CONFIG`")
+        return
+    try:
+        config = load_daemon_config(config_path)
+    except UserError as error:
+        yield from_file("configuration", str(error), "the daemon does not start")
+        return
+    yield good("configuration", f"{config_path} is in order")
+    yield check_disk(Path() if config.recording is None else config.recording.folder)
+    yield from check_files(config, config_path, check_emulators, geometry)
+    tasks = daemon_tasks(config.commands)
+    if tasks is not None:
+        yield good("daemon", f"answers at {config.commands}; it holds the devices and reports on them")
+        received = {} if "publish" in config.network_addresses else listen_for_frames(config.publish, seconds)
+        yield from check_daemon(config, tasks, received)
+    elif config.emulators:
+        means = "they exist only while the daemon runs"
+        cure = f"`shearloop run {config_path}`, then run the doctor again"
+        yield note("devices", "the configuration emulates them", means, cure)
+    else:
+        yield good("daemon", "not running with this configuration: the devices are free")
+        yield from asyncio.run(check_devices(config, seconds))
+
+
+def check_computer() -> Iterator[Finding]:
+    """Check the clock and the robot's library."""
+    yield check_clock(time.time(), clock_state())
+    version = ".".join(map(str, sys.version_info[:2]))
+    if reason := missing_library():
+        cause, _, cure = reason.partition(": ")
+        yield note("robot's library", cause, "everything but the robot works", cure)
+    else:
+        yield good("robot's library", f"ur-rtde is installed, Python {version}")
+
+
+def clock_state() -> int:
+    """Return adjtimex(2)'s answer: 5 when the clock is not synchronised, -1 when it cannot be asked."""
+    # struct timex takes 208 bytes on 64-bit Linux; `modes` 0 changes nothing.
+    try:
+        return int(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)))
+    except (OSError, AttributeError):
+        return -1
+
+
+def check_clock(unix_s: float, state: int) -> Finding:
+    """Check the system clock's time and adjtimex's answer."""
+    today = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(unix_s))
+    if unix_s < FIRST_SANE_UNIX_S:
+        cure = "set it: `sudo timedatectl set-ntp true`"
+        return trouble("clock", f"it says {today}", "recordings and messages carry a wrong time", cure)
+    if state == _TIME_ERROR:
+        means = "times in messages and recordings drift against other computers; the loop uses another clock"
+        cure = "`sudo timedatectl set-ntp true`, if the network allows it"
+        return note("clock", f"it says {today} and is not synchronised", means, cure)
+    return good("clock", f"it says {today}" + (" and is synchronised" if state >= 0 else ""))
+
+
+def check_disk(folder: Path) -> Finding:
+    """Check the space for recordings in a folder, or in its nearest existing parent."""
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.is_dir())
+    free = shutil.disk_usage(existing).free
+    found = f"{free / 1e9:.1f} GB are free in {existing}"
+    if not os.access(existing, os.W_OK):
+        return note("disk", f"you may not write in {existing}", "recordings fail there", "choose another folder")
+    if free < NO_DISK_BYTES:
+        return trouble("disk", found, "recordings fail and experiments do not start", "free some space")
+    if free < LOW_DISK_BYTES:
+        return note("disk", found, "enough for a day of recordings at most", "free some space before a long experiment")
+    return good("disk", found)
+
+
+def check_ports() -> Iterator[Finding]:
+    """List the USB serial ports with their serial numbers, and the boards that have none."""
+    ports, hidden = list_serial_ports(), list_hidden_boards()
+    yield from map(_explain_hidden, hidden)
+    if not ports:
+        if not hidden:
+            means = "no board is plugged in, or the system has not noticed it"
+            yield note("USB serial ports", "none", means, "plug the boards in; look at `sudo dmesg | tail`")
+        return
+    shown = ", ".join(f"{port.path} ({port.serial_number or 'without a serial number'})" for port in ports)
+    denied = "; ".join(f"{port.path}: {port.error}" for port in ports if port.error)
+    if denied:
+        yield note("USB serial ports", shown, denied, "see `shearloop ports`")
+    else:
+        yield good("USB serial ports", shown)
+
+
+def _explain_hidden(board: HiddenBoard) -> Finding:
+    subject = f"USB {board.usb}"
+    found = f"likely the {board.likely}; it is plugged in and has no serial port"
+    if has_brltty():
+        means = "brltty, which serves Braille displays, takes boards with such a converter"
+        cure = "`sudo apt remove brltty` if nobody needs a Braille display here; then plug the board in again"
+        return trouble(subject, found, means, cure)
+    means = "the kernel's driver for it is missing, or another program has taken the board"
+    modules = "`sudo apt install linux-modules-extra-$(uname -r)`"
+    cure = f"look at `sudo dmesg | tail`; on Ubuntu {modules}, then plug it in again"
+    return trouble(subject, found, means, cure)
+
+
+def check_files(
+    config: DaemonConfig, path: Path, check_emulators: CheckEmulators, geometry: Path | None
+) -> Iterator[Finding]:
+    """Check every file of the configuration in `path`; `geometry` is the fingertip that its bank must match."""
+    banks = [check_bank(name, fingertip, geometry) for name, fingertip in config.fingertips.items()]
+    yield from banks
+    parts = check_parts(config, path, check_emulators)
+    for name, text in parts.texts.items():
+        if name != "keys":
+            yield good(f"files of {name}", text)
+    for name, mistake in parts.mistakes.items():
+        kind = from_file if "\n" in mistake else from_error
+        finding = kind(f"files of {name}", mistake, "the daemon does not start")
+        if name != "keys" and finding.found not in [one.found for one in banks]:
+            yield finding
+    yield check_keys(config.curve, config.network_addresses)
+
+
+def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = None) -> Finding:
+    """Check a bank's checksums and channel table, and its geometry if one is given."""
+    subject = f"bank of {name}"
+    if fingertip.bank is None:
+        return note(subject, "not configured", "there are no heatmaps, no k and no sigma", "add `bank:` to get them")
+    try:
+        bank = Bank.open(fingertip.bank, verify=True)
+    except BankError as error:
+        return from_error(subject, error, "no frame can be matched, and the daemon does not start")
+    found = (
+        f"{fingertip.bank} is intact, {int(bank.valid.sum())} of {bank.valid.size} cells valid, channel table "
+        f"{bank.table.digest[:12]} with {bank.table.n_channels} channels, geometry {bank.geometry_hash[:12]}"
+    )
+    if geometry is None:
+        return good(subject, found)
+    from shearloop.tools.bank_config import load_geometry
+
+    try:
+        digest = load_geometry(geometry).mesh.digest
+    except (UserError, BankError) as error:
+        return from_error(subject, error, "the bank cannot be compared with it")
+    if digest != bank.geometry_hash:
+        means = "the bank belongs to another fingertip or another mesh; estimates are wrong"
+        cure = "build it again with `shearloop bank build`, or give the geometry it was built from"
+        return trouble(subject, f"{found}; {geometry} is {digest[:12]}", means, cure)
+    return good(subject, f"{found}, which is {geometry}")
+
+
+def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
+    """Say who may connect from the network, and check that the secret key is secret."""
+    from shearloop.daemon.messaging.keys import check_allowed_clients, load_server_keys, server_key_file
+
+    if curve is None:
+        return good("keys", "not needed: every address is on this computer")
+    try:
+        load_server_keys(curve.server_key)
+        clients = check_allowed_clients(curve.clients)
+    except UserError as error:
+        return from_error("keys", error, "the daemon does not start")
+    path = server_key_file(curve.server_key)
+    mode = path.stat().st_mode & 0o777
+    if mode & 0o077:
+        means = "a reader of this key can pose as the daemon"
+        cure = f"`chmod 600 {path}`; make new keys if somebody may have read it"
+        return trouble("keys", f"others can read {path} (mode {mode:o})", means, cure)
+    if not network:
+        means = "nobody else can connect"
+        cure = "set `publish` and `commands` to tcp://0.0.0.0:PORT to let others connect"
+        return note("keys", "there are keys, but every address is on this computer", means, cure)
+    return good("keys", f"{', '.join(sorted(clients.values()))} may connect to {' and '.join(network.values())}")

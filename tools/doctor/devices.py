@@ -1,0 +1,181 @@
+"""Checks of the devices: opened and listened to directly, or through the daemon that holds them."""
+
+import asyncio
+import contextlib
+import time
+from collections import defaultdict
+from collections.abc import Awaitable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shearloop.daemon.config import DaemonConfig, GripperConfig, SerialDevice
+from shearloop.daemon.messaging.client import receive_messages, send_command
+from shearloop.daemon.messaging.stop_client import send_to_stop_socket
+from shearloop.daemon.rig import make_gripper_client
+from shearloop.daemon.sensing.frame_estimator import fingertip_table
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
+from shearloop.drivers.ur.control_box import REMOTE_CURE, check_ports, query_controller, untested_sentence
+from shearloop.drivers.ur.messages import RobotLostError
+from shearloop.drivers.ur.settings import read_settings
+from shearloop.errors import UserError
+from shearloop.tools.doctor.boards import (
+    check_adc,
+    check_channels,
+    check_fingertip,
+    check_load_cell,
+    check_port,
+    check_rate,
+)
+from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
+from shearloop.tools.task_row import task_row
+
+ROBOT_TIMEOUT_S = 2.0
+DAEMON_TIMEOUT_S = 1.0
+
+
+async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
+    """Open every device, listen to all at once for `seconds`, and return findings in the configuration's order."""
+    checks: list[Awaitable[list[Finding]]] = [
+        check_fingertip(name, fingertip, seconds) for name, fingertip in config.fingertips.items()
+    ]
+    if config.load_cell is not None:
+        checks.append(check_load_cell(config.load_cell, seconds))
+    if config.skin is not None:
+        if config.skin.source.serial is not None:
+            checks.append(asyncio.to_thread(_check_source, config.skin.source.serial))
+        if config.skin.daq.adc is not None:
+            checks.append(check_adc("skin's DAQ", config.skin.daq.adc, config.skin.daq.rate_hz, seconds))
+    if config.gripper is not None:
+        checks.append(_check_gripper(config.gripper))
+    if config.robot is not None:
+        checks.append(asyncio.to_thread(lambda path: [*_check_robot(path)], config.robot))
+    return [finding for findings in await asyncio.gather(*checks) for finding in findings]
+
+
+def _check_source(device: SerialDevice) -> list[Finding]:
+    return [check_port("skin's source", device)]
+
+
+async def _check_gripper(config: GripperConfig) -> list[Finding]:
+    client = make_gripper_client(config)
+    try:
+        await client.connect()
+        state = await client.read()
+    except DriverError as error:
+        cure = "check its power and cable, and end other programs that use it"
+        return [from_error("gripper", error, "nothing can be gripped", cure)]
+    finally:
+        await client.close()
+    if state.flt:
+        found = f"{client.name} answers, with fault {state.flt}: {fault_of(state.flt).sentence}"
+        return [from_error("gripper", found, "it does not move", "`shearloop command unlock`")]
+    if state.sta is not ActivationStatus.ACTIVE:
+        cure = "keep fingers and tools away when the daemon starts"
+        return [note("gripper", f"{client.name} answers; not activated", "it opens and closes once at the start", cure)]
+    return [good("gripper", f"{client.name} answers and is activated")]
+
+
+def _check_robot(settings: Path) -> Iterator[Finding]:
+    try:
+        host = read_settings(settings).host
+        try:
+            check_ports(host, ROBOT_TIMEOUT_S)
+        except RobotLostError as error:
+            yield from_error("robot's ports", error, "the daemon cannot drive the robot without them")
+        seen = query_controller(host, ROBOT_TIMEOUT_S)
+    except DriverError as error:
+        cure = "look at the teach pendant, and check the cable and `host` in the robot's settings"
+        yield from_error("robot", error, "the robot cannot be driven", cure)
+        return
+    answers = f"{host} answers, PolyScope {seen.version}"
+    if untested := untested_sentence(seen.version):
+        what, _, cure = untested.rpartition(": ")
+        yield note("robot", answers, what, cure.rstrip("."))
+    else:
+        yield good("robot", answers)
+    if seen.remote is False:
+        means = "it accepts no motion from the network"
+        yield trouble("remote control", "the robot is in local control", means, REMOTE_CURE)
+    else:
+        yield good("remote control", "on" if seen.remote else "this controller has no such mode")
+    mode = f"robot mode {seen.robot_mode}, safety mode {seen.safety_mode}"
+    if seen.robot_mode == "RUNNING" and seen.safety_mode in ("NORMAL", "REDUCED"):
+        yield good("robot's mode", mode)
+    else:
+        cure = "make the cell safe, start the daemon, then `shearloop command unlock`"
+        yield note("robot's mode", mode, "the arm does not move in this mode", cure)
+    if seen.registers_free:
+        yield good("robot's registers", "free")
+    else:
+        means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
+        cure = "close the other program, or disable the adapter under Installation → Fieldbus"
+        yield trouble("robot's registers", "in use", means, cure)
+
+
+def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
+    """Return the status of a running daemon's tasks; None when no daemon answers."""
+    try:
+        request = {"command": "status"}
+        reply = send_to_stop_socket(address, request, DAEMON_TIMEOUT_S)
+        tasks = (reply or send_command(address, request, DAEMON_TIMEOUT_S)).get("tasks")
+    except (UserError, TimeoutError):
+        return None
+    return tasks if isinstance(tasks, dict) else {}
+
+
+def listen_for_frames(address: str, seconds: float) -> dict[str, list[Mapping[str, Any]]]:
+    """Collect the frames of a local daemon's fingertips for `seconds`, by their names."""
+    received: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+    end_s = time.monotonic() + seconds
+    with contextlib.suppress(UserError):
+        # `health` comes every second.
+        for topic, content in receive_messages(address, ("eit.frame", "health"), seconds):
+            if topic == "eit.frame":
+                received[str(content["source"])].append(content)
+            if time.monotonic() > end_s:
+                break
+    return received
+
+
+def check_daemon(
+    config: DaemonConfig, tasks: Mapping[str, Mapping[str, Any]], received: Mapping[str, list[Mapping[str, Any]]]
+) -> Iterator[Finding]:
+    """Judge a running daemon by its tasks and by the frames of its fingertips."""
+    for name, status in tasks.items():
+        yield check_task(name, status)
+    for name, own in config.fingertips.items():
+        if frames := received.get(name):
+            # The daemon opens a silent board again; such a pause is no period of the board.
+            period_s = _usual_period_s(frames)
+            if period_s:
+                measured_hz = 1.0 / period_s
+                key = f"fingertips.{name}.frame_period_s"
+                yield check_rate(f"rate of {name}", measured_hz, 1.0 / own.frame_period_s, key, as_period=True)
+            saturated = max(int(frame.get("saturated") or 0) for frame in frames)
+            channels = np.array([frame["channels"] for frame in frames], dtype=np.float64)
+            yield check_channels(name, channels, saturated, fingertip_table(own))
+
+
+def _usual_period_s(frames: Sequence[Mapping[str, Any]]) -> float:
+    """Return the median distance of the frames' times; 0 for a single frame."""
+    steps_ns = np.diff([int(frame["t_mono_ns"]) for frame in frames])
+    return float(np.median(steps_ns)) / 1e9 if len(steps_ns) else 0.0
+
+
+def check_task(name: str, status: Mapping[str, Any]) -> Finding:
+    """Judge one task by what it reports."""
+    subject, (_, state, _, notes) = f"task {name}", task_row(name, status)
+    found = f"{state}, {notes}" if notes else state
+    if state == "DEAD" or status.get("restarts"):
+        judge = trouble if state == "DEAD" else note
+        means = "an error ended it, and it starts again by itself"
+        return judge(subject, found, means, "read the daemon's log; report it if it comes back")
+    if state == "not connected":
+        return from_error(subject, found, "nothing comes from its device", "check its port, cable and power")
+    if notes:
+        what, cure = split_cure(found)
+        return note(subject, what, "what is refused or dead is not used", cure or "see docs/troubleshooting.md")
+    return good(subject, found)

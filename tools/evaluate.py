@@ -1,0 +1,232 @@
+"""Evaluates a calibration on recordings: every frame in order through a session, against the truth."""
+
+import csv
+import math
+import re
+import time
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.bank_file import Bank
+from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
+from shearloop.estimation.defaults import LOADED_NM
+from shearloop.estimation.values import winkler_scores
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Figures: TypeAlias = dict[str, float | int | None]
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
+_UNITS = {"torque": "nm", "diameter": "mm"}
+# Of the names of an estimate and of the ends of its interval.
+_ENDS = ("", "_low", "_high")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimateTrack:
+    """One series with an estimate per frame, and the time that each took."""
+
+    series: FrameSeries
+    estimates: tuple[Estimate, ...]
+    latency_ms: FloatArray
+
+    def since(self, first_frame: int) -> "EstimateTrack":
+        """Return the part from a frame of the recording on."""
+        first = first_frame - self.series.first_frame
+        series = self.series.between(first, len(self.estimates))
+        return EstimateTrack(series, self.estimates[first:], self.latency_ms[first:])
+
+
+def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> EstimateTrack:
+    """Estimate every frame of a series in order, as live; raises CalibrationError for a series of other sides."""
+    chosen = series.select_sides(calibration.sides)
+    session = EstimatorSession(calibration, bank)
+    session.set_tool(chosen.tool_mm)
+    estimates, latency = [], []
+    for t_s, channels in zip(chosen.t_s, chosen.channels, strict=True):
+        begun = time.perf_counter()
+        estimates.append(session.estimate(TactileFrame.of(float(t_s), channels)))
+        latency.append(1e3 * (time.perf_counter() - begun))
+    return EstimateTrack(chosen, tuple(estimates), np.array(latency))
+
+
+def estimate_in_worker(shared: tuple[Calibration, str | None], series: FrameSeries) -> EstimateTrack:
+    """Return `estimate_series` for a calibration and the bank's path, which the worker opens."""
+    calibration, path = shared
+    return estimate_series(calibration, series, None if path is None else Bank.open(path))
+
+
+def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
+    """Return the figures of all frames, by the names that `shearloop evaluate` prints.
+
+    Only valid frames with a known truth are judged; with fewer than two of them, errors are None. interval_nm is the
+    median width of the intervals. winkler_nm is their mean score. zero_rmse_nm is the error of an estimate of 0. Known
+    diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a torque, coverage_95 is of
+    the diameter.
+    """
+    torque, diameter = (_compare(_known_frames(tracks, quantity), unit) for quantity, unit in _UNITS.items())
+    valid = [estimate.valid for track in tracks for estimate in track.estimates]
+    latency = np.concatenate([track.latency_ms for track in tracks])
+    figures = {name: value for name, value in torque.items() if name not in ("n", "gain")} | {
+        "valid_fraction": float(np.mean(valid)) if valid else None,
+        "latency_ms_p50": float(np.quantile(latency, 0.5)) if len(latency) else None,
+        "latency_ms_p99": float(np.quantile(latency, 0.99)) if len(latency) else None,
+        "frames": len(valid),
+    }
+    if not torque["valid_fraction"]:
+        figures["coverage_95"] = diameter["coverage_95"]
+    if any(np.isfinite(track.series.diameter_mm).any() for track in tracks):
+        figures |= {f"diameter_{name}": diameter[name] for name in ("rmse_mm", "coverage_95", "interval_mm")}
+    return figures
+
+
+def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_NM) -> dict[str, Figures]:
+    """Return the torque's figures of `loaded` frames, with a torque of loaded_nm or more in size, and of the others.
+
+    n frames have a known truth, and valid_fraction of them an estimate. Only these are judged. gain is the mean
+    estimate over the mean truth, both along the truth.
+    """
+    frames = _known_frames(tracks, "torque")
+    is_loaded = np.abs(frames[0]) >= loaded_nm
+    found = {"loaded": _compare(frames[:, is_loaded], "nm"), "unloaded": _compare(frames[:, ~is_loaded], "nm")}
+    for figures in found.values():
+        del figures["r"]
+    del found["unloaded"]["gain"]
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class InvalidReason:
+    """Why `frames` were not valid: the most frequent sentence, an example if the numbers in it `differ`."""
+
+    frames: int
+    sentence: str
+    differ: bool
+
+
+def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
+    """Return why frames were not valid, the most frequent first; sentences that differ in numbers count as one."""
+    kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    for reason in (reason for track in tracks for estimate in track.estimates for reason in estimate.reasons):
+        kinds[_NUMBER.sub("#", reason)][reason] += 1
+    found = [InvalidReason(counts.total(), counts.most_common(1)[0][0], len(counts) > 1) for counts in kinds.values()]
+    return sorted(found, key=lambda reason: -reason.frames)
+
+
+def values_of(estimates: Sequence[Estimate], quantity: str = "torque") -> FloatArray:
+    """Return estimate and the interval's ends (3, n) in N·m or mm, NaN without an estimate."""
+    names = [f"{quantity}{end}_{_UNITS[quantity]}" for end in _ENDS]
+    # None becomes NaN.
+    return np.array([[getattr(estimate, name) for estimate in estimates] for name in names], dtype=np.float64)
+
+
+def _frames(track: EstimateTrack, quantity: str) -> FloatArray:
+    """Return truth, estimate and the interval's ends (4, n) of all frames, NaN for unknown ones."""
+    truth = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
+    return np.array([truth, *values_of(track.estimates, quantity)])
+
+
+def _known_frames(tracks: Sequence[EstimateTrack], quantity: str) -> FloatArray:
+    """Return truth, estimate and the interval's ends (4, n) of the frames with a known truth."""
+    frames = np.concatenate([_frames(track, quantity) for track in tracks], axis=1)
+    return frames[:, np.isfinite(frames[0])]
+
+
+def _compare(frames: FloatArray, unit: str) -> Figures:
+    """Return the figures of a quantity's frames (4, n), None where fewer than two of them are estimated."""
+    truth, value, low, high = frames[:, np.isfinite(frames[1])]
+    n = frames.shape[1]
+    counts: Figures = {"n": n, "valid_fraction": len(truth) / n if n else None}
+    if len(truth) < 2:
+        errors = (f"{name}_{unit}" for name in ("rmse", "zero_rmse", "bias", "interval", "winkler"))
+        return counts | dict.fromkeys(("r", "gain", "coverage_95", *errors))
+    error, size = value - truth, float(np.abs(truth).sum())
+    changing = value.std() > 0 and truth.std() > 0
+    return {
+        "r": float(np.corrcoef(value, truth)[0, 1]) if changing else None,
+        "gain": float((value * np.sign(truth)).sum()) / size if size else None,
+        f"rmse_{unit}": float(np.sqrt((error**2).mean())),
+        f"zero_rmse_{unit}": float(np.sqrt((truth**2).mean())),
+        f"bias_{unit}": float(error.mean()),
+        "coverage_95": float(((low <= truth) & (truth <= high)).mean()),
+        f"interval_{unit}": float(np.median(high - low)),
+        f"winkler_{unit}": float(winkler_scores(truth, low, high).mean()),
+        **counts,
+    }
+
+
+def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:
+    """Write a CSV row for every frame of each named series; cells without a truth or an estimate are empty."""
+    values = [f"{quantity}{end}_{unit}" for quantity, unit in _UNITS.items() for end in _ENDS]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(["recording", "frame", "t_s", "truth_nm", *values, "valid", "reason"])
+        for track, name in zip(tracks, names, strict=True):
+            series = track.series
+            truths = [None if math.isnan(one) else one for one in series.torque_at_frames().tolist()]
+            frames = enumerate(zip(series.t_s.tolist(), truths, track.estimates, strict=True), series.first_frame)
+            for number, (t_s, truth, estimate) in frames:
+                cells = [getattr(estimate, one) for one in values]
+                table.writerow([name, number, t_s, truth, *cells, estimate.valid, "; ".join(estimate.reasons)])
+
+
+def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: str, path: Path) -> None:
+    """Write a figure with a named row per series: truth, estimates with intervals, and where none is valid."""
+    from matplotlib.ticker import MaxNLocator
+
+    from shearloop.tools.drawing import figure
+
+    made = figure(11, 3.2 * len(tracks))
+    rows = np.ravel(made.subplots(len(tracks), 1, squeeze=False))
+    for axes, track, row_name in zip(rows, tracks, names, strict=True):
+        slices = track.series.kind == "difference"
+        # A stream has one tool: its diameter would be a flat line.
+        is_torque = not slices or not np.isfinite(track.series.diameter_mm).any()
+        truth, value, low, high = _frames(track, "torque" if is_torque else "diameter")
+        t_s = track.series.t_s
+        known = "load cell" if is_torque else "known diameter"
+        axes.plot(t_s, truth, "ko" if slices else "k-", linewidth=1.0, markersize=5, label=known)
+        if slices:
+            shown = "estimate with its 95 % interval"
+            axes.errorbar(t_s, value, [value - low, high - value], fmt="s", markersize=4, label=shown)
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        else:
+            _draw_intervals(axes, t_s, value, low, high)
+        axes.set_title(row_name + (_loaded_text(track) if is_torque else ""), loc="left", fontsize="medium")
+        axes.set_xlabel("slice" if slices else "time in s")
+        axes.set_ylabel("torque in N·m" if is_torque else "diameter in mm")
+    labelled = {label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    made.legend(labelled.values(), labelled, loc="outside lower left", ncols=3, frameon=False, fontsize="small")
+    made.suptitle(title)
+    made.savefig(path, dpi=110)
+
+
+def _draw_intervals(axes: "Axes", t_s: FloatArray, value: FloatArray, low: FloatArray, high: FloatArray) -> None:
+    """Draw a stream's estimates and intervals, hatched where a load cell is not pushed."""
+    axes.plot(t_s, value, linewidth=1.2, label="estimate")
+    axes.fill_between(t_s, low, high, alpha=0.25, linewidth=0, label="95 % interval of the estimate")
+    axes.fill_between(
+        t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
+        label="no valid estimate",
+    )  # fmt: skip
+    hanging = (value == 0) & ~np.isclose(low, -high)
+    if hanging.any():
+        label = "no load on a load cell that is pushed from one side: the tool may be twisted this far the other way"
+        axes.fill_between(
+            t_s, low, high, where=hanging, facecolor="none", edgecolor="0.6", hatch="///", linewidth=0, label=label
+        )
+
+
+def _loaded_text(track: EstimateTrack) -> str:
+    """Return the errors of a track's loaded frames as the end of a title, empty without any."""
+    loaded = figures_by_load([track])["loaded"]
+    error, zero = loaded["rmse_nm"], loaded["zero_rmse_nm"]
+    if error is None or zero is None:
+        return ""
+    return f"; {loaded['n']} loaded frames: RMSE {error:.2g} N·m (always saying 0: {zero:.2g})"

@@ -1,0 +1,215 @@
+"""Recordings and folders of slices as series of frames, with the tool of each and a check for copies."""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT_NOTE, SIDES
+from shearloop.errors import UserError
+from shearloop.estimation import FrameSeries, Measured
+from shearloop.estimation.calibration import LARGEST_TOOL_SHARE
+from shearloop.tools.recordings.matlab_import import (
+    DIAMETER_FOLDER,
+    TORQUE_FOLDER,
+    Slices,
+    read_diameter_slices,
+    read_torque_slices,
+)
+from shearloop.tools.recordings.reader import Recording, read_recording
+from shearloop.words import counted
+
+# Slices do not name their side.
+SLICE_SIDE = "right"
+# Largest distance in time of a pair of frames, as a share of the period.
+_LARGEST_APART = 0.75
+# Share of the time with another grip that does not count as another tool: the fingers met something or gripped again.
+_MOMENTARY = 0.05
+
+
+def read_series(
+    path: str | Path, sides: tuple[str, ...] | None = None, tool_mm: float | None = None
+) -> list[FrameSeries]:
+    """Return the series of a recording, of a folder of slices, or of a folder with torque_slices and diameter_slices.
+
+    `sides` selects the sides of a recording, by default all; `tool_mm` is the diameter of its tool, if the recording
+    does not name it. Raises UserError for anything else.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return [series_of(read_recording(path), sides, tool_mm)]
+    inside = [path / name for name in (TORQUE_FOLDER, DIAMETER_FOLDER) if (path / name).is_dir()]
+    if inside:
+        return [series for folder in inside for series in read_series(folder)]
+    names = [one.name for one in path.iterdir()]
+    if any(name.startswith("Data_Slice_") for name in names):
+        return [_series_of_slices(read_torque_slices(path))]
+    if any("mm_Data_" in name for name in names):
+        return [_series_of_slices(read_diameter_slices(path))]
+    raise UserError(
+        f"{path} is a folder without slices; name a recording (.mcap, from `shearloop run --record` or `shearloop "
+        "import`), or a folder of slices"
+    )
+
+
+def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> FrameSeries:
+    """Return a recording's frames, several sides paired by time at their mean time.
+
+    Times are in seconds since the middle of the recording's first frame of the right side, or of the left one without
+    a right side. This does not depend on `sides`.
+    """
+    known = tuple(side for side in SIDES if side in recording.sides) or tuple(recording.sides)
+    wanted = sides or known
+    missing = [side for side in wanted if side not in recording.sides]
+    if missing or not wanted:
+        # Only frames of SIDES can be imported.
+        cure = "import those files as well" if {*SIDES} >= {*missing} else "name a side that it has"
+        raise UserError(
+            f"{recording.path} has frames of {' and '.join(recording.sides) or 'no side'}, not of "
+            f"{' and '.join(missing) or 'any'}; {cure}"
+        )
+    first = recording.sides[wanted[0]]
+    rows = [_nearest(first.t_mid_ns, recording.sides[side].t_mid_ns) for side in wanted]
+    period_ns = float(np.median(np.diff(first.t_mid_ns))) if len(first.t_mid_ns) > 1 else 1.0
+    times = np.array([recording.sides[side].t_mid_ns[row] for side, row in zip(wanted, rows, strict=True)])
+    paired = np.ptp(times, axis=0) <= _LARGEST_APART * period_ns
+    lines = [recording.sides[side].lines[row][paired] for side, row in zip(wanted, rows, strict=True)]
+    start = int(recording.sides[known[0]].t_mid_ns[0])
+    t_s = (times[:, paired] - start).mean(axis=0) / 1e9
+    diameter_mm, gripper_mm = tool_of(recording, first.t_mid_ns, tool_mm)
+    return FrameSeries(
+        "raw",
+        wanted,
+        t_s,
+        np.stack([recording.table.channels_of_line(one) for one in lines], axis=1),
+        (recording.torque_t_ns - start) / 1e9,
+        recording.torque_nm,
+        np.full(len(t_s), diameter_mm),
+        gripper_mm,
+        recording.table,
+        load_doubt=recording.notes.get(LOAD_DOUBT_NOTE, ""),
+    )
+
+
+def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:
+    """Return the frames between two shares (0 to 1) of a series, in time order; UserError for an empty part."""
+    n = len(series.t_s)
+    first, end = round(start * n), round(stop * n)
+    if first == end:
+        raise UserError(f"none of {n} frames lies between the shares {start:g} and {stop:g}; use a longer part")
+    return series.between(first, end)
+
+
+def _nearest(wanted: IntArray, times: IntArray) -> IntArray:
+    """Return the places of the nearest of rising times, the earlier of two that are equally near."""
+    return np.searchsorted(times[:-1] + np.diff(times) // 2, wanted)
+
+
+def _series_of_slices(slices: Slices) -> FrameSeries:
+    """Return slices in time order; slices of cylinders in turn, so that every part in time has all cylinders."""
+    diameter_mm, t_s = slices.diameter_mm, slices.numbers.astype(np.float64)
+    order = np.arange(len(t_s))
+    if np.isfinite(diameter_mm).all():
+        numbers = np.concatenate([np.arange(count) for count in np.unique(diameter_mm, return_counts=True)[1]])
+        order, t_s = np.lexsort((diameter_mm, numbers)), np.arange(len(t_s), dtype=np.float64)
+    frames, torque_nm = slices.differences[order, None], slices.torque_nm[order]
+    return FrameSeries("difference", (SLICE_SIDE,), t_s, frames, t_s, torque_nm, diameter_mm[order])
+
+
+def tool_of(recording: Recording, t_ns: IntArray, given_mm: float | None = None) -> tuple[float, Measured | None]:
+    """Return the diameter of a recording's tool in mm, NaN if unnamed, and then the gripper's, if it has one.
+
+    The recording's notes come first, then `given_mm`, then the gripper's width while frames were taken (at t_ns, Unix
+    nanoseconds). Raises UserError where the gripper held several tools, or another one than is named, unless
+    `given_mm` decides.
+    """
+    named_mm = _named_mm(recording)
+    held = _held_mm(recording, t_ns)
+    conflict = ""
+    if len(held) > 1:
+        conflict = f"the gripper held tools of {' and '.join(f'{one.value:.1f}' for one in held)} mm"
+    elif held and _is_another(held[0].value, Measured(named_mm, held[0].half_width)):
+        conflict = f"it names a tool of {named_mm:g} mm, and the gripper held one of {held[0].value:.1f} mm"
+    if conflict and given_mm is None:
+        raise UserError(
+            f"{recording.path}: {conflict}; record one tool at a time, correct the experiment's `tool_mm`, or "
+            "calibrate with --tool-mm if you know which it was"
+        )
+    if given_mm is not None and (conflict or np.isnan(named_mm)):
+        return given_mm, None
+    return named_mm, held[0] if held and np.isnan(named_mm) else None
+
+
+def _named_mm(recording: Recording) -> float:
+    text = recording.notes.get(DIAMETER_NOTE)
+    if text is None:
+        return float("nan")
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < LARGEST_DIAMETER_MM:
+        raise UserError(f"{recording.path}: its notes give the diameter {text!r}, not a value in mm; record it again")
+    return value
+
+
+def _held_mm(recording: Recording, t_ns: IntArray) -> list[Measured]:
+    """Return the tool that the gripper held while frames were taken, or two if it changed."""
+    if not recording.tools:
+        return []
+    tools = [tool for _, tool in recording.tools]
+    rows = np.searchsorted([since_ns for since_ns, _ in recording.tools], t_ns, side="right") - 1
+    held = [tool for row in rows.tolist() if row >= 0 and (tool := tools[row]) is not None]
+    if not held:
+        return []
+    usual = sorted(held, key=lambda one: one.value)[len(held) // 2]
+    others = [one for one in held if _is_another(one.value, usual)]
+    return [usual] if len(others) <= _MOMENTARY * len(held) else [usual, others[len(others) // 2]]
+
+
+def _is_another(diameter_mm: float, tool: Measured) -> bool:
+    return abs(diameter_mm - tool.value) > LARGEST_TOOL_SHARE * tool.value + tool.half_width
+
+
+def check_paths_differ(paths: Sequence[Path]) -> None:
+    """Raise UserError for a recording or a folder that is named twice, under the same name or another."""
+    known: dict[Path, Path] = {}
+    for path in paths:
+        first = known.setdefault(path.resolve(), path)
+        if first is not path:
+            also = "" if first == path else f", once as {first}"
+            raise UserError(f"{path} is given twice{also}; name it once: a copy adds nothing")
+
+
+def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:
+    """Raise UserError for named series of the same frames, and for slices with the same frame.
+
+    A copy is no second measurement: intervals fitted to it are too narrow, and figures count frames twice.
+    """
+    known: dict[bytes, str] = {}
+    copies = []
+    for name, one in series:
+        for part, frames in _measurements(name, one):
+            first = known.setdefault(hashlib.sha256(np.ascontiguousarray(frames).data).digest(), part)
+            if first is not part:
+                copies.append((part, first))
+    if copies:
+        others = counted(len(copies) - 1, "more is such a copy", "more are such copies")
+        more = f", and {others}" if len(copies) > 1 else ""
+        raise UserError("{} equals {}{}; leave copies out: they add nothing".format(*copies[0], more))
+
+
+def _measurements(name: str, series: FrameSeries) -> Iterator[tuple[str, FloatArray]]:
+    """Yield the independent measurements with their names: each slice, or the whole recording."""
+    if series.kind == "raw":
+        yield name, series.channels
+        return
+    for i, (number, frame, diameter) in enumerate(zip(series.t_s, series.channels, series.diameter_mm, strict=True)):
+        if np.isfinite(diameter):
+            # The times of cylinders in turn are not their numbers.
+            nth = np.count_nonzero(series.diameter_mm[: i + 1] == diameter)
+            yield f"{name}: slice {nth} of {diameter:g} mm", frame
+        else:
+            yield f"{name}: Data_Slice_{number:g}.mat", frame

@@ -1,0 +1,210 @@
+"""The plan of an experiment: each step in words, with direction, angle, torque, force, duration and limits."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from shearloop.daemon.control import experiment_schema as steps
+from shearloop.daemon.control.experiment_check import Turn, reversals, turns
+from shearloop.daemon.control.experiment_schema import Demand, ExperimentFile, Step, demand
+from shearloop.drivers.robotiq.models import GripperModel
+from shearloop.drivers.ur.settings import UrLimits
+
+
+@dataclass(frozen=True, slots=True)
+class StepPlan:
+    """One step: what it does in words, its largest values, and what is limited, reversed or refused."""
+
+    number: int
+    do: str
+    text: str
+    duration_s: float
+    direction: str = ""
+    torque_nm: float = 0.0
+    angle_rad: float = 0.0
+    force_n: float = 0.0
+    timeout_s: float | None = None
+    notes: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
+
+    def sentences(self) -> Iterator[str]:
+        """Yield the step's lines."""
+        timeout = f", stopped after {self.timeout_s:g} s" if self.timeout_s is not None else ""
+        yield f"  {self.number:>2}  {self.do:<12} {self.text}; about {_duration(self.duration_s)}{timeout}"
+        for note in (*self.notes, *(f"REFUSED: {why}" for why in self.refused)):
+            yield f"      {'':<12} {note}"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """An experiment's steps in order, what it reaches at most, and what is not known."""
+
+    name: str
+    torque_source: str
+    limit_nm: float
+    limit_rad: float
+    steps: tuple[StepPlan, ...]
+    unknown: str = ""
+    _totals: Mapping[str, float] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the plan for a script."""
+        content = {key: value for key, value in asdict(self).items() if not key.startswith("_")}
+        return content | dict(self._totals)
+
+    def sentences(self) -> Iterator[str]:
+        """Yield the plan's lines."""
+        totals = self._totals
+        yield f"plan of {self.name!r}, driven by {self.torque_source}, about {_duration(totals['duration_s'])}:"
+        for step in self.steps:
+            yield from step.sentences()
+        yield (
+            f"  at most {_angle(totals['angle_rad'])} in a step, {totals['torque_nm']:g} N·m, fingers "
+            f"{totals['force_n']:g} N; its limits stop it at {self.limit_nm:g} N·m and {_angle(self.limit_rad)} from "
+            "the grip"
+        )
+        turned_back = sum(any(note.startswith("reversal") for note in step.notes) for step in self.steps)
+        yield f"  {turned_back or 'no'} reversal{'s' if turned_back != 1 else ''} of a held tool"
+        yield "  clockwise and counterclockwise are for an eye that faces the gripper"
+        if self.unknown:
+            yield f"  {self.unknown}"
+
+
+def plan_of(
+    file: ExperimentFile,
+    robot: UrLimits | None = None,
+    gripper: GripperModel | None = None,
+    refused: Mapping[int, tuple[str, ...]] | None = None,
+    warm_up_s: float = 0.0,
+) -> Plan:
+    """Return the plan of an experiment within the limits of the robot and the gripper, where they are known.
+
+    `refused` has the reasons against each step by its index; `warm_up_s` passes after a grip until the first torque.
+    """
+    back = {one.number: one.sentence(file) for one in reversals(file)}
+    planned, waits = [], False
+    for number, (step, turn) in enumerate(zip(file.steps, turns(file), strict=True), 1):
+        needs = demand(step)
+        duration_s, notes = needs.stands_s + needs.moves_s, list(_notes(file, step, turn, robot))
+        if waits and isinstance(step, steps.TwistingStep):
+            notes.append(f"before it, up to {warm_up_s:g} s for the first torques of the grip")
+            duration_s, waits = duration_s + warm_up_s, False
+        waits = warm_up_s > 0 if isinstance(step, steps.GripStep | steps.TareStep) else waits
+        if number in back:
+            notes.insert(0, back[number])
+        planned.append(
+            StepPlan(
+                number,
+                step.do,
+                _words(step, gripper),
+                duration_s,
+                turn.begins or "",
+                needs.torque_nm,
+                _largest_angle(step, needs),
+                step.force_n if isinstance(step, steps.GripStep) else 0.0,
+                step.timeout_s,
+                tuple(notes),
+                (refused or {}).get(number - 1, ()),
+            )
+        )
+    totals = {
+        "duration_s": sum(one.duration_s for one in planned),
+        "angle_rad": max(one.angle_rad for one in planned),
+        "torque_nm": max(one.torque_nm for one in planned),
+        "force_n": max(one.force_n for one in planned),
+    }
+    unknown = "" if robot is not None else "the robot's limits are not known: give `--config RIG` to check against them"
+    limits = file.limits
+    return Plan(file.name, file.torque_source, limits.torque_nm, limits.angle_rad, tuple(planned), unknown, totals)
+
+
+def _words(step: Step, gripper: GripperModel | None) -> str:
+    match step:
+        case steps.ApproachStep(pose_m_rad=pose) if pose is not None:
+            x, y, z = pose[:3]
+            return f"moves in a straight line to x {x:g}, y {y:g}, z {z:g} m at {step.speed_m_per_s:g} m/s"
+        case steps.ApproachStep(along_tool_m=distance_m):
+            way = "away from the robot" if (distance_m or 0.0) >= 0 else "towards the robot"
+            return f"moves {1e3 * abs(distance_m or 0.0):g} mm along the tool, {way}, at {step.speed_m_per_s:g} m/s"
+        case steps.GripStep():
+            empty = "stops the experiment if it meets nothing" if step.expect_object else "may meet nothing"
+            to = f"closes the fingers to {step.width_mm:g} mm, or onto a tool, at {step.speed_mm_per_s:g} mm/s"
+            return f"{to} with up to {step.force_n:g} N; {empty}"
+        case steps.ReleaseStep():
+            width_mm = min(step.width_mm, gripper.stroke_mm) if gripper is not None else step.width_mm
+            return f"opens the fingers to {width_mm:g} mm: a held tool drops"
+        case steps.TareStep():
+            return "takes the zero of every torque sensor; nothing turns"
+        case steps.IdentifyStep():
+            return f"measures the tool with small twists of up to {_angle(step.amplitude_rad)}"
+        case steps.AdaptStep():
+            return f"corrects the gain of {step.fingertip} by the {step.reference.replace('_', ' ')}; nothing turns"
+        case steps.TurnToStep():
+            return f"turns wrist 3 to {_angle(step.angle_rad)} at {step.speed_rad_per_s:g} rad/s"
+        case steps.TwistStep():
+            return _twist(step)
+        case steps.HoldTorqueStep():
+            way = steps.direction_of(step.signed_torque_nm) or "to rest"
+            return f"brings the torque to {abs(step.torque_nm):g} N·m {way} and holds it for {step.hold_s:g} s"
+        case steps.TightenStep():
+            until = f"until {step.until_torque_nm:g} N·m or {_angle(step.until_angle_rad)}"
+            return f"turns {step.direction} at {step.speed_rad_per_s:g} rad/s {until}"
+        case steps.WaitStep():
+            return f"stands still for {step.wait_s:g} s"
+
+
+def _twist(step: steps.TwistStep) -> str:
+    angles_rad = step.angles_rad
+    count, low_rad, high_rad = len(angles_rad), min(angles_rad), max(angles_rad)
+    places = _angle(angles_rad[0]) if count == 1 else f"{count} angles from {_angle(low_rad)} to {_angle(high_rad)}"
+    since = "of wrist 3" if step.absolute else "from the grip"
+    way = "" if step.absolute else f", {' and '.join(_ways(angles_rad)) or 'not turned'}"
+    then = f"holds each for {step.hold_s:g} s" + (" and returns" if step.return_to_start else "")
+    times = f", {step.repeats} times" if step.repeats > 1 else ""
+    return f"twists to {places} {since}{way}, {then}{times}, at {step.speed_rad_per_s:g} rad/s"
+
+
+def _ways(angles_rad: tuple[float, ...]) -> list[str]:
+    """Return the directions of angles, each once, in order."""
+    return list(dict.fromkeys(way for angle_rad in angles_rad if (way := steps.direction_of(angle_rad)) is not None))
+
+
+def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None) -> Iterator[str]:
+    """Yield what a step's limits and the robot's change."""
+    if isinstance(step, steps.TwistingStep):
+        limits = file.limits_of(step)
+        if step.limits is not None:
+            yield f"its limits stop it at {limits.torque_nm:g} N·m and {_angle(limits.angle_rad)} from the grip"
+        reach_rad = max(-turn.low_rad, turn.high_rad)
+        if math.isfinite(reach_rad) and reach_rad >= limits.angle_rad:
+            asks = f"with the steps before it may be {_angle(reach_rad)} from the grip"
+            yield f"{asks}: the limit stops it at {_angle(limits.angle_rad)}"
+    if robot is None:
+        return
+    match step:
+        case steps.ApproachStep(speed_m_per_s=speed) if speed > (top := robot.linear_speed_m_per_s.inner):
+            yield f"the robot's limit allows {top:g} m/s"
+        case steps.TwistStep() | steps.TurnToStep() | steps.TightenStep():
+            if step.speed_rad_per_s > (top := robot.wrist_speed_rad_per_s.inner):
+                yield f"the robot's limit allows {top:g} rad/s"
+        case steps.ApproachStep(pose_m_rad=None):
+            yield "its end is checked against the workspace as it begins: it depends on where the tool is"
+
+
+def _largest_angle(step: Step, needs: Demand) -> float:
+    match step:
+        case steps.TwistStep():
+            return max(map(abs, step.angles_rad))
+        case steps.TurnToStep():
+            return abs(step.angle_rad)
+    return needs.angle_rad
+
+
+def _angle(angle_rad: float) -> str:
+    return f"{angle_rad:g} rad ({math.degrees(angle_rad):.0f}°)"
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02} s" if minutes else f"{rest} s"

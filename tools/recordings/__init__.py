@@ -1,0 +1,1 @@
+"""Recordings at the desk: read, repair, export, replay and import MCAP files."""

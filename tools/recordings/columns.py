@@ -1,0 +1,159 @@
+"""The keys of a recorded message in the order of its topic's schema, each checked for its type.
+
+Exports, replay and `shearloop.read` take messages from here, so a value is always under its own name. What no recorder
+of this version writes is refused: an unknown or missing key, another type, integers beyond 64 bits, nested lists, a
+heatmap that is no rectangle.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any, NamedTuple
+
+from pydantic_core import from_json
+
+from shearloop.daemon.messaging.messages import TOPICS, EitHeatmap
+from shearloop.daemon.recorder import schema
+from shearloop.drivers.serial_sensor import InputKind
+
+# Unix time and CLOCK_MONOTONIC in ns: the year 2116, and 146 years after the start of a computer.
+_LATEST_NS = 2**62
+_LONGEST_QUOTE = 40
+
+
+class ContentError(ValueError):
+    """A recorded message that does not fit its topic."""
+
+
+class OtherKeysError(ContentError):
+    """A recorded message with keys of another version."""
+
+
+class Column(NamedTuple):
+    """One key of a topic: its JSON type, and whether a live message has it without a value."""
+
+    name: str
+    kind: str
+    optional: bool
+
+
+@cache
+def columns(name: str) -> Mapping[str, Column]:
+    """Return the columns of a schema by their names, in its order."""
+    optional = schema.optional_keys(name) if name in TOPICS else ()
+    described = schema.schemas()[name]["properties"].items()
+    return {key: Column(key, one["type"], key in optional) for key, one in described}
+
+
+def read_content(topic: str, data: bytes) -> dict[str, Any]:
+    """Return a message of a recorded topic: its keys in the order of the schema, None where a value is missing.
+
+    Numbers are floats, arrays are lists of floats, integers or None. An imported message has only the keys that its
+    import writes. Raises UnknownTopicError for another topic and ContentError for what does not fit it.
+    """
+    name = schema.schema_name(topic)
+    try:
+        content = from_json(data)
+    except ValueError as error:
+        raise ContentError(f"it is not JSON ({error})") from error
+    if not isinstance(content, dict):
+        raise ContentError(f"it is {_quoted(content)}, not a map")
+    known = columns(name)
+    imported = "source" not in content and name in schema.IMPORTED_KEYS
+    expected = schema.IMPORTED_KEYS[name] if imported else known
+    if other := [key for key in content if key not in expected]:
+        raise OtherKeysError(f"it has the unknown key {_quoted(other[0])}")
+    if missing := [key for key in expected if key not in content and not known[key].optional]:
+        raise OtherKeysError(f"it lacks the key {missing[0]!r}")
+    row = {key: _checked(known[key], content.get(key), imported=imported) for key in expected}
+    for key in ("t_mono_ns", "offset_ns", schema.ARRIVAL):
+        check_time(key, row.get(key) or 0)
+    if name == EitHeatmap.topic:
+        _check_rectangle(row["scores"], row[schema.SCORES_SHAPE])
+    elif name == schema.INPUT:
+        _check_input(row)
+    return row
+
+
+def check_time(key: str, t_ns: int) -> None:
+    """Raise ContentError for a time in ns that no clock shows."""
+    if abs(t_ns) >= _LATEST_NS:
+        raise ContentError(f"{key} is {t_ns} ns, which no clock shows")
+
+
+def check_length(key: str, found: int, expected: int) -> None:
+    """Raise ContentError for an array of another length."""
+    if found != expected:
+        raise ContentError(f"{key} has {found} values, not {expected}")
+
+
+def _checked(column: Column, value: Any, *, imported: bool) -> Any:
+    """Return a value in the type of its column; raises ContentError for another type."""
+    if value is None and (column.optional or imported):
+        return None
+    expected, fits, convert = _TYPES[column.kind]
+    if not fits(value):
+        raise ContentError(f"{column.name} is {_quoted(value)}, not {expected}")
+    return convert(value)
+
+
+def _is_number(value: Any) -> bool:
+    if type(value) is int:
+        return -(2**63) <= value < 2**63
+    return type(value) is float and math.isfinite(value)
+
+
+def _is_integer(value: Any) -> bool:
+    return type(value) is int and -(2**63) <= value < 2**63
+
+
+def _is_array(value: Any) -> bool:
+    if type(value) is not list or not set(map(type, value)) <= {float, int, type(None)}:
+        return False
+    return all(map(_is_number, value)) if {int} <= set(map(type, value)) else _is_finite_array(value)
+
+
+def _is_finite_array(value: list[float | None]) -> bool:
+    return all(element is None or math.isfinite(element) for element in value)
+
+
+def _as_floats(value: list[Any]) -> list[float | None]:
+    return [element if element is None else float(element) for element in value]
+
+
+class _Type(NamedTuple):
+    expected: str
+    fits: Callable[[Any], bool]
+    convert: Callable[[Any], Any]
+
+
+_TYPES: Mapping[str, _Type] = {
+    "number": _Type("a number", _is_number, float),
+    "integer": _Type("an integer of 64 bits", _is_integer, int),
+    "boolean": _Type("true or false", lambda value: type(value) is bool, bool),
+    "string": _Type("a text", lambda value: type(value) is str, str),
+    "object": _Type("a map", lambda value: type(value) is dict, dict),
+    "array": _Type("a list of numbers", _is_array, list),
+}
+
+
+def _check_rectangle(scores: list[float], shape: list[float]) -> None:
+    sides = [int(side) for side in shape if side is not None and side >= 1]
+    if len(shape) != 2 or sides != shape or math.prod(sides) != len(scores):
+        raise ContentError(f"its {len(scores)} scores are no rectangle of {_quoted(shape)}")
+
+
+def _check_input(row: Mapping[str, Any]) -> None:
+    if row["kind"] not in (kind.value for kind in InputKind):
+        raise ContentError(f"kind is {_quoted(row['kind'])}, not one of {', '.join(kind.value for kind in InputKind)}")
+    if not all(ord(character) < 256 for character in row["data"]):
+        raise ContentError(f"data is {_quoted(row['data'])}, not bytes as Latin-1 text")
+
+
+def _quoted(value: object) -> str:
+    try:
+        text = repr(value)
+    except ValueError:
+        # Python refuses to print integers of thousands of digits.
+        text = "a huge integer"
+    return text if len(text) <= _LONGEST_QUOTE else f"{text[:_LONGEST_QUOTE]}…"

@@ -1,0 +1,181 @@
+"""Exports topics of a recording as tables: CSV or Parquet, a file per topic, or MATLAB, all topics in a file."""
+
+import re
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic_core import to_json
+from scipy.io import savemat
+
+from shearloop.daemon.recorder import schema
+from shearloop.errors import UserError, require
+from shearloop.tools.recordings.columns import columns
+from shearloop.tools.recordings.intact_records import Progress
+from shearloop.tools.recordings.reader import read_messages
+from shearloop.tools.recordings.tables import Rows, arrays, columns_of, read_rows, row_of
+
+# Numbers of a Parquet table that are written at once.
+_BATCH = 200_000
+# Largest size of the messages in one MATLAB file, in numbers of eight bytes; a key of a message counts as ten. It
+# bounds the memory and keeps each variable below the format's 2 GB.
+_MAT_SIZE, _KEY_SIZE = 12_000_000, 10
+# MATLAB takes 63 characters.
+_LONGEST_NAME = 59
+# A cell with one of these stands in quotes.
+_QUOTED = re.compile(r'[",\r\n]')
+
+
+def export(path: Path, form: str, out: Path, topics: list[str], progress: Progress = lambda _: None) -> list[Path]:
+    """Write topics as `form` (csv, parquet or mat) and return the files.
+
+    For csv and parquet `out` is a folder. For mat it is a file; a large recording continues in NAME_2.mat, NAME_3.mat,
+    and so on, which must not exist. `progress` receives the number of messages so far. Raises UserError for a recording
+    that cannot be read, and OSError for files that cannot be written.
+    """
+    if form == "mat":
+        return _export_mat(path, out, topics, progress)
+    return _export_tables(path, form, out, topics, progress)
+
+
+def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) -> list[Path]:
+    def part(number: int) -> Path:
+        return out.with_name(f"{out.stem}_{number}{out.suffix}") if number > 1 else out
+
+    if part(2).exists():
+        raise UserError(f"{part(2)} exists and would look like a part of this export; remove it, or use another --out")
+    written: list[Path] = []
+    names = _struct_names(topics)
+    waiting: dict[str, Rows] = {topic: [] for topic in topics}
+    size = 0
+
+    def write() -> None:
+        structs = {name: arrays(waiting[topic]) for topic, name in names.items() if waiting[topic]}
+        target = part(len(written) + 1)
+        # savemat changes names and hides the reason if it opens the file itself.
+        with target.open("xb" if written else "wb") as file:
+            # The stubs allow only names.
+            savemat(file, structs, long_field_names=True, oned_as="column")  # type: ignore[arg-type]
+        written.append(target)
+
+    for topic, row in read_rows(path, topics, progress):
+        waiting[topic].append(row)
+        size += sum(value.size if isinstance(value, np.ndarray) else _KEY_SIZE for value in row.values())
+        if size >= _MAT_SIZE:
+            write()
+            waiting, size = {topic: [] for topic in topics}, 0
+    if size or not written:
+        write()
+    return written
+
+
+def _struct_names(topics: Iterable[str]) -> dict[str, str]:
+    """Return a name of MATLAB for each topic, and number those that would be alike: `eit.frame.a-b` and `….a_b`."""
+    names: dict[str, str] = {}
+    for topic in topics:
+        plain = re.sub(r"\W", "_", topic, flags=re.ASCII)[:_LONGEST_NAME]
+        number, name = 1, plain
+        while name in names.values():
+            number += 1
+            name = f"{plain}_{number}"
+        names[topic] = name
+    return names
+
+
+def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress: Progress) -> list[Path]:
+    if form == "parquet":
+        require("pyarrow", "export", "Parquet")
+    out.mkdir(parents=True, exist_ok=True)
+    files = {topic: out / f"{topic}.{form}" for topic in topics}
+    tables: dict[str, _CsvTable | _ParquetTable] = {}
+    with ExitStack() as stack:
+        for topic, content, message in read_messages(path, topics, progress):
+            row = row_of(content, message.log_time)
+            if topic not in tables:
+                made = _CsvTable(files[topic], row) if form == "csv" else _ParquetTable(files[topic], topic, row)
+                stack.callback(made.close)
+                tables[topic] = made
+            tables[topic].add(row)
+    return list(files.values())
+
+
+class _CsvTable:
+    """A table with one column per array element, after the other columns: channels_0, channels_1, …"""
+
+    def __init__(self, path: Path, first: dict[str, Any]) -> None:
+        """Write the names of the columns, as in the first row."""
+        self._path = path
+        self._scalars = [key for key, value in first.items() if not isinstance(value, list)]
+        self._lengths = {key: len(value) for key, value in first.items() if isinstance(value, list)}
+        self._file = path.open("w", newline="", encoding="utf-8")
+        elements = [f"{key}_{i}" for key, length in self._lengths.items() for i in range(length)]
+        self._file.write(",".join([*self._scalars, *elements]) + "\r\n")
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Write one row by the names of its values; raises UserError if an array has another length than the first."""
+        for key, length in self._lengths.items():
+            if len(row[key]) != length:
+                raise UserError(
+                    f"{self._path}: the first message has {length} values of {key} and a later one {len(row[key])}; "
+                    "use --format mat"
+                )
+        cells = [_csv_cell(row[key]) for key in self._scalars]
+        # The csv module takes ten times as long for numbers.
+        cells += [to_json(row[key])[1:-1].replace(b"null", b"").decode() for key in self._lengths if row[key]]
+        self._file.write(",".join(cells) + "\r\n")
+
+    def close(self) -> None:
+        """End the file."""
+        self._file.close()
+
+
+def _csv_cell(value: Any) -> str:
+    """Return a scalar as a cell of CSV: empty for None, in quotes where it holds a comma, a quote or a line's end."""
+    if value is None:
+        return ""
+    text = str(value)
+    return '"' + text.replace('"', '""') + '"' if _QUOTED.search(text) else text
+
+
+class _ParquetTable:
+    """A table with the types of the topic's schema, written in batches; missing elements of arrays are NaN."""
+
+    def __init__(self, path: Path, topic: str, first: dict[str, Any]) -> None:
+        """Begin the file with the columns of the first row."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        names = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string", "object": "string"}
+        types = {kind: pa.type_for_alias(name) for kind, name in names.items()}
+        types["array"] = pa.list_(types["number"])
+        known = columns(schema.schema_name(topic))
+        kinds = {key: known[key].kind if key in known else "integer" for key in first}
+        self._schema = pa.schema([(key, types[kind]) for key, kind in kinds.items()])
+        self._arrays = [field.name for field in self._schema if field.type == pa.list_(pa.float64())]
+        scalars = [field.name for field in self._schema if not pa.types.is_list(field.type)]
+        # Measured values seldom repeat: a dictionary of them would only cost time, and so would limits of arrays.
+        self._writer = pq.ParquetWriter(path, self._schema, use_dictionary=False, write_statistics=scalars)
+        self._rows: Rows = []
+        self._rows_at_once = 1 + _BATCH // sum(len(value) if isinstance(value, list) else 1 for value in first.values())
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Add one row."""
+        # Arrow takes twice as long for a list.
+        arrays = {key: np.array(row[key], dtype=np.float64) for key in self._arrays}
+        self._rows.append(row | arrays)
+        if len(self._rows) == self._rows_at_once:
+            self._write()
+
+    def close(self) -> None:
+        """Write what waits, and end the file."""
+        if self._rows:
+            self._write()
+        self._writer.close()
+
+    def _write(self) -> None:
+        import pyarrow as pa
+
+        self._writer.write_table(pa.table(columns_of(self._rows), schema=self._schema))
+        self._rows.clear()

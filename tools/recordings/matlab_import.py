@@ -1,0 +1,329 @@
+"""Reads the paper's MATLAB files of slices, raw lines and streams; imports streams as a recording."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import minimum_filter1d
+
+from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.channels import PAPER_TABLE
+from shearloop.bank.matlab_file import MatFileError, Variable, read_variables
+from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT, LOAD_DOUBT_NOTE, SIDES
+from shearloop.daemon.recorder.writer import new_recording
+from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import slope_below
+from shearloop.errors import UserError
+from shearloop.estimation import FrameSeries
+from shearloop.estimation.load_delay import measured_delay
+from shearloop.estimation.values import LARGEST_TORQUE_NM
+from shearloop.files import open_file
+from shearloop.words import counted
+
+# The recording scripts changed these names over time.
+_STREAMS = {
+    "right": ("Right_Data", "plotthis2", "plotthis_right"),
+    "left": ("Left_Data", "plotthis1", "plotthis_left"),
+    "load": ("Load_Data", "plotthis3", "plotthis_truth"),
+}
+TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
+RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
+_LINES = ("clipped_data", "clipped_data_hom")
+# MATLAB counts days from the year 0; this is its number for 1970-01-01.
+_DATENUM_OF_UNIX_EPOCH = 719529
+_SECONDS_PER_DAY = 86400.0
+_TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
+_DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
+# Among this many frames on either side, at least one should have been read without delay.
+_NEIGHBOURS = 12
+# The load cell's board sends a line every 91.6 ms.
+LOAD_PERIOD_S = 0.0916
+_CYLINDER = re.compile(r"(\d+(?:\.\d+)?)mm[_.]")
+# Stamps of frames and load that differ less than this, row by row, come from one loop.
+_ONE_LOOP_S = 0.02
+# A loop waited for its load values where this many end within this time of the line below all of them.
+_LEAST_PACED, _PACED_S = 3, 0.03
+_HDF5_SIGNATURE = b"\x89HDF"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stream:
+    """Arrival times unix_s (n,), and a fingertip's lines (n, 1024) in volts or the load cell's torques (n, 1) in N·m.
+
+    The file names no time zone, so its times are read as UTC. Damaged torques are included.
+    """
+
+    unix_s: FloatArray
+    values: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slices:
+    """Differences (n, 896) |frame − homogeneous frame| in volts at torque_nm (n,), by the numbers in the files' names.
+
+    diameter_mm (n,) is of the cylinders, NaN for torque slices.
+    """
+
+    differences: FloatArray
+    torque_nm: FloatArray
+    numbers: IntArray
+    diameter_mm: FloatArray
+
+
+def find_streams(path: Path) -> tuple[str, ...]:
+    """Return the streams of a file: "right", "left" or "load"; raises UserError if it cannot be read or has none."""
+    variables = _load(path)
+    found = tuple(stream for stream, names in _STREAMS.items() if any(name in variables for name in names))
+    if not found:
+        wanted = ", ".join(name for names in _STREAMS.values() for name in names)
+        raise UserError(f"{path} holds {', '.join(variables) or 'no variable'}, expected one of {wanted}")
+    return found
+
+
+def read_stream(path: Path, name: str | None = None) -> Stream:
+    """Return the stream "right", "left" or "load", by default the only fingertip's.
+
+    Raises UserError for a file that cannot be read or holds no such stream.
+    """
+    names = _STREAMS[name] if name is not None else (*_STREAMS["right"], *_STREAMS["left"])
+    table, width = _one_of(path, _load(path), names), 1 if name == "load" else PAPER_TABLE.n_line_values
+    if table.shape[1] != width + 1 or len(table) == 0:
+        raise UserError(f"{path}: expected rows of one time and {counted(width, 'value')}, found {_size(table)}")
+    return Stream((table[:, 0] - _DATENUM_OF_UNIX_EPOCH) * _SECONDS_PER_DAY, np.ascontiguousarray(table[:, 1:]))
+
+
+def read_line(path: Path) -> FloatArray:
+    """Return the (1024,) values in volts of a file with a single line; raises UserError as `read_stream` does."""
+    return _row(path, _one_of(path, _load(path), _LINES), PAPER_TABLE.n_line_values)
+
+
+def read_torque_slices(folder: Path) -> Slices:
+    """Return the slices Data_Slice_N.mat of a folder by rising N, which may have gaps.
+
+    Raises UserError for a folder without any, and for a file that cannot be used.
+    """
+    return _read_slices(folder, "torque", _TORQUE_SLICE, "torque_value", "Data_Slice_1.mat, Data_Slice_2.mat")
+
+
+def read_diameter_slices(folder: Path) -> Slices:
+    """Return the slices DDmm_Data_N.mat of a folder by rising diameter, then N; raises as `read_torque_slices` does."""
+    return _read_slices(folder, "diameter", _DIAMETER_SLICE, "mean_torque", "10mm_Data_1.mat, 20mm_Data_1.mat")
+
+
+def _read_slices(folder: Path, kind: str, pattern: re.Pattern[str], torque_name: str, examples: str) -> Slices:
+    try:
+        found = [(pattern.fullmatch(path.name), path) for path in folder.iterdir()]
+    except OSError as error:
+        raise UserError(f"{folder}: the recordings cannot be listed: {error.strerror}") from error
+    files = sorted((tuple(map(float, match.groups())), path) for match, path in found if match)
+    if not files:
+        raise UserError(f"{folder} has no {kind} slices: expected files named {examples} …")
+    differences, torques = [], []
+    for _, path in files:
+        variables = _load(path)
+        differences.append(_row(path, _one_of(path, variables, ["data_diff"]), PAPER_TABLE.n_channels))
+        if not differences[-1].any():
+            raise UserError(f"{path}: data_diff is zero in all channels; leave this slice out")
+        torques.append(_row(path, _one_of(path, variables, [torque_name]), 1)[0])
+    named = np.array([numbers for numbers, _ in files])
+    diameter_mm = named[:, 0] if kind == "diameter" else np.full(len(files), np.nan)
+    return Slices(np.array(differences), np.array(torques), named[:, -1].astype(int), diameter_mm)
+
+
+def _load(path: Path) -> dict[str, Variable]:
+    try:
+        with open_file(path) as file:
+            content = file.read()
+    except OSError as error:
+        raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
+    if content.startswith(_HDF5_SIGNATURE) or content.startswith(b"MATLAB 7.3"):
+        raise UserError(f"{path} is a MATLAB file of version 7.3; save it again with `save -v7`")
+    if not content.startswith(b"MATLAB"):
+        raise UserError(f"{path} is not a MATLAB file: expected a recording saved with `save -v6` or `save -v7`")
+    try:
+        return read_variables(content)
+    except MatFileError as error:
+        raise UserError(f"{path}: the recording is truncated or damaged: {error}; copy it again") from error
+
+
+def _one_of(path: Path, variables: dict[str, Variable], names: Sequence[str]) -> FloatArray:
+    """Return the only matrix that has one of these names."""
+    present = [name for name in names if name in variables]
+    if len(present) > 1:
+        raise UserError(f"{path} holds {' and '.join(present)}; choose one of them")
+    if not present:
+        others = ", ".join(variables) or "no variable"
+        raise UserError(f"{path} holds {others}, expected {' or '.join(names)}")
+    values = variables[present[0]]
+    if not isinstance(values, np.ndarray):
+        raise UserError(f"{path}: {present[0]} is {values}, expected a matrix of real numbers")
+    if not np.isfinite(values).all():
+        wrong = int((~np.isfinite(values)).sum())
+        found = counted(wrong, "value that is not a finite number", "values that are not finite numbers")
+        raise UserError(f"{path}: {present[0]} has {found}")
+    return values
+
+
+def _row(path: Path, values: FloatArray, length: int) -> FloatArray:
+    if values.shape not in ((1, length), (length, 1)):
+        raise UserError(f"{path}: expected 1 × {length} values, found {_size(values)}")
+    return values.ravel()
+
+
+def _size(values: FloatArray) -> str:
+    return " × ".join(map(str, values.shape))
+
+
+@dataclass(frozen=True, slots=True)
+class ImportResult:
+    """The imported frames by side, the number of torques, and remarks in sentences."""
+
+    frames: dict[str, int]
+    torques: int
+    remarks: tuple[str, ...]
+
+
+def import_mat(sources: Sequence[Path], out: Path) -> ImportResult:
+    """Write the streams of MATLAB files, or of folders of them, into one recording.
+
+    Time stamps are corrected, and damaged load values are left out. Raises UserError for a file without a stream, for
+    two streams of one side, and if there are no frames.
+    """
+    files = _mat_files(sources)
+    streams: dict[str, Stream] = {}
+    for path in files:
+        for name in find_streams(path):
+            if name in streams:
+                raise UserError(f"{path} is a second stream of {name}; import one recording at a time")
+            streams[name] = read_stream(path, name)
+    load = streams.pop("load", None)
+    if not streams:
+        raise UserError("the files hold no frames of a fingertip; name those of the right or left side as well")
+    remarks: list[str] = []
+    notes: dict[str, str] = {}
+    sure = True
+    if load is None:
+        load = Stream(np.zeros(0), np.zeros((0, 1)))
+    elif any(_is_one_loop(load.unix_s, stream.unix_s) for stream in streams.values()):
+        load, streams, sure = _loop_times(load, streams, remarks)
+    load = _valid_load(load, remarks)
+    arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in one.unix_s] for side, one in streams.items()}
+    middles = {side: frame_middles(one) for side, one in arrivals.items()}
+    delay = measured_delay([_series_of_side(side, one, middles[side], load) for side, one in streams.items()])
+    if delay is not None and delay.late_s:
+        load = replace(load, unix_s=load.unix_s - delay.late_s)
+        remarks.append(
+            f"The load was stamped {delay.late_s:.2f} ± {delay.error_s:.2f} s too late against the gel's motion, "
+            "and its times were corrected."
+        )
+    if delay is None and not sure:
+        notes[LOAD_DOUBT_NOTE] = LOAD_DOUBT
+    if remarks:
+        notes["remarks"] = " ".join(remarks)
+    if (diameter := _diameter_mm(files)) is not None:
+        notes[DIAMETER_NOTE] = diameter
+    with new_recording(out, ", ".join(sorted(path.name for path in files)), notes) as writer:
+        for side in (side for side in SIDES if side in streams):
+            rows = zip(middles[side], arrivals[side], streams[side].values, strict=True)
+            for middle_ns, arrival_ns, line in rows:
+                writer.add_frame(side, middle_ns, arrival_ns, line)
+        for t_s, torque in zip(load.unix_s, load.values[:, 0], strict=True):
+            writer.add_torque(round(float(t_s) * 1e9), float(torque))
+    counts = {side: len(stream.unix_s) for side, stream in streams.items()}
+    return ImportResult(counts, len(load.unix_s), tuple(remarks))
+
+
+def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:
+    """Return the middle of each frame's acquisition from its arrival, in nanoseconds.
+
+    A frame is read when it is complete or later. The board's clock is therefore the line below the stamps
+    (`drivers.eit_kit`). The earliest stamp among the neighbours gives its height, so that it follows a
+    board that paused.
+    """
+    numbered = list(enumerate(arrivals_ns))
+    period = slope_below(numbered) if len(numbered) > 1 else 1e9 * FRAME_PERIOD_S
+    height = np.array([float(arrival - arrivals_ns[0]) - n * period for n, arrival in numbered])
+    lowest = minimum_filter1d(height, 2 * _NEIGHBOURS + 1, mode="nearest")
+    return [arrivals_ns[0] + round(low + (n - 0.5) * period) for n, low in enumerate(lowest)]
+
+
+def _loop_clock(stamps_s: FloatArray) -> tuple[float, float] | None:
+    """Return when a loop's lines were sent: the first load after the first stamp, and frames after theirs, in s.
+
+    A loop with (n,) stamps reads one line of each board per row, and stamps a row before it reads it. So its lines were
+    sent before the next stamp. After a stall the loop empties the fingertips' buffers, and waits for the load alone:
+    then the load was sent at the next stamp. Frames were sent between the two stamps, in the middle on average.
+    None where the stamps do not show this.
+    """
+    if len(stamps_s) <= _LEAST_PACED:
+        return None
+    latest_s = stamps_s[1:] - stamps_s[0] - LOAD_PERIOD_S * np.arange(len(stamps_s) - 1)
+    if np.count_nonzero(latest_s <= latest_s.min() + _PACED_S) < _LEAST_PACED:
+        return None
+    return float(latest_s.min()), float(np.median(np.diff(stamps_s))) / 2
+
+
+def _loop_times(load: Stream, streams: dict[str, Stream], remarks: list[str]) -> tuple[Stream, dict[str, Stream], bool]:
+    """Return the streams of one loop with the times at which they were sent, and whether these are sure."""
+    # The loop read one line per frame and the board sends six. The rest waited in the port's buffer.
+    clock = _loop_clock(load.unix_s)
+    load_late_s, late_s = clock or (0.0, 0.0)
+    t_s = load.unix_s[0] + load_late_s + LOAD_PERIOD_S * np.arange(len(load.unix_s))
+    remarks.append(
+        f"The load cell was read once per frame but sends a value every {1e3 * LOAD_PERIOD_S:.1f} ms, so its "
+        f"values waited in a buffer. Their times are now one period apart, {t_s[-1] - t_s[0]:.0f} s in all."
+    )
+    if clock is None:
+        remarks.append(f"Warning: {LOAD_DOUBT}.")
+        return replace(load, unix_s=t_s), streams, False
+    remarks.append(
+        f"The loop waited for its first load values, so the load's times were moved by {load_late_s - late_s:.2f} ± "
+        f"{late_s:.2f} s against the frames."
+    )
+    frames = {
+        # The next stamp less half a period: the first rows were stamped before the loop waited for its frames.
+        side: replace(one, unix_s=np.append(one.unix_s[1:] - late_s, one.unix_s[-1] + late_s))
+        for side, one in streams.items()
+    }
+    return replace(load, unix_s=t_s), frames, True
+
+
+def _series_of_side(side: str, stream: Stream, middles_ns: Sequence[int], load: Stream) -> FrameSeries:
+    t_s = np.array(middles_ns) / 1e9
+    channels = PAPER_TABLE.channels_of_line(stream.values)[:, None]
+    return FrameSeries("raw", (side,), t_s, channels, load.unix_s, load.values[:, 0], np.full(len(t_s), np.nan))
+
+
+def _valid_load(load: Stream, remarks: list[str]) -> Stream:
+    """Return the valid load values by rising time; appends to `remarks`."""
+    valid = np.abs(load.values[:, 0]) <= LARGEST_TORQUE_NM
+    if not valid.all():
+        remarks.append(
+            f"{counted(int(np.count_nonzero(~valid)), 'damaged load value')} beyond {LARGEST_TORQUE_NM:g} N·m left out."
+        )
+    order = np.flatnonzero(valid)[np.argsort(load.unix_s[valid], kind="stable")]
+    return Stream(load.unix_s[order], load.values[order])
+
+
+def _is_one_loop(load_s: FloatArray, frame_s: FloatArray) -> bool:
+    return len(load_s) == len(frame_s) and float(np.median(np.abs(load_s - frame_s))) < _ONE_LOOP_S
+
+
+def _diameter_mm(files: Sequence[Path]) -> str | None:
+    """Return the diameter in mm that the files' names start with (10mm_1_right.mat); UserError if they differ."""
+    found = sorted({match[1] for path in files if (match := _CYLINDER.match(path.name))})
+    if len(found) > 1:
+        raise UserError(f"the files are of cylinders of {' and '.join(found)} mm; import one recording at a time")
+    return found[0] if found and 0 < float(found[0]) < LARGEST_DIAMETER_MM else None
+
+
+def _mat_files(sources: Sequence[Path]) -> list[Path]:
+    found: list[Path] = []
+    for source in sources:
+        inside = sorted(source.glob("*.mat")) if source.is_dir() else [source]
+        if not inside:
+            raise UserError(f"{source} holds no .mat files; name the folder of one recording")
+        found += inside
+    return found

@@ -1,0 +1,425 @@
+"""Replay: the raw input of a recording passes through parsers and estimators again and is published as if live.
+
+All times are the recording's own, so the result does not depend on the replay's speed. The same code gives the same
+estimates bit for bit.
+"""
+
+import asyncio
+import json
+import math
+import tempfile
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import structlog
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
+from shearloop.daemon.messaging import messages
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.recorder import schema
+from shearloop.daemon.rig import load_cell_calibration
+from shearloop.daemon.sensing.fingertip_task import (
+    FramePairing,
+    adapted_message,
+    estimate_message,
+    frame_message,
+    torques_from_bytes,
+)
+from shearloop.daemon.sensing.frame_estimator import COMBINED, FrameEstimator, open_combined, open_estimator
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
+from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
+from shearloop.daemon.sensing.snapshots import SnapshotError, restored
+from shearloop.drivers.eit_kit import Frame, FrameParser
+from shearloop.drivers.load_cell import LoadParser
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.errors import UserError
+from shearloop.tools.recordings.columns import ContentError
+from shearloop.tools.recordings.reader import open_recording, reading
+from shearloop.yaml_files import validated
+
+# Topics that a replay computes. All others are sent as they were recorded.
+_COMPUTED = messages.EitFrame, messages.EitEstimate, messages.EitAdapted, messages.LoadTorque, messages.SkinShear
+COMPUTED_TOPICS = tuple(kind.topic for kind in _COMPUTED)
+# These depend on the computer, not on the measurement.
+NOT_COMPARED = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
+_MAX_EXAMPLES = 5
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedEvent:
+    """One entry of a recording: a message under its live topic, or a raw input (`raw`)."""
+
+    topic: str
+    t_mono_ns: int
+    content: Mapping[str, Any]
+    source: str = ""
+    raw: RawEvent | None = None
+
+
+class ReplayEvents(NamedTuple):
+    """What frames do not contain: tares, tools and known torques of the grip by source, each with its first frame.
+
+    `frame_numbers` holds the frames' numbers by source and arrival, `sample_numbers` those of the skin's samples by
+    their time; they continue from file to file.
+    """
+
+    before_frames: dict[str, list[tuple[int, InputKind, Any]]]
+    frame_numbers: dict[str, dict[int, int]]
+    sample_numbers: dict[int, int]
+
+
+class RecordedRun:
+    """A recording as a sequence of events; raises UserError for a file that cannot be replayed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with open_recording(path) as recording:
+            self.counts = recording.counts
+            self.metadata = recording.identity
+            self._attached = recording.attachments()
+            continued = recording.metadata.get(schema.CONTINUED_METADATA, {})
+        # Of a recording that begins in the middle of a run: the sources that continue from a state.
+        self.continued = frozenset(continued.get("sources", "").split())
+        self._own: DaemonConfig | None = None
+
+    @property
+    def has_inputs(self) -> bool:
+        """Whether it holds raw input; an imported recording holds only lines."""
+        return any(topic.startswith(schema.input_topic("")) and topic != schema.CLOCK_TOPIC for topic in self.counts)
+
+    def continues_with(self, config: DaemonConfig) -> bool:
+        """Whether its states fit: they are of the same code, and of the recorded configuration."""
+        return bool(self.continued) and config is self._own and self.metadata.get("code_sha256") == schema.code_digest()
+
+    @contextmanager
+    def configuration(self) -> Iterator[DaemonConfig]:
+        """Yield the recorded configuration, with the attached files in a temporary folder."""
+        if schema.CONFIGURATION not in self._attached:
+            raise UserError(
+                f"{self.path} has no configuration because no daemon recorded it; give one with --config CONFIG"
+            )
+        with tempfile.TemporaryDirectory(prefix="shearloop-replay-") as folder:
+            files: dict[str, str] = {}
+            for number, (name, data) in enumerate(self._attached.items()):
+                copy = Path(folder) / f"{number}-{Path(name).name[-60:]}"
+                copy.write_bytes(data)
+                files[name] = str(copy)
+
+            def with_copies(section: dict[str, Any]) -> dict[str, Any]:
+                return {key: files.get(str(value), value) for key, value in section.items()}
+
+            with reading(self.path):
+                content = json.loads(self._attached[schema.CONFIGURATION], object_hook=with_copies)
+            where = f"{self.path}: its configuration does not fit this version"
+            self._own = validated(content, DaemonConfig, where, UserError, cure="; give one with --config CONFIG")
+            yield self._own
+
+    def events(self) -> Iterator[RecordedEvent]:
+        """Yield the events in recorded order."""
+        with open_recording(self.path) as recording:
+            # An imported recording has one side after the other, a live one is in order.
+            recorded = recording.messages(by_time=not self.has_inputs)
+            for number, (channel, message) in enumerate(recorded):
+                content = recording.content(channel, message)
+                if schema.schema_name(channel.topic) in schema.IMPORTED_KEYS and "source" not in content:
+                    yield _imported_event(channel.topic, content, message.log_time, number)
+                else:
+                    yield _live_event(channel.topic, content)
+
+    def replay_events(self) -> ReplayEvents:
+        """Return the events that the frames do not contain."""
+        found = ReplayEvents(defaultdict(list), defaultdict(dict), {})
+        for event in self.events() if self.has_inputs else ():
+            before = found.before_frames[event.source]
+            with reading(self.path):
+                match event:
+                    case RecordedEvent(topic=messages.EitFrame.topic, content=content):
+                        arrival_ns = event.t_mono_ns + round(content["age_s"] * 1e9)
+                        found.frame_numbers[event.source][arrival_ns] = content["frame"]
+                    case RecordedEvent(topic=messages.SkinShear.topic, content=content):
+                        found.sample_numbers[event.t_mono_ns] = content["sample"]
+                    case RecordedEvent(raw=RawEvent(kind=InputKind.TARE, data=data)) if data.isdigit():
+                        before.append((int(data), InputKind.TARE, None))
+                    case RecordedEvent(raw=RawEvent(kind=InputKind.TOOL, data=data)):
+                        number, tool = tool_from_bytes(data)
+                        before.append((number, InputKind.TOOL, tool))
+                    case RecordedEvent(raw=RawEvent(kind=InputKind.ADAPT, data=data)):
+                        number, *known = torques_from_bytes(data)
+                        before.append((number, InputKind.ADAPT, known))
+        return found
+
+
+class ReplayClock(Clock):
+    """A clock that shows the recording's own time."""
+
+    def __init__(self) -> None:
+        """Start at zero until the first event sets the time."""
+        self._offset_ns = 0
+        self._now_ns = 0
+
+    def now_ns(self) -> int:
+        """Return the time of the current event."""
+        return self._now_ns
+
+    def set(self, now_ns: int, offset_ns: int | None = None) -> None:
+        """Set the time, and the offset to Unix time if it is given."""
+        self._now_ns = now_ns
+        if offset_ns is not None:
+            self._offset_ns = offset_ns
+
+
+@dataclass(slots=True)
+class ReplayComparison:
+    """Compares computed messages with recorded ones, bit for bit.
+
+    `recorded_topics` are the topics of the recording. Computed messages of other topics are only counted.
+    """
+
+    recorded_topics: Collection[str] = ()
+    compared: Counter[str] = field(default_factory=Counter)
+    different: Counter[str] = field(default_factory=Counter)
+    examples: list[str] = field(default_factory=list)
+    _foreign: int = 0
+    _computed: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
+
+    def add_computed(self, topic: str, content: Mapping[str, Any]) -> None:
+        """Store a message that the replay published."""
+        if topic not in COMPUTED_TOPICS:
+            return
+        if schema.recorded_topic(topic, content["source"]) not in self.recorded_topics:
+            self._foreign += 1
+        else:
+            plain = json.loads(schema.message_json(topic, content, 0))
+            self._computed.setdefault((topic, content["source"]), deque()).append(plain)
+
+    def restart(self, source: str) -> None:
+        """Forget the messages of a source so far: they were forwarded, and it is computed from here on."""
+        self._computed = {key: waiting for key, waiting in self._computed.items() if key[1] != source}
+
+    def compare(self, event: RecordedEvent) -> None:
+        """Compare a recorded message with the oldest computed one of its topic and source."""
+        waiting = self._computed.get((event.topic, event.source))
+        self.compared[event.topic] += 1
+        if not waiting:
+            self._add_difference(event, "the replay did not compute it")
+            return
+        computed = waiting.popleft()
+        keys = [key for key in event.content if key not in NOT_COMPARED and computed.get(key) != event.content[key]]
+        if keys:
+            changes = (f"{key} was {_short(event.content[key])}, is {_short(computed.get(key))}" for key in keys)
+            self._add_difference(event, ", ".join(changes))
+
+    @property
+    def unrecorded(self) -> int:
+        """Computed messages that are not in the recording, such as those at the moment of the daemon's stop."""
+        return self._foreign + sum(map(len, self._computed.values()))
+
+    def _add_difference(self, event: RecordedEvent, text: str) -> None:
+        self.different[event.topic] += 1
+        if len(self.examples) < _MAX_EXAMPLES:
+            self.examples.append(f"{event.topic} of {event.source}, number {event.content['seq']}: {text}")
+
+
+class Replay:
+    """The parsers and estimators of one configuration, fed with a recording; `clock` is the publisher's clock."""
+
+    def __init__(self, run: RecordedRun, config: DaemonConfig, publisher: Publisher, clock: ReplayClock) -> None:
+        """Open all files of the configuration; raises BankError or UserError."""
+        self._run = run
+        self._events = run.replay_events()
+        self._publisher = publisher
+        self._clock = clock
+        self.comparison = ReplayComparison(run.counts)
+        if run.has_inputs:
+            publisher.add_listener(self.comparison.add_computed, raises=True)
+        # Per source: the difference between recorded and replayed numbers of frames or samples, and the latest frame.
+        self._number_offset: dict[str, int] = {}
+        self._latest_frame: dict[str, int] = {}
+        self._estimators: dict[str, FrameEstimator] = {
+            name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
+        }
+        self._frame_parsers = {
+            name: FrameParser(
+                self._estimators[name].table.zero_slots, nominal_period_ns=round(fingertip.frame_period_s * 1e9)
+            )
+            for name, fingertip in config.fingertips.items()
+        }
+        self._pairing: FramePairing | None = None
+        if config.combined is not None:
+            self._estimators[COMBINED] = combined = open_combined(config.combined, config.fingertips)
+            sides = combined.calibration.sides
+            self._pairing = FramePairing(sides, config.fingertips[sides[0]].frame_period_s)
+        self._load_parser: LoadParser | None = None
+        if config.load_cell is not None:
+            self._load_parser = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
+        self._skin = ReplayedSkin(config.skin) if config.skin is not None else None
+        # Sources that continue from a state which has not come yet: their messages are sent as they were recorded.
+        self._awaited = set(run.continued.intersection(self._sources)) if run.continues_with(config) else set()
+
+    @property
+    def _sources(self) -> set[str]:
+        """The sources of the messages that are computed."""
+        load_cell = (LOAD_CELL,) if self._load_parser is not None else ()
+        return {*self._estimators, *load_cell, *((SKIN,) if self._skin is not None else ())}
+
+    async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> None:
+        """Replay all events `speed` times as fast as they happened; math.inf does not wait at all."""
+        loop = asyncio.get_running_loop()
+        began_s, first_ns = loop.time(), None
+        for number, event in enumerate(self._run.events(), 1):
+            # The time of a message lies before its sending. Only a raw input has its arrival time.
+            if event.raw is not None or not self._run.has_inputs:
+                first_ns = event.t_mono_ns if first_ns is None else first_ns
+                due_s = began_s + (event.t_mono_ns - first_ns) / 1e9 / speed
+                if due_s > loop.time():
+                    await asyncio.sleep(due_s - loop.time())
+            await self._process(event)
+            progress(number)
+            if number % 100 == 0:
+                # Let signals and sockets run.
+                await asyncio.sleep(0)
+
+    async def _process(self, event: RecordedEvent) -> None:
+        if event.topic == schema.CLOCK_TOPIC:
+            self._clock.set(event.t_mono_ns, int(event.content["offset_ns"]))
+        elif event.raw is not None:
+            self._clock.set(event.t_mono_ns)
+            await self._process_input(event.source, event.raw)
+        elif self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in self._sources - self._awaited:
+            self.comparison.compare(event)
+        elif event.topic != messages.EitHeatmap.topic:
+            self._publisher.forward(event.topic, messages.with_packed_arrays(event.content))
+
+    async def _process_input(self, source: str, event: RawEvent) -> None:
+        """Publish the messages that follow from a raw input; an input of another source is ignored."""
+        if event.kind is InputKind.STATE:
+            if source in self._awaited:
+                self._restore(source, event.data)
+        elif source in self._awaited:
+            # Its state, which comes soon, includes what follows from this.
+            return
+        elif source in self._frame_parsers:
+            for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
+                self._publisher.publish(frame_message(source, frame))
+                await self._estimate(source, frame)
+                pair = self._pairing.add(source, frame) if self._pairing is not None else None
+                if pair is not None:
+                    await self._estimate(COMBINED, *pair)
+        elif source == LOAD_CELL and self._load_parser is not None:
+            for sample in self._load_parser.handle(event):
+                self._publisher.publish(load_message(sample))
+        elif self._skin is not None and source in self._skin.sources:
+            # A query before the state may have its reply after it.
+            for message in self._skin.handle(source, event):
+                if SKIN not in self._awaited:
+                    self._publisher.publish(self._continued(message))
+
+    def _restore(self, source: str, text: bytes) -> None:
+        """Continue a source from its recorded state; raises UserError for one that does not fit."""
+        try:
+            if source in self._estimators:
+                session = self._estimators[source].session
+                state = restored(text, session.fixed)
+                self._estimators[source].session = state["session"]
+                if source in self._frame_parsers:
+                    self._frame_parsers[source] = state["parser"]
+                else:
+                    self._pairing = state["pairing"]
+            elif source == LOAD_CELL:
+                self._load_parser = restored(text, {})["parser"]
+            elif self._skin is not None:
+                self._skin.restore(text)
+        except (SnapshotError, KeyError) as error:
+            raise UserError(f"{self._run.path}: the state of {source} cannot be used: {error}") from error
+        self._awaited.discard(source)
+        self.comparison.restart(source)
+        self._number_offset[source] = 0
+
+    def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:
+        """Return frames with their recorded numbers: a later file of a run continues to count."""
+        if frames and source not in self._number_offset:
+            # The first of several frames may have begun in the file before.
+            last, numbers = frames[-1], self._events.frame_numbers.get(source, {})
+            self._number_offset[source] = numbers.get(last.t_arrival_ns, last.seq) - last.seq
+        offset = self._number_offset.get(source, 0)
+        return [replace(frame, seq=frame.seq + offset) for frame in frames] if offset else frames
+
+    def _continued(self, message: messages.SkinShear) -> messages.SkinShear:
+        """Return a message with the number of its sample in the run; the first one takes that of the nearest time."""
+        if SKIN not in self._number_offset:
+            numbers = self._events.sample_numbers
+            nearest = min(numbers, key=lambda t_ns: abs(t_ns - message.t_mono_ns), default=None)
+            self._number_offset[SKIN] = 0 if nearest is None else numbers[nearest] - message.sample
+        return replace(message, sample=message.sample + self._number_offset[SKIN])
+
+    async def _estimate(self, source: str, *frames: Frame) -> None:
+        estimator, number = self._estimators[source], frames[0].seq
+        for first, kind, value in self._events.before_frames.get(source, ()):
+            # Of a later file's tools, the first may be held since the file before.
+            if kind is InputKind.TOOL and self._latest_frame.get(source, -1) < first <= number:
+                estimator.session.set_tool(value)
+            elif kind is InputKind.TARE and first == number:
+                estimator.session.tare()
+            elif kind is InputKind.ADAPT and first == number:
+                self._adapt(source, frames, *value)
+        self._latest_frame[source] = number
+        estimate = await estimator.estimate(*frames)
+        # The replayed latency is 0; the recording holds the live one.
+        arrival_ns = max(frame.t_arrival_ns for frame in frames)
+        self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))
+
+    def _adapt(self, source: str, frames: tuple[Frame, ...], reference: str, torque_nm: FloatArray) -> None:
+        estimator = self._estimators[source]
+        if len(estimator.session.grip_t_s) != len(torque_nm):
+            reason = "the recording begins in the middle of the grip, so the correction of its gain is left out"
+            structlog.get_logger().warning(reason, source=source, frame=frames[0].seq)
+            return
+        self._publisher.publish(adapted_message(source, frames, reference, estimator.session.adapt(torque_nm)))
+
+
+def _live_event(topic: str, content: dict[str, Any]) -> RecordedEvent:
+    if topic == schema.CLOCK_TOPIC:
+        return RecordedEvent(topic, content["t_mono_ns"], content)
+    live = schema.schema_name(topic)
+    if live == schema.INPUT:
+        raw = schema.input_event(content)
+        return RecordedEvent(topic, raw.t_ns, content, topic.removeprefix(schema.input_topic("")), raw)
+    return RecordedEvent(live, content["t_mono_ns"], content, content["source"])
+
+
+def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: int) -> RecordedEvent:
+    if topic.startswith(f"{schema.FRAME_TOPIC}."):
+        # The line as the board sent it: four decimals, each followed by a comma and a space.
+        values = np.asarray(content["line"], dtype=np.float64)
+        if math.isqrt(values.size) ** 2 != values.size:
+            raise ContentError(f"{topic}: a line of {values.size} values")
+        text = "".join(f"{value:.4f}, " for value in values.tolist()) + "\r\n"
+        side, t_ns = topic.removeprefix(f"{schema.FRAME_TOPIC}."), int(content["arrival_unix_ns"])
+        return RecordedEvent(schema.input_topic(side), t_ns, {}, side, RawEvent(InputKind.DATA, t_ns, text.encode()))
+    complete = {
+        # The only imported topic beside the frames.
+        "source": LOAD_CELL,
+        "raw": content.get("torque_nm"),
+        "saturated": False,
+        "spike": False,
+        "valid": True,
+        "reason": "",
+        **content,
+        "timestamp": log_ns / 1e9,
+        "t_mono_ns": log_ns,
+        "seq": number,
+    }
+    return RecordedEvent(topic, log_ns, complete, complete["source"])
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) < 40 else f"{text[:40]}…"

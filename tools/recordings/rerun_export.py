@@ -1,0 +1,153 @@
+"""Writes a recording for the Rerun viewer: scalars with their intervals, images of the bank's match, and the robot."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.fingertip import Fingertip
+from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage, units
+from shearloop.daemon.recorder import schema
+from shearloop.daemon.web.message_store import conductivity_profile
+from shearloop.errors import require
+from shearloop.tools.recordings.intact_records import Progress
+from shearloop.tools.recordings.reader import read_messages
+
+TIMELINE = "time"
+# Values of an entity that are sent at once, and images.
+_BATCH, _IMAGE_BATCH = 1000, 30
+# Longer arrays are frames and heatmaps.
+_LONGEST_SCALARS = 8
+_POSE = 6
+_NOT_SHOWN = (*ENVELOPE, "scores", schema.SCORES_SHAPE)
+# The charts, each of one unit.
+_CHARTS = {"N·m": "torque (N·m)", "mm": "diameter (mm)", "N": "shear force (N)", "rad": "angle (rad)"}
+
+
+class _RerunFile:
+    """Adds messages to a Rerun file, in batches."""
+
+    def __init__(self, out: Path, fingertip: Fingertip) -> None:
+        import rerun
+
+        self._rr = rerun
+        self._height_cm = fingertip.height_cm
+        self._width_cm = float(np.ptp([x for x, _ in fingertip.outline().contour]))
+        # The SDK may be switched off by an environment variable, and would then write nothing.
+        self._stream = rerun.RecordingStream("shearloop", default_enabled=True)
+        self._stream.save(out)
+        self._waiting: dict[str, tuple[list[int], list[Any]]] = {}
+        self._models: dict[str, str] = {}
+        self._images: set[str] = set()
+        self._poses: set[str] = set()
+        # By entity.
+        self._units: dict[str, str] = {}
+
+    def add(self, topic: str, content: Mapping[str, Any], t_ns: int) -> None:
+        """Add one message of a recorded topic."""
+        entity, live = self._rr.new_entity_path(topic.split(".")).lstrip("/"), schema.schema_name(topic)
+        for key, value in content.items():
+            if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in _NOT_SHOWN:
+                continue
+            if isinstance(value, bool | int | float | list):
+                self._units.setdefault(f"{entity}/{key}", units(live).get(key, ""))
+                self._add(f"{entity}/{key}", value, t_ns)
+        if live == EitHeatmap.topic:
+            self._models[content["source"]] = content["model"]
+            shape = [int(side) for side in content[schema.SCORES_SHAPE]]
+            self._add_image(f"{entity}/scores", np.array(content["scores"], float).reshape(shape), t_ns)
+        elif live == EitEstimate.topic and content["k"] is not None and content["sigma"] is not None:
+            model = self._models.get(content["source"], "")
+            profile = conductivity_profile(model, content["k"], content["sigma"], self._height_cm)
+            if profile is not None:
+                # The top comes first, and twice the untouched gel's is white.
+                column = np.array(profile)[::-1, None] / 2
+                width = round(len(column) * self._width_cm / self._height_cm)
+                self._add_image(f"{entity}/conductivity", np.repeat(column, width, axis=1), t_ns)
+        elif live == RobotStateMessage.topic and len(content["tcp_pose"]) == _POSE and None not in content["tcp_pose"]:
+            self._add_pose(f"{entity}/tool_centre", content["tcp_pose"], t_ns)
+
+    def close(self) -> None:
+        """Write what waits, and the layout of the viewer."""
+        for entity in self._waiting:
+            self._send(entity)
+        self._stream.send_blueprint(self._layout())
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _add(self, entity: str, value: Any, t_ns: int) -> None:
+        times, values = self._waiting.setdefault(entity, ([], []))
+        # The values of a batch have one shape.
+        if values and np.shape(values[0]) != np.shape(value) and entity not in self._images:
+            self._send(entity)
+        times.append(t_ns)
+        values.append(value)
+        if len(times) == (_IMAGE_BATCH if entity in self._images else _BATCH):
+            self._send(entity)
+
+    def _send(self, entity: str) -> None:
+        times, waiting = self._waiting[entity]
+        if times:
+            index = self._rr.TimeColumn(TIMELINE, timestamp=np.array(times, "datetime64[ns]"))
+            self._stream.send_columns(entity, [index], self._columns(entity, waiting))
+        times.clear()
+        waiting.clear()
+
+    def _columns(self, entity: str, waiting: list[Any]) -> Any:
+        rr = self._rr
+        if entity in self._images:
+            sizes = [{"height": len(pixels), "width": len(pixels.T)} for pixels in waiting]
+            formats = [rr.components.ImageFormat(**size, color_model="L", channel_datatype="U8") for size in sizes]
+            return rr.Image.columns(buffer=[pixels.tobytes() for pixels in waiting], format=formats)
+        # A number that is not finite is null in a recording.
+        values = np.array(waiting, dtype=np.float64)
+        if entity in self._poses:
+            turns = values[:, 3:]
+            half = np.linalg.norm(turns, axis=1, keepdims=True) / 2
+            quaternions = np.hstack([turns / 2 * np.sinc(half / np.pi), np.cos(half)])
+            return rr.Transform3D.columns(translation=values[:, :3], quaternion=quaternions)
+        return rr.Scalars.columns(scalars=values)
+
+    def _add_image(self, entity: str, share: NDArray[np.floating[Any]], t_ns: int) -> None:
+        """Add a grey image; 0 and NaN are black, 1 is white."""
+        pixels = np.round(255 * np.fmin(np.fmax(share, 0), 1)).astype(np.uint8)
+        self._images.add(entity)
+        self._add(entity, pixels, t_ns)
+
+    def _add_pose(self, entity: str, pose: list[float], t_ns: int) -> None:
+        if entity not in self._poses:
+            self._poses.add(entity)
+            self._stream.log(entity, self._rr.TransformAxes3D(0.1), static=True)
+        self._add(entity, pose, t_ns)
+
+    def _layout(self) -> Any:
+        from rerun import blueprint
+
+        charted = {
+            name: [entity for entity in self._waiting if self._units.get(entity) == unit]
+            for unit, name in _CHARTS.items()
+        }
+        charts = [blueprint.TimeSeriesView(name=name, contents=lines) for name, lines in charted.items() if lines]
+        images = [blueprint.Spatial2DView(name=one, origin=one) for one in sorted(self._images)]
+        poses = [blueprint.Spatial3DView(name=one, contents=[one]) for one in sorted(self._poses)]
+        columns = [blueprint.Vertical(*views) for views in (charts, [*images, *poses]) if views]
+        return blueprint.Blueprint(blueprint.Horizontal(*columns))
+
+
+def export_rerun(
+    path: Path, out: Path, topics: list[str], fingertip: Fingertip, progress: Progress = lambda _: None
+) -> Path:
+    """Write topics of a recording as a .rrd file and return it; the conductivity is drawn for `fingertip`.
+
+    Raises OSError for a file that cannot be written, UserError without rerun-sdk and for an unreadable recording.
+    """
+    require("rerun", "rerun", "a file for Rerun")
+    # The SDK's own error is a sentence of its internals.
+    out.open("wb").close()
+    file = _RerunFile(out, fingertip)
+    for topic, content, message in read_messages(path, topics, progress):
+        file.add(topic, content, message.log_time)
+    file.close()
+    return out

@@ -220,9 +220,7 @@ def build_sensors(
     if (cell := config.load_cell) is not None:
         calibration = load_cell_calibration(cell)
         lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL))
-        tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(
-            lever, publisher, clock, loop, cell.rate_hz, inputs(LOAD_CELL)
-        )
+        tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
     return Sensors(tasks, tareable, pairs)
 
 

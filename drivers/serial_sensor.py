@@ -305,6 +305,12 @@ class SerialSensor(Generic[ValueT]):
                 yield values
 
     @property
+    def state_recorder(self) -> InputRecorder | None:
+        """The recorder, if it wants the state, and everything that was read has been yielded."""
+        wanted = self._inputs is not None and self._inputs.wants_state and not self.unread
+        return self._inputs if wanted else None
+
+    @property
     def parser(self) -> Parser[ValueT]:
         """What turns its bytes into values."""
         return self._parser

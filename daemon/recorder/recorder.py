@@ -143,15 +143,19 @@ class _Counts:
 
 
 @dataclass(slots=True)
-class _StatesWanted:
-    """Which sources owe their state to a file that began in the middle of the run."""
+class _Carried:
+    """What a file that begins in the middle of the run needs from before it."""
 
     sources: set[str] = field(default_factory=set)
+    # The sources that owe their state to the current file.
     missing: set[str] = field(default_factory=set)
+    # The latest tool event of each source, and its query that has no reply yet.
+    tools: dict[str, RawEvent] = field(default_factory=dict)
+    asked: dict[str, RawEvent] = field(default_factory=dict)
     # A further experiment begins a file.
     experiment_began: bool = False
 
-    def want(self) -> None:
+    def want_states(self) -> None:
         self.missing |= self.sources
 
 
@@ -180,10 +184,7 @@ class Recorder:
         self._queue: deque[_Item] = deque()
         self._counts = _Counts()
         self._experiment_runs = False
-        # The latest tool event of each source, and its query that has no reply yet.
-        self._tools: dict[str, RawEvent] = {}
-        self._asked: dict[str, RawEvent] = {}
-        self._states = _StatesWanted()
+        self._carried = _Carried()
         # A flush may still run in its thread when the recorder is closed.
         self._lock = threading.Lock()
         self.failure = ""
@@ -207,17 +208,17 @@ class Recorder:
 
     def input_recorder(self, source: str) -> InputRecorder:
         """Return the recorder of one source's raw input."""
-        self._states.sources.add(source)
+        self._carried.sources.add(source)
         return _SourceRecorder(self, source)
 
     def wants_state(self, source: str) -> bool:
         """Return whether a file began in the middle of the run, and has no state of this source yet."""
-        return source in self._states.missing
+        return source in self._carried.missing
 
     def record_input(self, source: str, event: RawEvent) -> None:
         """Queue a raw input."""
         if event.kind is InputKind.STATE:
-            self._states.missing.discard(source)
+            self._carried.missing.discard(source)
         add = partial(self._add_input, source, event, self._clock.offset_ns)
         self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
 
@@ -228,9 +229,9 @@ class Recorder:
         t_unix_ns = self._clock.now_ns() + self._clock.offset_ns
         notes = {} if tool_mm is None else {schema.DIAMETER_NOTE: f"{tool_mm:g}"}
         add = partial(self._add_experiment, name, attached, notes, t_unix_ns)
-        if self._states.experiment_began:
-            self._states.want()
-        self._states.experiment_began = True
+        if self._carried.experiment_began:
+            self._carried.want_states()
+        self._carried.experiment_began = True
         self._enqueue(_OVERHEAD_BYTES, add, begins_experiment=True)
 
     async def flushes(self) -> AsyncIterator[str]:
@@ -329,12 +330,12 @@ class Recorder:
             self.failure = f"{self._folder}: {error.strerror}"
             return
         if not states_follow:
-            self._states.want()
+            self._carried.want_states()
         self._finish_file(previous, lost)
-        self._current.file.add_metadata(schema.CONTINUED_METADATA, {"sources": " ".join(sorted(self._states.sources))})
-        for source, event in list(self._asked.items()):
+        self._current.file.add_metadata(schema.CONTINUED_METADATA, {"sources": " ".join(sorted(self._carried.sources))})
+        for source, event in list(self._carried.asked.items()):
             self._add_input(source, event, self._clock.offset_ns)
-        for source, event in self._tools.items():
+        for source, event in self._carried.tools.items():
             # The tool is still held, and a replay of this file must know it.
             self._add_input(source, replace(event, t_ns=self._current.began_ns), self._clock.offset_ns)
 
@@ -394,11 +395,11 @@ class Recorder:
     def _add_input(self, source: str, event: RawEvent, offset_ns: int) -> None:
         match event.kind:
             case InputKind.TOOL:
-                self._tools[source] = event
+                self._carried.tools[source] = event
             case InputKind.ASKED:
-                self._asked[source] = event
+                self._carried.asked[source] = event
             case InputKind.DATA:
-                self._asked.pop(source, None)
+                self._carried.asked.pop(source, None)
         self._add_clock(event.t_ns, offset_ns)
         t_unix_ns = event.t_ns + offset_ns
         self._current.file.add(schema.input_topic(source), t_unix_ns, t_unix_ns, schema.input_json(event))

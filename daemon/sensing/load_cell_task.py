@@ -13,7 +13,6 @@ from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.drivers.load_cell import LoadCell, LoadSample
-from shearloop.drivers.serial_sensor import InputRecorder
 
 LOAD_CELL = "load_cell"
 # Two seconds at 10.9 Hz.
@@ -33,22 +32,14 @@ class LoadCellTask:
     """Connects the load cell's board to the publisher and the control loop."""
 
     def __init__(
-        self,
-        board: LoadCell,
-        publisher: Publisher,
-        clock: Clock,
-        loop: ControlLoop | None,
-        rate_hz: float,
-        inputs: InputRecorder | None = None,
+        self, board: LoadCell, publisher: Publisher, clock: Clock, loop: ControlLoop | None, rate_hz: float
     ) -> None:
-        """Take the board, which keeps its own bytes in `inputs`; the task keeps its state there."""
         self._period_s = 1.0 / rate_hz
         self._timeout_s = max(ZERO_TIMEOUT_S, 2.0 * (ZERO_SAMPLES + SETTLING_PERIODS) / rate_hz)
         self._board = board
         self._publisher = publisher
         self._clock = clock
         self._loop = loop
-        self._inputs = inputs
         # The raw values of a zero in progress, and the times between which it is taken.
         self._zeroing: list[float] | None = None
         self._zero_from_ns = self._zero_until_ns = 0
@@ -67,8 +58,8 @@ class LoadCellTask:
                     torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
                     self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, message.reason, sample.t_mid_ns, now_ns))
                 self._take_zero(sample)
-                if self._inputs is not None and self._inputs.wants_state and not self._board.unread:
-                    record_state(self._inputs, {"parser": self._board.parser}, {}, self._clock.now_ns())
+                if (inputs := self._board.state_recorder) is not None:
+                    record_state(inputs, {"parser": self._board.parser}, {}, self._clock.now_ns())
                 self._sampled.set()
                 self._sampled.clear()
 

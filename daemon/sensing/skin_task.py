@@ -87,7 +87,6 @@ class SkinTask:
             config.daq.averaged,
         )
         self.source = SkinCurrentTask(self._skin)
-        self._calibration = calibration
         self._estimator = _estimator(config, calibration)
         self._publisher = publisher
         self._clock = clock
@@ -109,7 +108,7 @@ class SkinTask:
                 self._sampled.clear()
                 if self._inputs is not None and self._inputs.wants_state and self._skin.is_between_readings:
                     state = {**self._skin.state, "estimator": self._estimator}
-                    record_state(self._inputs, state, {"calibration": self._calibration}, self._clock.now_ns())
+                    record_state(self._inputs, state, self._estimator.fixed, self._clock.now_ns())
 
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""
@@ -162,7 +161,6 @@ class ReplayedSkin:
     def __init__(self, config: SkinConfig) -> None:
         """Raises BankError for an unusable calibration."""
         calibration = load_calibration(config.calibration)
-        self._calibration = calibration
         self._estimator = _estimator(config, calibration)
         current_a = config.source.current_ma * 1e-3
         daq_period_s = 1.0 / config.daq.rate_hz
@@ -178,7 +176,7 @@ class ReplayedSkin:
 
     def restore(self, text: bytes) -> None:
         """Continue from a recorded state; raises SnapshotError for one that does not fit."""
-        state = restored(text, {"calibration": self._calibration})
+        state = restored(text, self._estimator.fixed)
         self._validator, self._averager = state["validator"], state["averager"]
         self._latest, self._estimator = state["latest"], state["estimator"]
         self._daq = state.get("parser", self._daq)

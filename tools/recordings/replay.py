@@ -187,6 +187,8 @@ class ReplayComparison:
     compared: Counter[str] = field(default_factory=Counter)
     different: Counter[str] = field(default_factory=Counter)
     examples: list[str] = field(default_factory=list)
+    # Sources that continue from a state which has not come yet: their messages are sent as they were recorded.
+    awaited: set[str] = field(default_factory=set)
     _foreign: int = 0
     _computed: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
 
@@ -202,6 +204,7 @@ class ReplayComparison:
 
     def restart(self, source: str) -> None:
         """Forget the messages of a source so far: they were forwarded, and it is computed from here on."""
+        self.awaited.discard(source)
         self._computed = {key: waiting for key, waiting in self._computed.items() if key[1] != source}
 
     def compare(self, event: RecordedEvent) -> None:
@@ -261,8 +264,7 @@ class Replay:
         if config.load_cell is not None:
             self._load_parser = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
         self._skin = ReplayedSkin(config.skin) if config.skin is not None else None
-        # Sources that continue from a state which has not come yet: their messages are sent as they were recorded.
-        self._awaited = set(run.continued.intersection(self._sources)) if run.continues_with(config) else set()
+        self.comparison.awaited.update(run.continued.intersection(self._sources)) if run.continues_with(config) else ()
 
     @property
     def _sources(self) -> set[str]:
@@ -293,17 +295,25 @@ class Replay:
         elif event.raw is not None:
             self._clock.set(event.t_mono_ns)
             await self._process_input(event.source, event.raw)
-        elif self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in self._sources - self._awaited:
+        elif (
+            self._run.has_inputs
+            and event.topic in COMPUTED_TOPICS
+            and event.source in self._sources - self.comparison.awaited
+        ):
             self.comparison.compare(event)
         elif event.topic != messages.EitHeatmap.topic:
             self._publisher.forward(event.topic, messages.with_packed_arrays(event.content))
 
+    def _is_compared(self, event: RecordedEvent) -> bool:
+        computed = self._sources - self.comparison.awaited
+        return self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in computed
+
     async def _process_input(self, source: str, event: RawEvent) -> None:
         """Publish the messages that follow from a raw input; an input of another source is ignored."""
         if event.kind is InputKind.STATE:
-            if source in self._awaited:
+            if source in self.comparison.awaited:
                 self._restore(source, event.data)
-        elif source in self._awaited:
+        elif source in self.comparison.awaited:
             # Its state, which comes soon, includes what follows from this.
             return
         elif source in self._frame_parsers:
@@ -319,7 +329,7 @@ class Replay:
         elif self._skin is not None and source in self._skin.sources:
             # A query before the state may have its reply after it.
             for message in self._skin.handle(source, event):
-                if SKIN not in self._awaited:
+                if SKIN not in self.comparison.awaited:
                     self._publisher.publish(self._continued(message))
 
     def _restore(self, source: str, text: bytes) -> None:
@@ -328,7 +338,7 @@ class Replay:
             if source in self._estimators:
                 session = self._estimators[source].session
                 state = restored(text, session.fixed)
-                self._estimators[source].session = state["session"]
+                self._estimators[source].continue_from(state["session"])
                 if source in self._frame_parsers:
                     self._frame_parsers[source] = state["parser"]
                 else:
@@ -339,7 +349,6 @@ class Replay:
                 self._skin.restore(text)
         except (SnapshotError, KeyError) as error:
             raise UserError(f"{self._run.path}: the state of {source} cannot be used: {error}") from error
-        self._awaited.discard(source)
         self.comparison.restart(source)
         self._number_offset[source] = 0
 

@@ -21,7 +21,7 @@ from benchmarks.common import parser_of, table_head, table_row, write_figures
 from benchmarks.stop_times import CAUSES, RunningRig
 from shearloop.tools.recordings.reader import read_recording
 
-FAULTS = [cause for cause in CAUSES if cause.command]
+FAULTS = [cause for cause in CAUSES if cause.command and not cause.straight]
 
 
 def usage(rig: RunningRig) -> dict[str, float]:

@@ -3,10 +3,10 @@
     python -m benchmarks.stop_times --out run/stop_times [--repeats 20] [--busy 8] [--only TEXT]
 
 The real daemon in its own process and the real drivers, with the rig emulated over its real ports. The wrist turns a
-gripped tool at 0.5 rad/s when a process is killed, stopped or blocked, or a device fails. The emulated robot reports
-when its true wrist stands. The promise is 0.2 s, and for a device's fault what the daemon needs to notice it: a period
-of a sensor that is unplugged and of the polled gripper, two of the load cell for a jump within a reading, 2.5 of a
-sensor that falls silent. `--busy` runs that many busy processes.
+gripped tool at 0.5 rad/s, or the tool centre moves straight at 0.1 m/s, when a process is killed, stopped or blocked,
+or a device fails. The emulated robot reports when its true joints stand. The promise is 0.2 s, and for a device's fault
+what the daemon needs to notice it: a period of a sensor that is unplugged and of the polled gripper, two of the load
+cell for a jump within a reading, 2.5 of a sensor that falls silent. `--busy` runs that many busy processes.
 
 Writes JSON and a chart.
 """
@@ -23,7 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,16 +47,21 @@ from shearloop.drivers.defaults import FRAME_PERIOD_S, LOAD_CELL_RATE_HZ
 PROMISE_S = 0.2
 DEADLINE_S = 60.0
 SPEED_RAD_PER_S, FAR_RAD = 0.5, 2.5
+SPEED_M_PER_S, FAR_M = 0.1, 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Signals to processes, or a command to the rig; `noticed_s` is the time until the daemon can know of it."""
+    """Signals to processes, or a command to the rig; `noticed_s` is the time until the daemon can know of it.
+
+    `straight`: it comes during a straight move; else while the wrist turns.
+    """
 
     name: str
     signals: tuple[tuple[str, signal.Signals], ...] = ()
     command: str = ""
     noticed_s: float = 0.0
+    straight: bool = False
 
     @property
     def promise_s(self) -> float:
@@ -68,7 +73,8 @@ def _periods_s(topic: str, count: float) -> float:
     return count / (TOPICS[topic].rate_hz or 1.0)
 
 
-CAUSES = (
+# What can happen to the processes, and to the link between them and the robot.
+ENDINGS = (
     Cause("daemon killed", (("daemon", signal.SIGKILL),)),
     Cause("worker killed", (("worker", signal.SIGKILL),)),
     Cause("daemon and worker killed", (("daemon", signal.SIGKILL), ("worker", signal.SIGKILL))),
@@ -78,7 +84,10 @@ CAUSES = (
     Cause("protective stop", command="protective-stop"),
     Cause("emergency stop", command="emergency-stop"),
     Cause("RTDE lost", command="drop-rtde"),
-    Cause("robot silent", command="silence robot 3", noticed_s=0.25),
+    # What the robot sends is lost; what it is sent arrives.
+    Cause("link open one way", command="silence robot 3"),
+)
+DEVICES = (
     Cause("EIT board unplugged", command="unplug right", noticed_s=_periods_s("eit.frame", 1)),
     Cause("EIT board silent", command="silence right 5", noticed_s=_periods_s("eit.frame", STALE_AFTER_PERIODS)),
     Cause("load cell unplugged", command="unplug load", noticed_s=_periods_s("load.torque", 1)),
@@ -87,6 +96,7 @@ CAUSES = (
     Cause("tool dropped", command="gripper drop", noticed_s=_periods_s("gripper.state", 1)),
     Cause("torque beyond its limit", command="kick 0.4", noticed_s=_periods_s("load.torque", 2)),
 )
+CAUSES = (*ENDINGS, *(replace(one, name=f"straight: {one.name}", straight=True) for one in ENDINGS), *DEVICES)
 
 
 def write_random_bank(path: Path) -> None:
@@ -115,6 +125,8 @@ class RunningRig:
             folder, "config/ur.yaml", fingertips={"right": right}, load_cell=load_cell, **content
         )
         self._folder = folder
+        # The height of the middle of the straight moves.
+        self._middle_m: float | None = None
         self._unread = b""
         self._daemons = stack.enter_context(ExitStack())
         self._start_daemon()
@@ -157,21 +169,41 @@ class RunningRig:
                     return content
         raise RuntimeError("no such message of the daemon")
 
+    def begin(self, cause: Cause) -> None:
+        """Turn the wrist, or move straight, as the cause needs; return at full speed."""
+        if cause.straight:
+            self.move_straight()
+        else:
+            self.turn()
+
+    def move_straight(self) -> None:
+        """Move the open gripper along the tool, to the other side of where it began; return at full speed."""
+        height_m = self.wait_for(lambda topic, _: topic == "robot.state")["tcp_pose"][2]
+        if self._middle_m is None:
+            self._middle_m = height_m - 0.5 * FAR_M
+        # The tool points down.
+        along_m = FAR_M if height_m > self._middle_m else -FAR_M
+        approach = {"do": "approach", "along_tool_m": along_m, "speed_m_per_s": SPEED_M_PER_S}
+        self._run([{"do": "release", "width_mm": 30}, approach], _moves_or_ended)
+
     def turn(self) -> None:
         """Grip the tool and turn it from where the wrist is to the other side; return at full speed."""
         wrist_rad = self.wait_for(lambda topic, _: topic == "robot.state")["wrist_rad"]
         twist = {"do": "twist", "angles_rad": [-FAR_RAD if wrist_rad > 0 else FAR_RAD], "absolute": True,
                  "speed_rad_per_s": SPEED_RAD_PER_S, "return_to_start": False}  # fmt: skip
         grip = {"do": "grip", "width_mm": 5, "speed_mm_per_s": 250, "force_n": 60}
-        steps = [{"do": "release", "width_mm": 30}, grip, twist]
+        self._run([{"do": "release", "width_mm": 30}, grip, twist], _turns_or_ended)
+
+    def _run(self, steps: list[dict[str, Any]], condition: Callable[[str, Mapping[str, Any]], bool]) -> None:
+        """Start an experiment, again while it ends early; return once a robot's state meets the condition."""
         limits = {"torque_nm": 0.3, "angle_rad": 6.28}
-        path = self._folder / "twist.yaml"
-        content = {"name": "twist", "torque_source": "load_cell", "limits": limits, "steps": steps}
+        path = self._folder / "motion.yaml"
+        content = {"name": "motion", "torque_source": "load_cell", "limits": limits, "steps": steps}
         path.write_text(yaml.safe_dump(content))
         end_s = time.monotonic() + DEADLINE_S
         while time.monotonic() < end_s:
             reply = self.send("start", experiment=str(path))
-            if reply["ok"] and "wrist_rad" in (reply := dict(self.wait_for(_turns_or_ended))):
+            if reply["ok"] and "wrist_rad" in (reply := dict(self.wait_for(condition))):
                 return
             # Devices come back at their own time.
             time.sleep(0.2)
@@ -219,6 +251,12 @@ def _turns_or_ended(topic: str, content: Mapping[str, Any]) -> bool:
     return bool(abs(content["wrist_speed_rad_per_s"]) > 0.95 * SPEED_RAD_PER_S)
 
 
+def _moves_or_ended(topic: str, content: Mapping[str, Any]) -> bool:
+    if topic == "loop.state":
+        return content["phase"] in ("stopped", "done")
+    return bool(content["tcp_speed_m_per_s"] > 0.95 * SPEED_M_PER_S)
+
+
 @contextlib.contextmanager
 def busy_processes(count: int) -> Iterator[None]:
     """Run processes that only compute."""
@@ -241,7 +279,7 @@ def measure(causes: Sequence[Cause], repeats: int, busy: int) -> dict[str, list[
         for cause in causes:
             times = found[cause.name] = []
             for _ in range(repeats):
-                rig.turn()
+                rig.begin(cause)
                 began_ns = rig.cause(cause)
                 times.append((rig.stood_ns(began_ns) - began_ns) / 1e9)
                 rig.recover(cause)

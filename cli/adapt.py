@@ -21,8 +21,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--tool-mm", TOOL_MM, "MM", "diameter of the tool, if the recording does not name it")
     add_json(parser)
     parser.epilog = (
-        "The gain of each fingertip changes between grips. One twist of known torque corrects most of it; the "
-        "correction is the smaller, the less the twists agree. Use the result for this grip, and CAL for the next one."
+        "The gain of each fingertip changes between grips. Twists of known torque correct it; the correction is the "
+        "smaller, the less twists agree, and the first twist after a grip counts less than the later ones. Use the "
+        "result for this grip, and CAL for the next one."
     )
 
 

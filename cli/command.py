@@ -64,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
         # These two need no key on the daemon's own machine.
         try:
             reply = stop_client.send_to_stop_socket(address, request, timeout_s)
+        except stop_client.StopSocketTakenError as error:
+            print(f"shearloop command: {error}; `{args.name}` is sent to the command address instead", file=sys.stderr)
         except TimeoutError:
             # The daemon may have stopped the motion by now. A second `stop` must not end the daemon.
             request["spare_daemon"] = True

@@ -72,7 +72,7 @@ def _allow(args: argparse.Namespace) -> int:
     public = load_public_key(args.key)
     name, clients = args.name or args.key.stem, args.dir / "clients"
     _check_name(name)
-    allowed = allowed_clients(clients)
+    allowed = allowed_clients(clients).names
     if public in allowed:
         raise UserError(f"{args.key} is allowed already, as {allowed[public]}")
     if name in allowed.values():
@@ -87,7 +87,7 @@ def _revoke(args: argparse.Namespace) -> int:
     _check_name(args.name)
     path = args.dir / "clients" / f"{args.name}.key"
     if not path.exists():
-        known = ", ".join(sorted(allowed_clients(path.parent).values())) or "none"
+        known = ", ".join(sorted(allowed_clients(path.parent).names.values())) or "none"
         raise UserError(f"there is no client {args.name!r}; the allowed clients are {known}")
     with writing_keys():
         path.unlink()
@@ -99,8 +99,9 @@ def _list(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.keys import allowed_clients, load_public_key
 
     server = load_public_key(args.dir / "server.key").decode()
-    clients = {name: key.decode() for key, name in allowed_clients(args.dir / "clients").items()}
-    sentences = [f"{server}  the daemon", *(f"{key}  {name}" for name, key in clients.items())]
+    allowed = allowed_clients(args.dir / "clients")
+    clients = {name: key.decode() for key, name in allowed.names.items()}
+    sentences = [f"{server}  the daemon", *(f"{key}  {name}" for name, key in clients.items()), *allowed.unusable]
     if not clients:
         sentences.append("no client may connect yet; see `shearloop keys allow`")
     return print_result({"server": server, "clients": clients}, sentences, as_json=args.json)

@@ -22,6 +22,7 @@ from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, build_rig
+from shearloop.daemon.rig_memory import Remembered
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.service import notify
@@ -108,6 +109,8 @@ class Daemon:
         """Run until `stop`, then end every task and close the sockets; `on_ready` is called once the tasks run."""
         try:
             await self._run_tasks(on_ready)
+            if self._rig is not None and self._rig.memory is not None:
+                await self._rig.memory.save(Remembered.of(self._rig.control_loop))
             self.health.publish_end(finished=self.finished, summary=self._summary.text)
         finally:
             try:

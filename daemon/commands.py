@@ -16,7 +16,7 @@ from shearloop.errors import UserError
 
 STOP_DELAY_S = 0.05
 # What `status` shows of `loop.state`.
-LOOP_KEYS = ("phase", "experiment", "step", "steps", "step_name", "activity", "progress", "reasons")
+LOOP_KEYS = ("phase", "run", "experiment", "step", "steps", "step_name", "activity", "progress", "reasons")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Commands:
             raise CommandRefusedError(str(error)) from error
         if self.experiment is not None:
             self.experiment.on_begun(Path(path))
-        return {"experiment": str(path)}
+        return {"experiment": str(path), "run": rig.control_loop.runs}
 
     async def _pause(self, _request: Request) -> Reply:
         _refuse_if(required_rig(self.rig).control_loop.pause())

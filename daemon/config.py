@@ -34,7 +34,7 @@ from shearloop.yaml_files import shown
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {
     *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording"),
-    *("commands", "stop", "publish", "clients", "health", "daemon", "clock"),
+    *("commands", "stop", "publish", "clients", "health", "daemon", "clock", "memory"),
 }
 
 

@@ -18,6 +18,7 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.addresses import is_loopback_host
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
+from shearloop.daemon.rig_memory import RigMemory, memory_path
 from shearloop.daemon.sensing.fingertip_task import (
     CombinedFingertips,
     FingertipPipeline,
@@ -148,6 +149,8 @@ class Rig:
     tasks: Mapping[str, Task]
     experiments: ExperimentFiles
     recorder: Recorder | None
+    # None for a rig that starts by itself: its emulated devices end with the daemon.
+    memory: RigMemory | None = None
 
     async def start(self, path: Path) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
@@ -156,7 +159,13 @@ class Rig:
             return reason
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
-        reason = await self.runner.start(experiment.file, stops_before)
+        try:
+            if self.memory is not None and (reason := await self.memory.begins(experiment.file.name)) is not None:
+                return reason
+            reason = await self.runner.start(experiment.file, stops_before)
+        finally:
+            if self.memory is not None:
+                self.memory.starting = ""
         if reason is None and self.recorder is not None:
             attached = (AttachedFile.of(path, experiment.data),)
             self.recorder.record_experiment(experiment.file.name, attached, experiment.file.tool_mm)
@@ -242,7 +251,11 @@ def build_rig(
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, settings.limits, gripper_model(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
-    return sensors, Rig(loop, runner, {**fingers, "robot": robot, "loop": runner}, experiments, recorder)
+    memory = RigMemory(memory_path(settings.host), loop) if not config.autostart else None
+    tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
+    if memory is not None:
+        tasks["memory"] = memory
+    return sensors, Rig(loop, runner, tasks, experiments, recorder, memory)
 
 
 def gripper_model(config: DaemonConfig) -> GripperModel | None:

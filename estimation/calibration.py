@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
@@ -32,7 +32,7 @@ from shearloop.estimation.values import INLINE, Kind, Measured
 from shearloop.files import open_file, refusing_damage, replace_file
 from shearloop.yaml_files import parse_yaml, shown
 
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"
 _FILE_KIND = "shearloop estimator calibration"
@@ -104,14 +104,17 @@ class Calibration:
             return self.torque.regressor
         raise CalibrationError("only the torque of raw frames has a gain to correct; calibrate on raw recordings")
 
-    def correct_gain(self, features: FloatArray, torque_nm: FloatArray) -> tuple[Self, GainCorrection]:
+    def correct_gain(
+        self, features: FloatArray, torque_nm: FloatArray, first: BoolArray | None = None
+    ) -> tuple[Self, GainCorrection]:
         """Return the calibration with the gain of each side corrected by (n, d) features of known torques (n,).
 
-        Raises CalibrationError as `gain_regressor` does, and without a load that is large enough to show the gain.
+        `first` (n,) marks frames of the first twist after a grip. Raises CalibrationError as `gain_regressor` does,
+        without a load that is large enough to show the gain, and for twists that do not narrow it.
         """
         torque, regressor = self.torque, self.gain_regressor()
         sides = self.estimator.side_of_features(len(regressor.mean_feature))
-        adapted, correction = regressor.adapt(features, torque_nm, sides)
+        adapted, correction = regressor.adapt(features, torque_nm, sides, first)
         return replace(self, torque=torque and replace(torque, regressor=adapted)), correction
 
     @classmethod
@@ -194,7 +197,10 @@ class Calibration:
         whole = self.estimator.scale.shape == (m, c) and all(row.shape == (c,) for row in rows)
         if not whole or len(self.validators) not in (0, len(self.sides)):
             raise ValueError(f"it is of {len(self.sides)} sides of {c} channels, and its arrays have other shapes")
-        for model in self.outputs.values():
+        for quantity, model in self.outputs.items():
+            width, found = self.estimator.feature_width(quantity), len(model.regressor.mean_feature)
+            if width not in (None, found):
+                raise ValueError(f"the regressor of the {quantity} has {found} inputs, expected {width}")
             if model.k_range.shape not in ((0,), (2,)):
                 raise ValueError(f"k_range has the shape {model.k_range.shape}, expected two values")
             if model.novelty is not None:

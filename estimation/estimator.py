@@ -117,8 +117,8 @@ class Material:
 class CalibrationRows:
     """Calibration frames: the recording (n,), number and age (n,) of each there, its features (n, d) and the truth.
 
-    position and mean_position (n, m·c) are the difference to the idle frame and its mean over the grip, in units of
-    noise.
+    grip (n,) numbers the grips of all recordings. position and mean_position (n, m·c) are the difference to the idle
+    frame and its mean over the grip, in units of noise.
     """
 
     recording: IntArray
@@ -129,6 +129,7 @@ class CalibrationRows:
     mean_position: FloatArray
     torque_nm: FloatArray
     diameter_mm: FloatArray
+    grip: IntArray
 
     def where(self, rows: IntArray | BoolArray) -> Self:
         """Return some of the frames."""
@@ -234,6 +235,10 @@ class Estimator(ABC):
             fingertips=len(self.scale),
         )
         return self, regressor, 0.0
+
+    def feature_width(self, quantity: Quantity) -> int | None:  # noqa: ARG002 - estimators with a known width use it
+        """Return the number of inputs of a quantity's regressor, None if the estimator does not tell."""
+        return None
 
     def side_of_features(self, n_features: int) -> IntArray:
         """Return the side (d,) that each of the torque's features comes from: one number where they have no side."""

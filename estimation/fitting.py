@@ -4,6 +4,7 @@ Every choice is made on data left out of the fit: later data, blocks of time or 
 Nothing looks at the recordings that the calibration will be evaluated on.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -25,7 +26,7 @@ from shearloop.estimation.estimator import (
 )
 from shearloop.estimation.estimator_names import EstimatorName, estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator, segment_grip
-from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, gains_of_recordings
+from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, first_twists, loaded_log_gain
 from shearloop.estimation.interval_regressor import CensoredRidge, IntervalRegressor, fit_interval_regressor
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.novelty import NoveltyDetector
@@ -137,7 +138,7 @@ def _fit_raw(
     estimator = calibration.estimator
     if not estimator.imputes_by_motion:
         estimator = replace(estimator, imputer=ChannelImputer.fit(rows.position, calibration.validators))
-    estimator, regressor, unexplained = estimator.fit_torque(rows.features, rows.torque_nm, bounds, rows.recording)
+    estimator, regressor, unexplained = estimator.fit_torque(rows.features, rows.torque_nm, bounds, rows.grip)
     # By age within the recordings, so that every part has all tools.
     order = np.argsort(rows.age_s, kind="stable")
     known = rows.where(order[np.isfinite(rows.diameter_mm[order])])
@@ -161,10 +162,11 @@ def _fit_raw(
 def _fit_tools(
     estimator: Estimator, rows: CalibrationRows, diameters_mm: FloatArray
 ) -> tuple[Estimator, IntervalRegressor, ToolLaw] | None:
-    """Return the regressor of torques in units of each tool's gain, and the law of these gains.
+    """Return the regressor of torques in units of each recording's gain, and the law of these gains over the tools.
 
-    None where the tools have the torque in common, or were twisted both ways. Motion shows how torque changes after
-    the grip, so a recording counts from its least torque on.
+    A recording's gain is the root mean square of its torque: twists of all tools move the gel alike. None where the
+    tools have the torque in common, or were twisted both ways. Motion shows how torque changes after the grip, so a
+    recording counts from its least torque on.
     """
     rows = rows.where(np.isfinite(diameters_mm)[rows.recording])
     features, torque_nm = rows.features, rows.torque_nm.copy()
@@ -175,14 +177,25 @@ def _fit_tools(
             return None
         torque_nm[own] -= np.quantile(torque_nm[own], _RELEASED)
 
-    def predict(kept: IntArray, out: IntArray, values: FloatArray) -> FloatArray:
-        return np.maximum(CensoredRidge.fit(features[kept], values[kept], _TOOLS_STRENGTH).predict(features[out]), 0.0)
-
-    gains = gains_of_recordings(recording, torque_nm, predict)
-    if gains.max() < _TOOLS_DIFFER * gains.min():
+    each = [np.flatnonzero(recording == one) for one in range(len(tools))]
+    if _have_torque_in_common(features, torque_nm, each):
         return None
-    estimator, regressor, _ = estimator.fit_torque(features, torque_nm / gains[recording], None, recording)
+    gains = np.array([np.sqrt((torque_nm[rows] ** 2).mean()) for rows in each])
+    estimator, regressor, _ = estimator.fit_torque(features, torque_nm / gains[recording], None, rows.grip)
     return estimator, regressor, ToolLaw.fit(diameters_mm, gains)
+
+
+def _have_torque_in_common(features: FloatArray, torque_nm: FloatArray, each: Sequence[IntArray]) -> bool:
+    """Return whether the torques of each recording's rows follow from the others' with nearly the same gain."""
+    found: list[float] = []
+    for out in each:
+        kept = np.setdiff1d(np.arange(len(torque_nm)), out)
+        line = CensoredRidge.fit(features[kept], torque_nm[kept], _TOOLS_STRENGTH)
+        gain = loaded_log_gain(np.maximum(line.predict(features[out]), 0.0), torque_nm[out])
+        if gain is None:
+            return False
+        found.append(gain)
+    return max(found) - min(found) < math.log(_TOOLS_DIFFER)
 
 
 def adapt(
@@ -206,15 +219,18 @@ def adapt(
     matcher = calibration.matcher((physics or Physics()).bank)
     check_finite(recordings)
     rows = _replay(calibration, matcher, [one.select_sides(calibration.sides) for one in recordings])
-    if rows is not None and first_frames:
-        rows = rows.where(rows.frame >= np.array(first_frames)[rows.recording])
+    if rows is not None:
+        is_first = first_twists(rows.torque_nm, rows.grip)
+        if first_frames:
+            count = rows.frame >= np.array(first_frames)[rows.recording]
+            rows, is_first = rows.where(count), is_first[count]
     if rows is None or not len(rows.frame):
         raise CalibrationError(
             "no frame is gripped and undisturbed for long enough; `shearloop evaluate` lists the reasons; "
             "twist the gripped tool again"
         )
     features = rows.features[:, calibration.estimator.columns["torque"]]
-    adapted, correction = calibration.correct_gain(features, rows.torque_nm)
+    adapted, correction = calibration.correct_gain(features, rows.torque_nm, is_first)
     return replace(adapted, source=f"{calibration.source}, adapted on {source}"), correction
 
 
@@ -222,17 +238,21 @@ def _replay(
     calibration: Calibration, matcher: BankMatcher | None, recordings: Sequence[FrameSeries]
 ) -> CalibrationRows | None:
     """Return the frames that an estimate would be made of, processed as in a session; None without any."""
-    estimator, rows = calibration.estimator, []
+    estimator, rows, grip = calibration.estimator, [], 0
     for recording, series in enumerate(recordings):
         state = SessionState(calibration.validators, estimator.motion)
+        grip, was_held = grip + 1, False
         truths = zip(series.torque_at_frames(), series.diameter_mm, strict=True)
         for i, (t_s, channels, truth) in enumerate(zip(series.t_s.tolist(), series.channels, truths, strict=True)):
             processed = state.process(TactileFrame.of(t_s, channels))
+            if was_held and not processed.held_frames:
+                grip += 1
+            was_held = processed.held_frames > 0
             if processed.reasons or not np.isfinite(truth[0]):
                 continue
             features = estimator.features(Reading.of(processed, t_s, matcher))
             places = ((one / estimator.scale).ravel() for one in (processed.difference, processed.mean_difference))
-            rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, *truth))
+            rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, *truth, grip))
     return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None
 
 

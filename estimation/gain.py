@@ -13,29 +13,40 @@ from typing import Self
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import TWO_SIDED_95
 
 # Standard deviation of the logarithm of one fingertip's gain between recordings, and the recordings that it counts as.
 # Cylinders and days recorded twice differ by factors of 0.44 to 1.4.
 PRIOR_SPREAD, _PRIOR_RECORDINGS = 0.28, 3
+# The same of the first twist after a grip against the later ones, and the grips that its mean of 0 counts as.
+FIRST_SPREAD, _PRIOR_GRIPS = 0.2, 1
+# The same of a tool that was not calibrated, against the law over the diameter: a factor of 4 either way.
+TOOL_SPREAD = 0.7
 # Twists of a recording differ at least by this; a few alike are chance.
 _LEAST_WITHIN = 0.05
-_LEAST_NOISE, _LEAST_ZERO, _ROUNDS = 1e-3, 1e-6, 200
-# Furthest diameter beyond the calibrated ones, as a ratio, and rounds that the gains of recordings need to settle.
-_REACH, _GAIN_ROUNDS = 1.5, 8
+_LEAST_NOISE, _LEAST_ZERO = 1e-3, 1e-6
+# The gain drifts while the gel settles, so successive twists deviate alike from the later ones, by this share of the
+# variance; more twists do not average it away.
+_ALIKE = 0.8
+# Furthest diameter beyond the calibrated ones, as a ratio.
+_REACH = 1.5
 # A frame is loaded above this share of the largest torque.
 LOADED_SHARE = 0.1
-# Gains outside these mean a twist that was missed or has the wrong sign, and are clipped.
-_LEAST_GAIN, _LARGEST_GAIN = 0.2, 5.0
+# A correction that leaves more than this share of the spread before it says nothing.
+_MOST_LEFT = 0.95
+# Damping of the first step, the most steps, and the square of a step, in standard errors, that changes nothing.
+_FIRST_DAMPING, _MOST_STEPS, _SETTLED = 1e-3, 200, 1e-12
 
 
 @dataclass(frozen=True, slots=True)
 class GainSpread:
     """Standard deviations of the gain's logarithm, and of the rest of a loaded frame's error in N·m.
 
-    `between` is of one recording to the next, and as certain as from this number of `recordings`; `within` is of one
-    twist to the next. `zero` is of the torque without motion, as a share of the load: 0 for the calibration's tool.
+    `between` is of one grip to the next, and as certain as from this number of `recordings`; `within` is of twists
+    of one grip. The first twist after a grip differs from the later ones by `first`, with the deviation `first_spread`.
+    `zero` is of the torque without motion, as a share of the load: 0 for the calibration's tool.
     """
 
     between: float = 0.0
@@ -43,26 +54,60 @@ class GainSpread:
     noise_nm: float = 0.0
     recordings: int = _PRIOR_RECORDINGS
     zero: float = 0.0
+    first: float = 0.0
+    first_spread: float = FIRST_SPREAD
 
     @classmethod
-    def fit(cls, predicted: FloatArray, truth: FloatArray, recordings: Sequence[float], m: int) -> Self:
-        """Return the spread from (n,) predictions of left-out frames and their truth.
+    def fit(
+        cls,
+        predicted: FloatArray,
+        truth: FloatArray,
+        grips: IntArray,
+        is_first: BoolArray,
+        left_out: Sequence[float],
+        fingertips: int,
+    ) -> Self:
+        """Return the spread from (n,) predictions of left-out frames and their truth, in the order of time.
 
-        `recordings` are the gains of recordings left out of the fit; m fingertips share the prior.
+        `grips` are the number of each one's grip, `is_first` whether it belongs to the grip's first twist, `left_out`
+        logarithms of the gains of grips that were left out of the fit. The fingertips share the prior.
         """
-        twists = find_twists(truth)
-        gains = [_gain(predicted[rows], truth[rows]) for rows in twists]
-        residuals = [truth[rows] - gain * predicted[rows] for gain, rows in zip(gains, twists, strict=True)]
-        noise_nm = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))) if twists else 0.0
+        root = math.sqrt(fingertips)
+        noise: list[FloatArray] = []
+        firsts: list[float] = []
+        squares, freedom = 0.0, 0
+        for own in (np.flatnonzero(grips == one) for one in np.unique(grips)):
+            twists = [own[rows] for rows in find_twists(truth[own])]
+            gains = [log_gain(predicted[rows], truth[rows]) for rows in twists]
+            noise += [
+                truth[rows] - (0.0 if gain is None else math.exp(gain)) * predicted[rows]
+                for rows, gain in zip(twists, gains, strict=True)
+            ]
+            # A tool's own gain is not a difference between twists, so each grip counts from its own mean.
+            known = [
+                (gain, bool(is_first[rows[0]])) for gain, rows in zip(gains, twists, strict=True) if gain is not None
+            ]
+            if later := [gain for gain, first in known if not first]:
+                mean = float(np.mean(later))
+                squares, freedom = squares + sum((gain - mean) ** 2 for gain in later), freedom + len(later) - 1
+                firsts += [gain - mean for gain, first in known if first]
+        noise_nm = float(np.sqrt(np.mean(np.concatenate(noise) ** 2))) if noise else 0.0
         noise_nm = max(noise_nm, _LEAST_NOISE * float(np.abs(truth).max(initial=0.0)))
-        within = float(np.std(np.log(gains))) if twists else 0.0
-        prior = cls(PRIOR_SPREAD / math.sqrt(m), max(within, _LEAST_WITHIN), noise_nm)
-        return prior._with_recordings([math.log(one) ** 2 for one in recordings])
+        within = math.sqrt(squares / freedom) if freedom else 0.0
+        first = sum(firsts) / (_PRIOR_GRIPS + len(firsts))
+        prior = cls(
+            PRIOR_SPREAD / root,
+            max(within, _LEAST_WITHIN),
+            noise_nm,
+            first=first,
+            first_spread=_pooled(FIRST_SPREAD / root, _PRIOR_RECORDINGS, [(one - first) ** 2 for one in firsts]),
+        )
+        return prior._with_recordings([one**2 for one in left_out])
 
     def _with_recordings(self, squares: Sequence[float]) -> Self:
         """Return the spread after recordings with these squares of the gain's logarithm."""
-        n = self.recordings + len(squares)
-        return replace(self, between=math.sqrt((self.recordings * self.between**2 + sum(squares)) / n), recordings=n)
+        between = _pooled(self.between, self.recordings, squares)
+        return replace(self, between=between, recordings=self.recordings + len(squares))
 
     def reach(self, value: float) -> tuple[float, float]:
         """Return how far the truth may lie below and above a value, at 95 %, because of the gain."""
@@ -71,45 +116,114 @@ class GainSpread:
         return (inward, outward) if value > 0 else (outward, inward)
 
     def correct(
-        self, parts: FloatArray, truth: FloatArray, twists: Sequence[IntArray], *, bounded: bool
+        self,
+        parts: FloatArray,
+        truth: FloatArray,
+        twists: Sequence[IntArray],
+        *,
+        first: BoolArray | None = None,
+        bounded: bool,
     ) -> "GainCorrection":
         """Return the factors on the parts (n, m) of predictions that m fingertips add, and the offset.
 
-        Frames of a twist share its gain, so a long twist determines the gain no better than twists agree. With
-        `bounded` a frame without load counts only while it is predicted above zero.
+        The logarithms of the factors and the offset have normal priors, and each twist is one equation, along its
+        torque: errors of its shape come from delays, not from the gain. Frames of a twist share its gain, so a long
+        twist determines the gain no better than twists agree. `first` (n,) marks frames of the first twist after a
+        grip. With `bounded` a frame without load counts only while it is predicted above zero. Raises CalibrationError
+        where the twists do not follow the torque, or leave the gain as uncertain as before.
         """
         m, loaded, total = parts.shape[1], np.concatenate(twists), parts.sum(axis=1)
+        is_first = np.array([first is not None and bool(first[rows].any()) for rows in twists])
+        # Variances of the logarithm: what successive twists have in common, and each one's own.
+        alike = _ALIKE * self.within**2
+        own = self.within**2 - alike + np.where(is_first, self.first_spread**2, 0.0)
+        spread = self._with_this(total[loaded], truth[loaded], alike + float(own.mean()) / len(twists))
         load_nm = float(np.sqrt((truth[loaded] ** 2).mean()))
-        # This recording's gain counts for the spread too, less the part that noise and twists explain.
-        excess = math.log(_gain(total[loaded], truth[loaded])) ** 2 - self.within**2 / len(twists)
-        excess -= self.noise_nm**2 / max(float(total[loaded] @ total[loaded]), self.noise_nm**2)
-        spread = self._with_recordings([max(excess, 0.0)])
-        columns = np.column_stack([parts, np.ones(len(parts))])
+        along = [truth[rows] for rows in twists]
+        power = np.array([float(one @ one) for one in along])
+        errors = np.diag(power * (self.noise_nm**2 + own * power)) + alike * np.outer(power, power)
+        whiten = np.linalg.inv(np.linalg.cholesky(errors))
+        # The first twist reads the gain times its own deviation from the later ones.
+        deviation = np.exp(np.where(is_first, self.first, 0.0))[:, None]
+        of_parts = np.array([one @ parts[rows] for one, rows in zip(along, twists, strict=True)])
         unloaded = np.setdiff1d(np.arange(len(truth)), loaded)
-        prior = np.append(np.full(m, m * spread.between**2), (max(self.zero, _LEAST_ZERO) * load_nm) ** 2)
-        weighted, information = np.zeros((len(truth), m + 1)), np.diag(1.0 / prior)
-        for rows in twists:
-            # One equation per twist, along its torque: errors of its shape come from delays, not from the gain.
-            along, power = truth[rows], float(truth[rows] @ truth[rows])
-            variance = power * (self.noise_nm**2 + self.within**2 * power)
-            weighted[rows] = np.outer(along, along @ columns[rows]) / variance
-        # The unloaded frames before a twist have one error in common.
-        weighted[unloaded] = columns[unloaded] * len(twists) / (max(len(unloaded), 1) * self.noise_nm**2)
-        covariance = np.linalg.inv(information + weighted.T @ columns)
-        change, target = np.zeros(m + 1), truth.copy()
-        for _ in range(_ROUNDS):
-            if bounded:
-                target[unloaded] = np.minimum(total + columns @ change, 0.0)[unloaded]
-            change = covariance @ (weighted.T @ (target - total))
-        # Unloaded frames predicted below zero carry no information about a bound.
-        informative = np.union1d(loaded, np.flatnonzero((total + columns @ change > 0) | (not bounded)))
-        covariance = np.linalg.inv(information + weighted[informative].T @ columns[informative])
-        factors = np.clip(1.0 + change[:m], _LEAST_GAIN, _LARGEST_GAIN)
-        corrected = parts @ factors + change[m]
-        spread_nm2 = np.einsum("ni,ij,nj->n", columns[loaded], covariance, columns[loaded]).mean()
-        relative = float(np.sqrt(spread_nm2 / (corrected[loaded] ** 2).mean()))
-        spread = replace(spread, between=min(relative, spread.between))
-        return GainCorrection(factors, np.sqrt(np.diag(covariance))[:m], float(change[m]), spread, len(twists))
+        equations = _Equations(
+            whiten @ (deviation * of_parts),
+            whiten @ np.array([one.sum() for one in along]),
+            whiten @ power,
+            parts[unloaded],
+            # The unloaded frames before a twist have one error in common.
+            math.sqrt(len(twists) / max(len(unloaded), 1)) / self.noise_nm,
+            np.append(np.full(m, math.sqrt(m) * spread.between), max(self.zero, _LEAST_ZERO) * load_nm),
+            bounded,
+        )
+        x = _least_squares(equations.residuals, equations.slopes, np.zeros(m + 1))
+        if x is None:
+            raise CalibrationError("the gain of these twists does not settle; twist further, and several times")
+        factors, offset_nm = np.exp(x[:m]), float(x[m])
+        slope = equations.slopes(x)
+        covariance = np.linalg.inv(slope.T @ slope)
+        columns = np.column_stack([parts[loaded] * factors, np.ones(len(loaded))])
+        corrected = parts[loaded] @ factors + offset_nm
+        before, left = (
+            float(np.sqrt(np.einsum("ni,ij,nj->n", columns, one, columns).mean() / (corrected**2).mean()))
+            for one in (np.diag(equations.prior**2), covariance)
+        )
+        if left > _MOST_LEFT * before:
+            raise CalibrationError(
+                "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
+                "these are too small; twist further, and several times"
+            )
+        spread = replace(spread, between=min(left, spread.between))
+        return GainCorrection(factors, factors * np.sqrt(np.diag(covariance))[:m], offset_nm, spread, len(twists))
+
+    def _with_this(self, predicted: FloatArray, truth: FloatArray, explained: float) -> Self:
+        """Return the spread with the gain of loaded frames (n,), less the variance that twists and noise explain.
+
+        Raises CalibrationError where they have no gain.
+        """
+        gain = log_gain(predicted, truth)
+        if gain is None:
+            raise CalibrationError(
+                "the estimates do not follow the known torque; check that the load cell and the calibration have the "
+                "same direction, and twist again"
+            )
+        explained += self.noise_nm**2 / max(float(predicted @ predicted), self.noise_nm**2)
+        return self._with_recordings([max(gain**2 - explained, 0.0)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """What twists say of the unknowns x: the logarithms of m factors, and the offset. In standard errors.
+
+    A twist says of_parts (k, m) · factors + of_offset (k,) · offset = known (k,), a frame without load parts (n, m) ·
+    factors + offset = 0 with this weight, or at most 0 where it is `bounded`, and the prior (m + 1,) deviations x = 0.
+    """
+
+    of_parts: FloatArray
+    of_offset: FloatArray
+    known: FloatArray
+    parts: FloatArray
+    weight: float
+    prior: FloatArray
+    bounded: bool
+
+    def residuals(self, x: FloatArray) -> FloatArray:
+        """Return the (k + n + m + 1,) residuals."""
+        factors, offset = np.exp(x[:-1]), x[-1]
+        free = self.parts @ factors + offset
+        of_twists = self.of_parts @ factors + self.of_offset * offset - self.known
+        return np.concatenate(
+            [of_twists, self.weight * (np.maximum(free, 0.0) if self.bounded else free), x / self.prior]
+        )
+
+    def slopes(self, x: FloatArray) -> FloatArray:
+        """Return their derivatives (k + n + m + 1, m + 1); bounds that do not bind carry no information."""
+        factors, offset = np.exp(x[:-1]), x[-1]
+        counts = (self.parts @ factors + offset > 0) | (not self.bounded)
+        free = np.column_stack([self.parts * factors, np.ones(len(self.parts))]) * counts[:, None]
+        of_twists = np.column_stack([self.of_parts * factors, self.of_offset])
+        return np.concatenate([of_twists, self.weight * free, np.diag(1.0 / self.prior)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +243,7 @@ class GainCorrection:
 
 @dataclass(frozen=True, slots=True)
 class ToolLaw:
-    """Gain over the tool's diameter: ln gain = intercept + slope · ln diameter, and its error on a diameter left out.
+    """Gain over the tool's diameter: ln gain = intercept + slope · ln diameter, and the spread of a tool left out.
 
     The diameters in mm reach from low_mm to high_mm.
     """
@@ -145,11 +259,19 @@ class ToolLaw:
         """Fit to (n,) gains of tools of three diameters or more."""
         x, y = np.log(diameters_mm), np.log(gains)
         slope, intercept = np.polyfit(x, y, 1)
-        errors = [
-            y[x == one] - np.polyval(np.polyfit(x[x != one], y[x != one], 1), one) for one in np.unique(x).tolist()
+        tools = np.unique(x).tolist()
+        squares = [
+            float(np.mean((y[x == one] - np.polyval(np.polyfit(x[x != one], y[x != one], 1), one)) ** 2))
+            for one in tools
         ]
-        spread = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+        # A line through two points says little of how far a third one lies, so the prior stays.
+        spread = max(_pooled(TOOL_SPREAD, _PRIOR_RECORDINGS, squares), TOOL_SPREAD)
         return cls(float(intercept), float(slope), spread, float(diameters_mm.min()), float(diameters_mm.max()))
+
+    @property
+    def factor(self) -> float:
+        """How far a torque may be off either way before a twist of known torque, at 95 %."""
+        return math.exp(TWO_SIDED_95 * self.spread)
 
     def gain(self, diameter_mm: float) -> float | None:
         """Return the gain on a tool, None too far from the calibrated ones."""
@@ -158,40 +280,60 @@ class ToolLaw:
         return math.exp(self.intercept + self.slope * math.log(diameter_mm))
 
 
-def gains_of_recordings(
-    numbers: IntArray, torque_nm: FloatArray, predict: Callable[[IntArray, IntArray, FloatArray], FloatArray]
-) -> FloatArray:
-    """Return the gain of each recording in one unit of motion, from the recording's number of each of (n,) rows.
-
-    predict(kept, out, values (n,)) fits values on some rows and predicts them on others. The gains are those that make
-    each recording's torque predictable from the others'.
-    """
-    each = [np.flatnonzero(numbers == one) for one in np.unique(numbers)]
-    gains = np.array([np.sqrt((torque_nm[rows] ** 2).mean()) for rows in each])
-    for _ in range(_GAIN_ROUNDS):
-        values = torque_nm / gains[numbers]
-        found = [
-            loaded_gain(predict(np.flatnonzero(numbers != one), rows, values), values[rows])
-            for one, rows in enumerate(each)
-        ]
-        gains *= found / np.exp(np.log(found).mean())
-    return gains
-
-
-def find_twists(torque_nm: FloatArray) -> list[IntArray]:
-    """Return the rows of each stretch of loaded frames in (n,) torques."""
-    loaded = np.abs(torque_nm) > LOADED_SHARE * float(np.abs(torque_nm).max(initial=0.0))
-    rows = np.flatnonzero(loaded)
+def find_twists(torque_nm: FloatArray, largest_nm: float | None = None) -> list[IntArray]:
+    """Return the rows of each stretch of loaded frames in (n,) torques, whose largest one is given or found."""
+    largest_nm = float(np.abs(torque_nm).max(initial=0.0)) if largest_nm is None else largest_nm
+    rows = np.flatnonzero(np.abs(torque_nm) > LOADED_SHARE * largest_nm)
     return [one for one in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(one)]
 
 
-def loaded_gain(predicted: FloatArray, truth: FloatArray) -> float:
-    """Return the factor on (n,) predictions that fits the truth of the loaded frames best."""
+def first_twists(torque_nm: FloatArray, grips: IntArray) -> BoolArray:
+    """Return which of (n,) frames belong to the first twist of their grip, from the number of each frame's grip."""
+    found: BoolArray = np.zeros(len(torque_nm), dtype=np.bool_)
+    for rows in (np.flatnonzero(grips == one) for one in np.unique(grips)):
+        for first in find_twists(torque_nm[rows])[:1]:
+            found[rows[first]] = True
+    return found
+
+
+def loaded_log_gain(predicted: FloatArray, truth: FloatArray) -> float | None:
+    """Return the logarithm of the factor on (n,) predictions that fits the truth of the loaded frames best."""
     rows = np.abs(truth) > LOADED_SHARE * float(np.abs(truth).max())
-    return _gain(predicted[rows], truth[rows])
+    return log_gain(predicted[rows], truth[rows])
 
 
-def _gain(predicted: FloatArray, truth: FloatArray) -> float:
-    squares = float(predicted @ predicted)
-    gain = float(predicted @ truth) / squares if squares else _LARGEST_GAIN
-    return min(max(gain, _LEAST_GAIN), _LARGEST_GAIN)
+def log_gain(predicted: FloatArray, truth: FloatArray) -> float | None:
+    """Return the logarithm of the factor on (n,) predictions that fits the truth best.
+
+    None where they do not follow the truth: a load that was missed, or of the other sign, has no gain.
+    """
+    along = float(predicted @ truth)
+    return math.log(along / float(predicted @ predicted)) if along > 0 else None
+
+
+def _least_squares(
+    residuals: Callable[[FloatArray], FloatArray], slopes: Callable[[FloatArray], FloatArray], start: FloatArray
+) -> FloatArray | None:
+    """Return the (d,) unknowns with the least squares of residuals, by Levenberg's and Marquardt's steps.
+
+    None where they do not settle. SciPy's would take the daemon a tenth of a second to import.
+    """
+    x, damping = start, _FIRST_DAMPING
+    left = residuals(x)
+    for _ in range(_MOST_STEPS):
+        slope = slopes(x)
+        information, gradient = slope.T @ slope, slope.T @ left
+        step = -np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+        if float(step @ information @ step) < _SETTLED:
+            return x
+        trial = residuals(x + step)
+        if float(trial @ trial) < float(left @ left):
+            x, left, damping = x + step, trial, damping / 10.0
+        else:
+            damping *= 10.0
+    return None
+
+
+def _pooled(prior: float, counts_as: int, squares: Sequence[float]) -> float:
+    """Return the root mean square of deviations, with a prior that counts as some."""
+    return math.sqrt((counts_as * prior**2 + sum(squares)) / (counts_as + len(squares)))

@@ -21,7 +21,14 @@ from scipy.special import stdtrit
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
-from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists, loaded_gain
+from shearloop.estimation.gain import (
+    LOADED_SHARE,
+    GainCorrection,
+    GainSpread,
+    find_twists,
+    first_twists,
+    loaded_log_gain,
+)
 from shearloop.estimation.regressors import InverseCalibration, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.values import INLINE
 from shearloop.words import counted
@@ -273,12 +280,12 @@ class IntervalRegressor:
         )
 
     def adapt(
-        self, features: FloatArray, torque_nm: FloatArray, sides: IntArray
+        self, features: FloatArray, torque_nm: FloatArray, sides: IntArray, first: BoolArray | None = None
     ) -> "tuple[IntervalRegressor, GainCorrection]":
         """Return the regressor with each side's gain corrected by (n, d) features of known torques (n,).
 
-        `sides` (d,) is the side of each feature. Raises CalibrationError without a load that is large enough to show
-        the gain.
+        `sides` (d,) is the side of each feature, `first` (n,) marks frames of the first twist after a grip. Raises
+        CalibrationError without a load that is large enough to show the gain.
         """
         point = self.point
         least_nm = LOADED_SHARE * max(abs(self.range.low), abs(self.range.high))
@@ -292,7 +299,9 @@ class IntervalRegressor:
         m, weighted = int(sides.max()) + 1, features * point.weights
         constant = point.offset - float(point.mean @ point.weights)
         parts = np.array([weighted[:, sides == side].sum(axis=1) + constant / m for side in range(m)]).T
-        correction = self.gain.correct(parts, sign * torque_nm, twists, bounded=isinstance(point, CensoredRidge))
+        correction = self.gain.correct(
+            parts, sign * torque_nm, twists, first=first, bounded=isinstance(point, CensoredRidge)
+        )
         factors, loaded = correction.factors, np.concatenate(twists)
         # Torques of both directions would cancel in a sum.
         before = parts[loaded].sum(axis=1)
@@ -390,18 +399,37 @@ def fit_interval_regressor(
         refit_line = None if full_range else partial(refit, by=fit_line)
         span, line = _range_of_slices(point, features, values, refit, refit_line)
     gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
-    gain = GainSpread() if recordings is None else GainSpread.fit(reported, truth, gains, fingertips)
+    gain = GainSpread()
+    if recordings is not None:
+        gain = _spread_of_gain(values, recordings, rows, reported, gains, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain, line)
 
 
 def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: IntArray, refit: Refit) -> list[float]:
-    """Return the gain of each recording that the others can predict."""
+    """Return the logarithm of the gain of each recording that the others can predict."""
     gains: list[float] = []
+    least = LOADED_SHARE * float(np.abs(values).max())
     for kept, out in left_out_groups(recordings):
-        if len(kept) and np.ptp(values[kept]) > 0 and np.ptp(values[out]) > 0:
+        if len(kept) and np.ptp(values[kept]) > 0 and np.abs(values[out]).max() > least:
             part = refit(kept)
-            gains.append(loaded_gain(_reported(part, part.predict(features[out])), values[out]))
+            gain = loaded_log_gain(_reported(part, part.predict(features[out])), values[out])
+            gains += [] if gain is None else [gain]
     return gains
+
+
+def _spread_of_gain(
+    values: FloatArray,
+    recordings: IntArray,
+    rows: IntArray,
+    predicted: FloatArray,
+    gains: Sequence[float],
+    fingertips: int,
+) -> GainSpread:
+    """Return the spread of the gain from the predictions of left-out rows, and the gains of left-out recordings."""
+    order = np.argsort(rows, kind="stable")
+    rows, predicted = rows[order], predicted[order]
+    is_first = first_twists(values, recordings)
+    return GainSpread.fit(predicted, values[rows], recordings[rows], is_first[rows], gains, fingertips)
 
 
 def _range_of_slices(

@@ -154,6 +154,18 @@ class MotionRegression(Estimator):
             return np.asarray((reading.frame.mean_difference / self.scale).ravel())
         return features
 
+    def feature_width(self, quantity: Quantity) -> int:
+        """Return the number of inputs of a quantity's regressor; raises ValueError for directions of other channels."""
+        m, c = map(int, self.scale.shape)
+        if self.temporal is None:
+            return m * c + 1
+        directions = self.temporal.directions
+        if directions.ndim != 3 or (directions.shape[0], directions.shape[2]) != (m, c):
+            raise ValueError(f"directions have the shape {directions.shape}, expected {m} sides of {c} channels")
+        if quantity == "diameter":
+            return m * c
+        return m * int(directions.shape[1]) * (self.temporal.n_lags + self.temporal.uses_position)
+
     def position_noise_mm(self, regressor: IntervalRegressor) -> float:
         """Return the diameter's 95 % error from the noise of one frame, where each feature has a noise of 1.
 

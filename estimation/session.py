@@ -17,7 +17,7 @@ from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.defaults import BASELINE_FRAMES, MAX_GAP_S
 from shearloop.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading
 from shearloop.estimation.fingertip_validator import FingertipValidator
-from shearloop.estimation.gain import GainCorrection, find_twists
+from shearloop.estimation.gain import GainCorrection, find_twists, first_twists
 from shearloop.estimation.session_state import PaperState, ProcessedFrame, SessionState, SliceState
 from shearloop.estimation.values import Estimate, Measured, TactileFrame
 from shearloop.words import counted
@@ -180,21 +180,29 @@ class EstimatorSession:
     def adapt(self, torque_nm: FloatArray) -> Adaptation:
         """Correct the gain until the next grip or tare, by torques (n,) measured at `grip_t_s`, NaN where unknown.
 
-        Always starts from the calibration's gain. Raises CalibrationError as `Calibration.correct_gain` does, and for a
-        tool without a torque.
+        The first twist after the grip settles the gel and is left out. Always starts from the calibration's gain.
+        Raises CalibrationError as `Calibration.correct_gain` does, for a tool without a torque, and without a second
+        twist.
         """
         if self._tool_reasons:
             raise CalibrationError(self._tool_reasons[0])
         calibration, grip, known = self._calibration, self._grip, np.isfinite(torque_nm)
         width = len(calibration.gain_regressor().mean_feature)
-        features = np.array([row for _, row in grip.frames]).reshape(-1, width)[known]
+        features, truth = np.array([row for _, row in grip.frames]).reshape(-1, width)[known], torque_nm[known]
+        settling = first_twists(truth, np.zeros(len(truth), dtype=np.int64))
+        largest_nm = float(np.abs(truth).max(initial=0.0))
+        features, truth = features[~settling], truth[~settling]
+        if settling.any() and not find_twists(truth, largest_nm):
+            raise CalibrationError(
+                "the first twist after a grip settles the gel and shows another gain than the later ones; twist again, "
+                "then adapt"
+            )
         before = self._models()["torque"]
-        adapted, correction = calibration.correct_gain(features, torque_nm[known])
+        adapted, correction = calibration.correct_gain(features, truth)
         after = adapted.outputs["torque"]
         grip.corrected = _Corrected(after, self._tool)
-        rows = np.concatenate(find_twists(torque_nm[known]))
-        truth = torque_nm[known][rows]
-        return Adaptation(correction, *(LoadedFit.of(one, features[rows], truth) for one in (before, after)))
+        rows = np.concatenate(find_twists(truth))
+        return Adaptation(correction, *(LoadedFit.of(one, features[rows], truth[rows]) for one in (before, after)))
 
     def estimate(self, frame: TactileFrame) -> Estimate:
         """Return the estimate of a frame of the calibration's sides.

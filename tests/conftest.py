@@ -64,6 +64,12 @@ def shared() -> Path:
     return SHARED
 
 
+@pytest.fixture(autouse=True)
+def state_home(tmp_path_factory, monkeypatch) -> None:
+    """A state folder of its own for every test: a stop is remembered there for the next daemon of the same robot."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+
+
 @pytest.fixture(scope="session")
 def fonts() -> None:
     """Have matplotlib open its fonts, which it keeps open, before any test is watched for open files."""

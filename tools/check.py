@@ -197,7 +197,7 @@ def _clients(curve: "CurveConfig") -> str:
     from shearloop.daemon.messaging.keys import check_allowed_clients, load_server_keys
 
     load_server_keys(curve.server_key)
-    return ", ".join(sorted(check_allowed_clients(curve.clients).values()))
+    return ", ".join(sorted(check_allowed_clients(curve.clients).names.values()))
 
 
 def _skin(config: "SkinConfig") -> str:

@@ -113,7 +113,11 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
         if result.tool_mm is not None:
             sentences.append(f"The tool's diameter is {result.tool_mm:.3g} mm.")
         elif (law := calibration.tools) is not None:
-            sentences.append(f"The tools' diameters are {law.low_mm:.3g} to {law.high_mm:.3g} mm.")
+            sentences.append(
+                f"The tools' diameters are {law.low_mm:.3g} to {law.high_mm:.3g} mm. Before a twist of known torque, "
+                f"the torque on another tool may be off by a factor of {law.factor:.2g} either way, and the interval "
+                "shows it; correct it with `shearloop adapt`."
+            )
         elif result.tools:
             named = " and ".join(f"{one.value:.3g}" for one in result.tools)
             sentences.append(f"The tools of {named} mm have the torque in common.")

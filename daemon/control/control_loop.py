@@ -98,6 +98,8 @@ class ControlLoop:
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
         self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
+        # How many experiments have begun.
+        self.runs = 0
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
         self.config = config
         self._sources = sources
@@ -191,6 +193,15 @@ class ControlLoop:
         self._gripped.release_error = error
         if error is None:
             self._gripped.origin_rad = self._gripped.force_n = None
+
+    @property
+    def grip(self) -> tuple[float | None, float | None]:
+        """The wrist's angle in rad at the present grip, and its largest force in N; None for what is unknown."""
+        return self._gripped.origin_rad, self._gripped.force_n
+
+    def restore_grip(self, origin_rad: float | None, force_n: float | None) -> None:
+        """Take the angle and the force of a grip that a process before this one has closed."""
+        self._gripped.origin_rad, self._gripped.force_n = origin_rad, force_n
 
     @property
     def held(self) -> str | None:
@@ -296,6 +307,9 @@ class ControlLoop:
             expected=expected,
             release_error=before.release_error,
         )
+        self.runs += 1
+        # Until the first tick, nobody takes the end of the run before for the end of this one.
+        self.status = LoopStatus(self.experiment.phase.value, "", WristCommand(), SafetyDecision(Response.NOTE))
         return None
 
     def pause(self) -> str | None:

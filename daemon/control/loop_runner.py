@@ -730,6 +730,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         source="loop",
         t_mono_ns=now_ns,
         phase=status.phase,
+        run=control_loop.runs,
         experiment=experiment.file.name if experiment is not None else "",
         step=experiment.step_number if experiment is not None else 0,
         steps=len(experiment.file.steps) if experiment is not None else 0,

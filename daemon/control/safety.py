@@ -23,8 +23,9 @@ class Response(IntEnum):
 class Rule:
     """One row: the response, the operator's sentence with its cure, and how long a hold may last before it stops.
 
-    A fault that `is_past` is detected after it is over, such as a pause of the loop. A fault that `explains` is
-    reported first until no fault is left, because it may have caused the others.
+    A fault that `is_past` is detected after it is over, such as a pause of the loop. A stop by a fault that `explains`
+    is reported first, and faults that only hold the wrist count as its consequences: queued data is old, and boards
+    seem lost.
     """
 
     response: Response
@@ -135,10 +136,10 @@ class FaultCode(Enum):
         "Read the log above this line; report the crash if it recurs.",
     )
     DAEMON_PAUSED = Rule(
-        _HOLD,
+        _KEEP,
         "the daemon itself was not running: {detail}.",
-        "Do not pause it (SIGSTOP, Ctrl-Z), nor suspend or overload the computer, while an experiment runs.",
-        hold_at_most_s=5.0,
+        "Do not pause it (SIGSTOP, Ctrl-Z), nor suspend or overload the computer, while an experiment runs; then "
+        "`shearloop command unlock`.",
         is_past=True,
         explains=True,
     )
@@ -196,9 +197,6 @@ class FaultCode(Enum):
 
 
 TABLE: Mapping[FaultCode, Rule] = {code: code.value for code in FaultCode}
-# Faults that only hold the wrist count as consequences of an explaining fault for this time: queued data is read, and
-# boards that seemed lost send again.
-SETTLES_S = 2.0
 # The longest hold by several alternating faults.
 HELD_AT_MOST_S = max(rule.hold_at_most_s for rule in TABLE.values() if rule.hold_at_most_s is not None)
 
@@ -249,8 +247,6 @@ class SafetyMonitor:
         # Each fault's contribution to the wrist's timer, for the report.
         self._share_ns: dict[FaultCode, int] = {}
         self._judged_ns: int | None = None
-        # The explaining fault, and its time.
-        self._cause: tuple[Fault, int] | None = None
         self._stop: SafetyDecision | None = None
 
     def judge(self, faults: Iterable[Fault], t_ns: int) -> SafetyDecision:
@@ -263,11 +259,7 @@ class SafetyMonitor:
         if response is Response.HOLD and self._wrist_ns > HELD_AT_MOST_S * 1e9:
             active = (*active, Fault(FaultCode.HELD_TOO_LONG, self._hold_report()))
             response = TABLE[FaultCode.HELD_TOO_LONG].response
-        if active:
-            active = self._explain(active, t_ns, held=response >= Response.HOLD)
-        else:
-            self._cause = None
-        decision = SafetyDecision(response, active)
+        decision = SafetyDecision(response, self._explained(active, _explaining(active)))
         if response >= Response.STOP_AND_KEEP_GRIP and (self._stop is None or response > self._stop.response):
             self._stop = decision
         return decision if self._stop is None else self._with_stop(self._stop, active)
@@ -299,35 +291,20 @@ class SafetyMonitor:
         """The faults of the stop that waits for the operator; empty without one."""
         return self._stop.faults if self._stop is not None else ()
 
-    def _explain(self, active: tuple[Fault, ...], t_ns: int, *, held: bool) -> tuple[Fault, ...]:
-        """Return the faults at t_ns with the explaining one first and its consequences marked; stops are never one."""
-        own = next((fault for fault in active if fault.rule.explains), None)
-        if own is not None:
-            self._cause = own, t_ns
-        if self._cause is None:
+    @classmethod
+    def _explained(cls, active: tuple[Fault, ...], cause: Fault | None) -> tuple[Fault, ...]:
+        """Return the faults with their cause first and its consequences marked; without a cause, as they are."""
+        if cause is None:
             return active
-        cause, since_ns = self._cause
-        settled = t_ns - since_ns > SETTLES_S * 1e9
-        if settled and not held:
-            # Faults that neither hold nor stop, such as a full disk, must not keep the cause for hours.
-            self._cause = None
-            return active
-        others = (fault for fault in active if fault is not own)
-        return (
-            cause,
-            *(replace(one, is_consequence=True) if not settled and self._may_follow(one) else one for one in others),
-        )
+        others = (fault for fault in active if fault.code is not cause.code)
+        return (cause, *(replace(one, is_consequence=True) if _may_follow(one) else one for one in others))
 
-    def _may_follow(self, fault: Fault) -> bool:
-        """Whether a fault may be a consequence of a pause."""
-        return fault.code is FaultCode.COMMAND_UNANSWERED or self._response(fault) is Response.HOLD
-
-    @staticmethod
-    def _with_stop(stop: SafetyDecision, active: tuple[Fault, ...]) -> SafetyDecision:
+    @classmethod
+    def _with_stop(cls, stop: SafetyDecision, active: tuple[Fault, ...]) -> SafetyDecision:
         """Return the stop's faults, updated with the present ones."""
         codes = {fault.code for fault in active}
-        past = (fault for fault in stop.faults if fault.code not in codes)
-        return SafetyDecision(stop.response, (*past, *active))
+        past = tuple(fault for fault in stop.faults if fault.code not in codes)
+        return SafetyDecision(stop.response, cls._explained((*past, *active), _explaining(stop.faults)))
 
     def _count(self, active: tuple[Fault, ...], t_ns: int) -> None:
         """Advance the hold timers to t_ns: up for faults that held until now, down for the others."""
@@ -349,7 +326,7 @@ class SafetyMonitor:
     def _reset_timers(self) -> None:
         self._held_ns.clear()
         self._share_ns.clear()
-        self._wrist_ns, self._holding, self._judged_ns, self._cause = 0, frozenset(), None, None
+        self._wrist_ns, self._holding, self._judged_ns = 0, frozenset(), None
 
     def _response(self, fault: Fault) -> Response:
         rule = fault.rule
@@ -362,6 +339,15 @@ class SafetyMonitor:
         """Return the hold time of each fault, the longest first."""
         longest_first = sorted(self._share_ns.items(), key=lambda held: -held[1])
         return ", ".join(f"{code.text} for {held_ns / 1e9:.1f} s" for code, held_ns in longest_first)
+
+
+def _explaining(faults: tuple[Fault, ...]) -> Fault | None:
+    return next((fault for fault in faults if fault.rule.explains), None)
+
+
+def _may_follow(fault: Fault) -> bool:
+    """Whether a fault may be a consequence of a pause."""
+    return fault.code is FaultCode.COMMAND_UNANSWERED or fault.rule.response is Response.HOLD
 
 
 def _counted(held_ns: int, passed_ns: int, *, held: bool) -> int:

@@ -181,16 +181,21 @@ def bind(
 def _check_ipc_path(address: str, setting: str) -> None:
     """Raise UserError if an ipc path is in use or is another kind of file: libzmq would delete it and bind."""
     path = address.removeprefix("ipc://")
-    if path == address or path.startswith(("@", "*")) or not os.path.lexists(path):
+    if path == address or path.startswith(("@", "*")):
         return
-    if not stat.S_ISSOCK(os.lstat(path).st_mode):
+    try:
+        mode = os.lstat(path).st_mode
+    except OSError:
+        # Nothing is there, or libzmq says why it cannot be reached. Another daemon may just have removed it.
+        return
+    if not stat.S_ISSOCK(mode):
         raise UserError(
             f"`{setting}: {address}` cannot be bound: {path} exists and is no socket; choose another address"
         )
     if (error := probe(path)) == 0:
         raise _in_use(address, setting)
-    # A killed daemon leaves the socket behind.
-    if error != errno.ECONNREFUSED:
+    # A killed daemon leaves the socket behind, and one that ends removes it.
+    if error not in (errno.ECONNREFUSED, errno.ENOENT):
         raise UserError(f"`{setting}: {address}` cannot be bound ({os.strerror(error)}); choose another address")
 
 

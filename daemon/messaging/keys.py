@@ -6,6 +6,7 @@ folder of the allowed clients' `.key` files is read again for each new connectio
 
 import asyncio
 import os
+import stat
 import struct
 import time
 from collections.abc import Iterator
@@ -23,10 +24,12 @@ from zmq.utils import z85
 
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.errors import UserError
+from shearloop.files import read_file
 
 # The unit's `SetCredential` gives this value until the server key exists.
 _NO_CREDENTIAL = "none"
 ZAP_DOMAIN = "shearloop"
+_LARGEST_KEY_BYTES = 1 << 14
 # New clients that are admitted at once, and then per second.
 NEW_BURST, NEW_PER_S = 50.0, 50.0
 
@@ -75,6 +78,11 @@ def load_key_pair(path: Path) -> KeyPair:
     public, secret = _load(path)
     if secret is None:
         raise UserError(f"{path} holds no secret key; give the file that ends in .key_secret")
+    if path.stat().st_mode & stat.S_IROTH:
+        raise UserError(
+            f"{path}: every user of this machine can read the secret key: run `chmod 600 {path}`, and make a new pair "
+            "with `shearloop keys` if another user may have read it"
+        )
     if zmq.curve_public(secret) != public:
         raise UserError(f"{path}: its public and its secret key do not match; make new ones with `shearloop keys`")
     return KeyPair(public, secret)
@@ -131,22 +139,38 @@ def writing_keys() -> Iterator[None]:
         raise UserError(f"{error.filename} cannot be written: {error.strerror}; {cure}") from error
 
 
-def allowed_clients(folder: Path) -> dict[bytes, str]:
-    """Return the name of each allowed client by public key; raises UserError if a file or the folder is unreadable."""
+@dataclass(frozen=True, slots=True)
+class AllowedClients:
+    """The name of each allowed client by public key, and a sentence for each file that is no key."""
+
+    names: dict[bytes, str]
+    unusable: tuple[str, ...]
+
+
+def allowed_clients(folder: Path) -> AllowedClients:
+    """Return the allowed clients; a file that is no key concerns no other. Raises UserError without the folder."""
     try:
         paths = sorted(path for path in folder.iterdir() if path.suffix == ".key")
     except OSError as error:
         raise UserError(
             f"{folder}: the allowed clients' keys cannot be read: {error.strerror}; `shearloop keys server` makes it"
         ) from error
-    return {load_public_key(path): path.stem for path in paths}
+    names: dict[bytes, str] = {}
+    unusable: list[str] = []
+    for path in paths:
+        try:
+            names[load_public_key(path)] = path.stem
+        except UserError as error:
+            unusable.append(str(error))
+    return AllowedClients(names, tuple(unusable))
 
 
-def check_allowed_clients(folder: Path) -> dict[bytes, str]:
-    """Return the allowed clients; raises UserError also for an empty folder."""
+def check_allowed_clients(folder: Path) -> AllowedClients:
+    """Return the allowed clients; raises UserError also where none could connect."""
     clients = allowed_clients(folder)
-    if not clients:
-        raise UserError(f"{folder} holds no key, so no client could connect; see `shearloop keys allow`")
+    if not clients.names:
+        why = "; ".join(clients.unusable) or f"{folder} holds no key"
+        raise UserError(f"{why}, so no client could connect; see `shearloop keys allow`")
     return clients
 
 
@@ -164,15 +188,18 @@ class ClientAuthenticator:
         self._new = TokenBucket(NEW_BURST, NEW_PER_S)
         self._authenticator = Authenticator(context)
         if clients is not None:
-            check_allowed_clients(clients)
+            for why in check_allowed_clients(clients).unusable:
+                structlog.get_logger().warning("a client's key cannot be used", reason=why)
             self._authenticator.configure_curve_callback(ZAP_DOMAIN, self)
         self._authenticator.start()
 
-    def callback(self, _domain: str, key: bytes) -> bool:
-        """Return whether a client with this public key may connect; pyzmq's authenticator calls it."""
+    async def callback(self, _domain: str, key: bytes) -> bool:
+        """Return whether a client with this public key may connect; pyzmq's authenticator awaits it."""
         log = structlog.get_logger()
         try:
-            name = allowed_clients(self._clients).get(key) if self._clients is not None else None
+            # In a thread: the folder may be on a slow drive.
+            allowed = await asyncio.to_thread(allowed_clients, self._clients) if self._clients is not None else None
+            name = allowed.names.get(key) if allowed is not None else None
         except UserError as error:
             self._refusals.counts["allow-list cannot be read"] += 1
             log.warning("client refused", reason=str(error))
@@ -207,6 +234,8 @@ class ClientAuthenticator:
 
 def _load(path: Path) -> tuple[bytes, bytes | None]:
     try:
+        # A key file is small, and no device.
+        read_file(path, _LARGEST_KEY_BYTES)
         public, secret = load_certificate(path)
     except PermissionError as error:
         raise UserError(f"{path}: this user may not read the key; run as its owner, or with sudo") from error

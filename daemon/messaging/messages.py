@@ -201,6 +201,7 @@ class LoopState(Message):
     """The state of the closed loop: setpoints, the command that was sent, and every reason for holding."""
 
     phase: str = column("", "idle, running, paused, held, done or stopped")
+    run: int = column("", "number of the experiment since the daemon began, from 1; 0 before the first")
     experiment: str = column("", "name of the experiment; empty when there is none")
     step: int = column("", "number of the step, from 1")
     steps: int = column("", "number of steps")

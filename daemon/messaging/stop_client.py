@@ -2,7 +2,9 @@
 
 import os
 import socket
+import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import msgpack
@@ -12,6 +14,10 @@ from shearloop.errors import UserError
 # Of the socket's name; a whole name has at most 107 bytes (unix(7)).
 _NAME_BYTES = 80
 _LARGEST_REPLY_BYTES = 1 << 18
+# struct ucred: process, user, group.
+_CREDENTIALS = struct.Struct("=3i")
+# Columns of /proc/net/tcp (proc(5)), and the state of a listening socket.
+_LOCAL, _STATE, _UID, _LISTENS = 1, 3, 7, "0A"
 
 
 def stop_name(address: str) -> bytes:
@@ -19,13 +25,39 @@ def stop_name(address: str) -> bytes:
     return b"\0shearloop-stop-" + os.fsencode(address.rpartition(":")[2])[-_NAME_BYTES:]
 
 
+class StopSocketTakenError(UserError):
+    """A user who does not run the daemon has taken the name of its stop socket."""
+
+
+def owners(address: str) -> set[int]:
+    """Return the users whose reply counts: this one, root, and who listens at the command address."""
+    found = {os.getuid(), 0}
+    if address.startswith("ipc://"):
+        with suppress(OSError):
+            found.add(os.stat(address.removeprefix("ipc://")).st_uid)
+        return found
+    port = address.rpartition(":")[2]
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        with suppress(OSError), open(table, encoding="ascii") as rows:
+            for row in rows:
+                # The address is IP:PORT in hexadecimal digits.
+                columns = row.split()
+                listens = len(columns) > _UID and columns[_STATE] == _LISTENS
+                if listens and port.isdecimal() and columns[_LOCAL].rpartition(":")[2] == f"{int(port):04X}":
+                    found.add(int(columns[_UID]))
+    return found
+
+
 def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any] | None:
     """Send `stop` or `status` to the local daemon with this command address; return its reply, None without a daemon.
 
-    Raises TimeoutError if no reply comes in time, and UserError for a reply of another program.
+    Raises TimeoutError if no reply comes in time, UserError for a reply of another program, and
+    StopSocketTakenError for a reply of a user who does not run the daemon.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         client.settimeout(timeout_s)
+        # With each datagram the kernel tells who sent it (unix(7)): any user may have taken the daemon's name first.
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
         # The kernel chooses an abstract name.
         client.bind("")
         try:
@@ -33,7 +65,15 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
             client.sendto(msgpack.packb(content), stop_name(address))
         except ConnectionError:
             return None
-        data = client.recv(_LARGEST_REPLY_BYTES)
+        data, told, _, _ = client.recvmsg(_LARGEST_REPLY_BYTES, socket.CMSG_SPACE(_CREDENTIALS.size))
+    for level, kind, credentials in told:
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS):
+            _, uid, _ = _CREDENTIALS.unpack(credentials)
+            if uid not in owners(address):
+                raise StopSocketTakenError(
+                    f"the stop socket of {address} is held by the user {uid}, who does not run the daemon: nothing was "
+                    "stopped by it; `sudo ss -xlp` names the process, end it and restart the daemon"
+                )
     try:
         # It has no arrays, for which `messages.decode` imports numpy.
         return dict(msgpack.unpackb(data))

@@ -34,7 +34,7 @@ class StopSocket:
             self._socket.close()
             raise UserError(
                 f"the stop socket of `commands: {address}` cannot be bound ({error.strerror}); is another daemon "
-                "running? Stop it, or choose another port"
+                "running? Stop it, or choose another port; if another user holds its name, `sudo ss -xlp` says who"
             ) from error
 
     async def run(self) -> None:

@@ -30,7 +30,7 @@ from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEO
 from shearloop.daemon.messaging.client import ask, connect
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
-from shearloop.daemon.messaging.stop_client import send_to_stop_socket
+from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to_stop_socket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.message_store import MessageStore
 from shearloop.errors import UserError
@@ -161,7 +161,7 @@ class Bridge:
         reply = None
         if not needs_keys(address):
             # A local daemon accepts it even without valid keys.
-            with contextlib.suppress(TimeoutError):
+            with contextlib.suppress(TimeoutError, StopSocketTakenError):
                 reply = await asyncio.to_thread(send_to_stop_socket, address, content, COMMAND_TIMEOUT_S)
         return reply or await self._request(content, COMMAND_TIMEOUT_S)
 

@@ -40,6 +40,8 @@ ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
 ACCELERATION_S = 0.04
 # The pendant shows grams, tenths of a millimetre and thousandths of a radian.
 PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
+# A straight move goes on for this fraction of `silence_timeout_s` after a cycle of the worker.
+LEASE_SHARE = 0.3
 # The time allowed for a motion to end: nominal time × factor + constant.
 MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
 # The pendant's speed slider slows everything; below this a motion would have no end.
@@ -121,6 +123,8 @@ class MotionExecutor:
                 return f"The wrist speed was decided {(now_ns - decided_ns) / 1e9:.2f} s ago: the computer is too busy."
             case WristSpeed(_, acceleration), _ if acceleration <= 0:
                 return f"An acceleration of {acceleration:g} rad/s² is not above 0."
+            case WristSpeed(), None if self._is_old(sample):
+                return f"T{_old(sample)[1:]}: the wrist does not begin to turn."
             case WristSpeed(), _Braking():
                 return f"The arm is still stopping ({self.end_reason})."
             case WristSpeed(), _Move():
@@ -224,11 +228,18 @@ class MotionExecutor:
         """Return how long a wrist speed still holds."""
         return self._settings.command_timeout_s - (now_ns - decided_ns) / 1e9
 
+    def _is_old(self, sample: RtdeSample) -> bool:
+        """Return whether a sample is too old to turn the wrist on: nothing shows what the arm does."""
+        return sample.age_ns > self._settings.command_timeout_s * 1e9
+
     def _keep_turning(self, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> None:
         left_s = self._left_s(asked.decided_ns, now_ns)
         if left_s < 0:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
             self.stop_now(sample, now_ns, late)
+        elif self._is_old(sample):
+            # The loop holds as well; this brakes as hard as allowed.
+            self.stop_now(sample, now_ns, _old(sample))
         else:
             # The one check of all speeds that turn the wrist.
             self.sent, self.clipped = clip_wrist(asked, sample, self._settings)
@@ -247,7 +258,10 @@ class MotionExecutor:
         elif reason:
             self.stop(sample, now_ns, reason)
             return
-        self._arm.send_heartbeat(self._settings.silence_timeout_s - (now_ns - daemon_alive_ns) / 1e9)
+        # Each cycle lets the script go on for a short time: when this process dies with the daemon, the script ends the
+        # move before its watchdog would.
+        silence_s = self._settings.silence_timeout_s
+        self._arm.send_heartbeat(min(LEASE_SHARE * silence_s, silence_s - (now_ns - daemon_alive_ns) / 1e9))
 
     def _keep_stopping(self, braking: _Braking, sample: RtdeSample, now_ns: int) -> None:
         if now_ns > braking.deadline_ns:
@@ -278,6 +292,10 @@ class MotionExecutor:
         if self._speed_thread:
             self._arm.end_speed(self._settings.limits.wrist_acceleration_rad_per_s2.inner)
             self._speed_thread = False
+
+
+def _old(sample: RtdeSample) -> str:
+    return f"the robot's last state is {sample.age_ns / 1e9:.2f} s old"
 
 
 def _nominal_move_s(move: MoveLinear, sample: RtdeSample) -> float:

@@ -198,7 +198,7 @@ class UrSettings(_Checked):
     watchdog_hz: Annotated[float, Field(ge=1, le=150)] = 10.0
     """The robot ends its program when it receives nothing for 1/watchdog_hz."""
     command_timeout_s: _Deadline = 0.1
-    """A wrist speed holds for this long after it was decided; then the wrist stops."""
+    """A wrist speed holds for this long after its decision, and after the robot's last state; then the wrist stops."""
     silence_timeout_s: _Deadline = 0.1
     """Other motion stops when the daemon sends nothing for this long."""
     state_timeout_s: _Deadline = 0.25

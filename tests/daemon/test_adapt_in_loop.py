@@ -48,7 +48,7 @@ async def test_adapt_corrects_a_wrong_gain_until_the_next_grip_and_is_replayed(r
     twist = {"do": "twist", "angles_rad": [0.1, 0.2], "speed_rad_per_s": 0.5, "hold_s": 1.0}
     grip = {"do": "grip", "width_mm": 5, "force_n": 60}
     adapt = {"do": "adapt", "fingertip": "right"}
-    steps = [twist, adapt, twist, adapt | {"reference": "wrench"}, {"do": "release"}, grip, twist]
+    steps = [twist, twist, adapt, twist, adapt | {"reference": "wrench"}, {"do": "release"}, grip, twist]
     async with running_rig(rig_config, bank, speed) as (_, watcher, _fault, command):
         await started(command, experiment(tmp_path, *steps))
         state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))

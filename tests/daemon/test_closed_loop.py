@@ -68,6 +68,15 @@ def ending_with(rig_config: Path, *steps: Mapping[str, Any]) -> Path:
     return path
 
 
+def second_config(rig_config: Path) -> Path:
+    """Return the same configuration with sockets of its own."""
+    path, folder = rig_config.with_name("second.yaml"), rig_config.parent
+    content = yaml.safe_load(rig_config.read_text())
+    sockets = {name: f"ipc://{folder}/second-{name}" for name in ("publish", "commands")}
+    path.write_text(yaml.safe_dump({**content, **sockets}))
+    return path
+
+
 class Watcher:
     """Collects what the daemon publishes, and waits for what a test is after."""
 
@@ -208,3 +217,38 @@ async def test_a_board_that_is_unplugged_holds_the_wrist(rig_config, tiny_bank, 
         state = await watcher.until("loop.state", lambda state: "no new torque has arrived" in state["reasons"])
         assert state["phase"] in ("held", "stopped")
         assert state["speed_command_rad_per_s"] == 0.0
+
+
+async def test_nothing_moves_after_a_restart_a_reconnection_and_an_acknowledgement(rig_config, tiny_bank, tmp_path):
+    """A tool is gripped, an experiment is configured, the daemon ends in the middle, and nobody asks for a motion."""
+    path = experiment(tmp_path, SLOW_TWIST)
+    content = {**yaml.safe_load(rig_config.read_text()), "experiment": path}
+    rig_config.write_text(yaml.safe_dump(content))
+    async with running_rig(rig_config, tiny_bank) as (first, watcher, fault, command):
+        await started(command, path)
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
+        first.stop()
+        await first._end.wait()
+        # Its last task ends once the wrist stands.
+        while any(record.alive for record in first.supervisor.records.values()):  # noqa: ASYNC110
+            await asyncio.sleep(0.05)
+        async with running_daemon(second_config(rig_config)) as daemon:
+            again, ask_again = Watcher(daemon), partial(ask, daemon)
+            still = await again.until("robot.state", lambda state: abs(state["wrist_speed_rad_per_s"]) < 1e-3)
+            tool = await again.until("gripper.state", lambda state: state["diameter_mm"] is not None)
+            state = await again.until("loop.state", lambda state: "still holds something" in state["reasons"])
+            assert "the daemon ended" in state["reasons"]
+            assert not (await ask_again("start"))["ok"]
+            fault("unplug gripper 0.5")
+            await again.until("loop.state", lambda state: "gripper" in state["reasons"])
+            reply = await ask_again("unlock")
+            while not reply["ok"]:
+                reply = await ask_again("unlock")
+            last = again.seen["robot.state"][-1]["seq"]
+            later = await again.until("robot.state", lambda state: state["seq"] > last + 50)
+            assert later["wrist_rad"] == pytest.approx(still["wrist_rad"], abs=1e-3)
+            assert again.seen["gripper.state"][-1]["width_mm"] == pytest.approx(tool["width_mm"], abs=1.0)
+            assert "drops" in (await ask_again("release"))["reason"]
+            reply = await ask_again("release", confirmed=True)
+            assert reply["ok"], reply
+            assert again.seen["gripper.state"][-1]["width_mm"] > tool["width_mm"] + 50

@@ -78,7 +78,7 @@ def test_foreign_and_stale_files_are_refused(tmp_path, small):
         Calibration.load(tmp_path / "none.cal")
     for find, new, message in (
         (PAPER_TABLE.digest, f"'{'0' * 64}'", "channel table 000000000000…, expected"),
-        ("format_version: 7", "format_version: 5", "format version 5, expected 7; calibrate again"),
+        ("format_version: 8", "format_version: 5", "format version 5, expected 8; calibrate again"),
     ):
         with pytest.raises(CalibrationError, match=message):
             Calibration.load(edited(small, tmp_path / "stale.cal", find, new))
@@ -209,6 +209,19 @@ def test_an_array_of_another_type_or_shape_is_refused(saved, array, change, tmp_
     with pytest.raises(CalibrationError, match="does not describe a calibration of this version"):
         Calibration.load(rewritten(saved, tmp_path / "x.cal", changed))
     assert f"{array}.npy" in seen
+
+
+@pytest.mark.parametrize("change", ["fewer lags", "other channels"])
+def test_arrays_that_fit_each_other_and_not_the_channel_table_are_refused(motion_calibration, change, tmp_path):
+    estimator = motion_calibration.estimator
+    temporal = estimator.temporal
+    if change == "fewer lags":
+        changed = replace(temporal, n_lags=temporal.n_lags - 1)
+    else:
+        changed = replace(temporal, directions=temporal.directions[:, :, :-1].copy())
+    replace(motion_calibration, estimator=replace(estimator, temporal=changed)).save(tmp_path / "x.cal")
+    with pytest.raises(CalibrationError, match="does not describe a calibration of this version"):
+        Calibration.load(tmp_path / "x.cal")
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])

@@ -29,7 +29,7 @@ def grip(diameter_mm, seed):
     frames = diameter_mm * PER_MM + twist - idle + rng.normal(size=(N_FRAMES, 2 * PAPER_TABLE.n_channels))
     held = np.cumsum(frames, axis=0) / np.arange(1, N_FRAMES + 1)[:, None]
     none = np.zeros(N_FRAMES)
-    return CalibrationRows(none, none, none, none, frames, held, none, np.full(N_FRAMES, diameter_mm))
+    return CalibrationRows(none, none, none, none, frames, held, none, np.full(N_FRAMES, diameter_mm), none.astype(int))
 
 
 @pytest.fixture(scope="module")

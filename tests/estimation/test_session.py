@@ -9,7 +9,7 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import TRUSTED, EstimatorSession, FrameSeries, Measured, TactileFrame, fit, fitting
 from shearloop.estimation.fingertip_validator import mask_unmeasured
-from shearloop.estimation.gain import ToolLaw
+from shearloop.estimation.gain import ToolLaw, find_twists
 from tests.estimation.conftest import follow, judged, kept, twisting
 
 
@@ -381,3 +381,24 @@ def test_a_drift_does_not_lead_a_regression_astray():
     drift = np.linspace(0, 1, len(later.t_s))[:, None, None] * moved
     found = follow(calibration, replace(later, channels=later.channels + drift))
     assert not any(one.valid for one in found[-60:-40])
+
+
+def test_a_session_settles_with_one_twist_and_adapts_by_the_next(motion_calibration):
+    """The first twist after a grip shows another gain, so it decides nothing."""
+    whole = twisting(cycles=4, seed=5)
+    torque_nm = whole.torque_at_frames()
+    first, second, *_ = find_twists(torque_nm)
+    torque_nm[first] *= 0.5
+    torque_nm[second] *= 1.3
+    session, begin, end = EstimatorSession(motion_calibration), first[-1] + 1, second[-1] + 1
+
+    def torque_of_grip():
+        return np.interp(session.grip_t_s, whole.t_s, torque_nm)
+
+    follow(session, whole.between(0, begin))
+    with pytest.raises(CalibrationError, match="the first twist after a grip settles the gel"):
+        session.adapt(torque_of_grip())
+    follow(session, whole.between(begin, end))
+    correction = session.adapt(torque_of_grip()).correction
+    assert correction.twists == 1
+    assert correction.factors.mean() == pytest.approx(1.3, abs=0.1)

@@ -160,6 +160,29 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
     assert found.width_mm(230) == pytest.approx(0, abs=1)
 
 
+def test_a_gripper_of_another_model_is_measured_where_its_counts_begin_and_bow(tmp_path):
+    diameters, out = (8, 25, 45, 75), tmp_path / "gripper.yaml"
+    emulated = ("--model", "2F-85", "--open-counts", "13", "--bow-mm", "2.5", "--port", "0", "--speed", "20")
+    with Process("emulate", "gripper-socket", *emulated) as gripper:
+        host, _, port = gripper.hear("127.0.0.1:").partition(":")
+        given = [word for diameter in diameters for word in ("--diameter-mm", str(diameter))]
+        reach = ("--host", host, "--socket-port", port, "--model", "2F-85")
+        with Process("calibrate", "gripper", *reach, *given, "--out", str(out)) as calibrate:
+            calibrate.hear("The fingers will open")
+            calibrate.tell("")
+            for diameter in diameters:
+                calibrate.hear(f"Hold the object of {diameter} mm")
+                gripper.carry_out(f"object {diameter}")
+                calibrate.tell("")
+                calibrate.hear(f"  {diameter} mm:")
+            status, _, _ = calibrate.end()
+    found = load_device_calibration(out, WidthCalibration)
+    assert (status, found.model) == (0, "2F-85")
+    assert found.open_counts == pytest.approx(13, abs=3)
+    assert found.bow_mm == pytest.approx(2.5, abs=0.5)
+    assert found.width_std_mm < 0.6
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

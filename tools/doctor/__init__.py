@@ -201,8 +201,11 @@ def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
         means = "a reader of this key can pose as the daemon"
         cure = f"`chmod 600 {path}`; make new keys if somebody may have read it"
         return trouble("keys", f"others can read {path} (mode {mode:o})", means, cure)
+    if clients.unusable:
+        means = "its client cannot connect; the others can"
+        return note("keys", "; ".join(clients.unusable), means, f"remove it from {curve.clients}")
     if not network:
         means = "nobody else can connect"
         cure = "set `publish` and `commands` to tcp://0.0.0.0:PORT to let others connect"
         return note("keys", "there are keys, but every address is on this computer", means, cure)
-    return good("keys", f"{', '.join(sorted(clients.values()))} may connect to {' and '.join(network.values())}")
+    return good("keys", f"{', '.join(sorted(clients.names.values()))} may connect to {' and '.join(network.values())}")

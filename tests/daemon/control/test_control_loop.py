@@ -225,6 +225,20 @@ def test_an_arm_that_a_start_enables_is_no_fault_until_then():
     assert "Motion has not been enabled" in rig.control_loop.start(file, rig.t_ns)
 
 
+def test_a_run_has_a_number_and_does_not_show_the_end_of_the_one_before():
+    rig = Rig(new_loop())
+    rig.run(1)
+    file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "wait", "wait_s": 1}]})
+    assert loop_state(rig.control_loop, 0.0, rig.t_ns).run == 0
+    for run in (1, 2):
+        assert rig.control_loop.start(file, rig.t_ns) is None
+        begun = loop_state(rig.control_loop, 0.0, rig.t_ns)
+        assert (begun.phase, begun.run, begun.progress) == ("running", run, 0.0)
+        rig.run(2)
+        ended = loop_state(rig.control_loop, 0.0, rig.t_ns)
+        assert (ended.phase, ended.run) == ("done", run)
+
+
 def test_fingers_that_open_are_no_torque_of_a_fingertip():
     rig = gripping({"do": "release"}, warm_up_s=0.0)
     while rig.force_n == 0.0 or rig.control_loop.experiment.step_number < 2:

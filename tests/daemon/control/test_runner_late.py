@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from shearloop.daemon.control import fault_detection
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.safety import Fault, FaultCode
 from tests.daemon.control.cell import TWIST, driven
@@ -25,7 +26,11 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch):
         assert FaultCode.LOOP_LATE in [trouble.code for trouble in cell.control_loop.status.decision.faults]
 
 
-async def test_a_speed_that_comes_while_the_arm_still_brakes_after_a_late_one_says_why_and_the_turn_continues():
+async def test_a_speed_that_comes_while_the_arm_still_brakes_after_a_late_one_says_why_and_the_turn_continues(
+    monkeypatch,
+):
+    # This arm turns for longer without a decision than the delivered one.
+    monkeypatch.setattr(fault_detection, "LONGEST_HANG_S", 1.0)
     async with driven(TWIST, cycles=50) as cell:
         while cell.state.motion != "stopping":
             cell.robot.cycle(read=False)
@@ -55,7 +60,18 @@ async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_
             cell.robot.cycle(read=False)
         await cell.cycles(1)
         assert cell.phase is ExperimentPhase.STOPPED
-        assert cell.why == Fault(FaultCode.DAEMON_PAUSED, "it stood still for 6.0 s").sentence
+        assert cell.why == Fault(FaultCode.DAEMON_PAUSED, "it stood still for 6.0 s, and 0.3 s are allowed").sentence
+
+
+@pytest.mark.parametrize(("hang_s", "goes_on"), [(0.15, True), (0.28, True), (0.32, False), (0.5, False), (2.0, False)])
+async def test_a_daemon_that_hung_for_longer_than_a_hand_needs_does_not_turn_the_wrist_again_by_itself(hang_s, goes_on):
+    async with driven(TWIST, cycles=50) as cell:
+        for _ in range(round(hang_s * 1e9 / CYCLE_NS)):
+            cell.robot.cycle(read=False)
+        await cell.cycles(100)
+        assert (cell.phase is ExperimentPhase.RUNNING) == goes_on
+        assert (cell.state.motion == "wrist") == goes_on
+        assert cell.control_loop.safety.stopped != goes_on, "a stop waits for the operator's word"
 
 
 async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time():

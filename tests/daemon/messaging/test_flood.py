@@ -28,7 +28,7 @@ from shearloop.daemon.messaging.command_server import (
 )
 from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.refusals import Refusals
-from shearloop.daemon.messaging.stop_client import send_to_stop_socket, stop_name
+from shearloop.daemon.messaging.stop_client import StopSocketTakenError, owners, send_to_stop_socket, stop_name
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from shearloop.daemon.supervisor import resident_memory_mb
@@ -235,3 +235,51 @@ async def test_requests_of_many_frames_do_not_fill_the_memory():
         serving.cancel()
         await asyncio.gather(serving, return_exceptions=True)
         server.close()
+
+
+NOBODY = 65534
+
+
+def hold_name(address: str, held: int) -> None:
+    """Take the name of a stop socket as another user, and answer one request as a daemon would."""
+    os.setuid(NOBODY)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as taken:
+        taken.bind(stop_name(address))
+        os.write(held, b"1")
+        _, client = taken.recvfrom(1024)
+        taken.sendto(encode({"ok": True, "stopped": "everything"}), client)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can pose as another user")
+def test_a_stop_socket_of_another_user_is_not_believed():
+    address = f"tcp://127.0.0.1:{free_port()}"
+    ready, held = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        try:
+            hold_name(address, held)
+        finally:
+            os._exit(0)
+    try:
+        assert os.read(ready, 1) == b"1"
+        with pytest.raises(UserError, match="if another user holds its name"):
+            StopSocket(address, {}, Refusals())
+        with pytest.raises(StopSocketTakenError, match=f"held by the user {NOBODY}, who does not run the daemon"):
+            send_to_stop_socket(address, {"command": "stop"}, DEADLINE_S)
+    finally:
+        os.waitpid(pid, 0)
+        os.close(ready)
+        os.close(held)
+
+
+def test_the_owner_of_the_command_address_is_believed(tmp_path):
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        assert owners(f"tcp://127.0.0.1:{listener.getsockname()[1]}") == {0, os.getuid()}
+    path = tmp_path / "commands"
+    path.touch()
+    if os.getuid() == 0:
+        os.chown(path, NOBODY, NOBODY)
+        assert owners(f"ipc://{path}") == {0, NOBODY}
+    assert owners(f"ipc://{tmp_path}/none") == {0, os.getuid()}

@@ -1,6 +1,7 @@
 """CURVE on anything but loopback and ipc, keys by `shearloop keys`, an allow-list, and no way round them."""
 
 import asyncio
+import os
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,14 @@ import zmq.asyncio
 from shearloop.daemon.messaging.addresses import has_valid_port, is_local, needs_keys
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.client import Subscriber
-from shearloop.daemon.messaging.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
+from shearloop.daemon.messaging.keys import (
+    ClientKeys,
+    KeyPair,
+    check_allowed_clients,
+    load_key_pair,
+    load_public_key,
+    load_server_keys,
+)
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
@@ -169,6 +177,7 @@ def test_a_systemd_credential_replaces_the_key_file(keys, tmp_path, monkeypatch)
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(handed))
     secret = keys / "keys/server.key_secret"
     (handed / secret.name).write_text(secret.read_text())
+    (handed / secret.name).chmod(0o400)
     assert load_server_keys(Path("/etc/shearloop/keys/server.key_secret")) == load_key_pair(secret)
     (handed / secret.name).write_text("none")
     with pytest.raises(UserError, match="run `sudo shearloop keys server`"):
@@ -178,3 +187,27 @@ def test_a_systemd_credential_replaces_the_key_file(keys, tmp_path, monkeypatch)
 def test_repr_hides_the_secret_key():
     pair = KeyPair(*zmq.curve_keypair())
     assert pair.secret.decode() not in repr(pair)
+
+
+def test_a_file_that_is_no_key_locks_out_nobody(keys, ran, result_of):
+    clients = keys / "keys" / "clients"
+    (clients / "junk.key").write_bytes(b"\xff\x00 no key")
+    (clients / "large.key").write_text("#" * 100_000)
+    os.mkfifo(clients / "pipe.key")
+    found = check_allowed_clients(clients)
+    assert list(found.names.values()) == ["ada"]
+    assert [Path(why.partition(":")[0].partition(" ")[0]).stem for why in found.unusable] == ["junk", "large", "pipe"]
+    assert set(result_of("keys", "list", "--dir", keys / "keys")["clients"]) == {"ada"}
+    assert "junk.key is no key file" in ran("keys", "list", "--dir", keys / "keys").out
+    (clients / "ada.key").unlink()
+    with pytest.raises(UserError, match=r"junk\.key is no key file.*so no client could connect"):
+        check_allowed_clients(clients)
+
+
+def test_a_secret_key_that_every_user_can_read_is_named(keys):
+    secret = keys / "keys" / "server.key_secret"
+    secret.chmod(0o644)
+    with pytest.raises(UserError, match=r"every user of this machine can read the secret key: run `chmod 600"):
+        load_key_pair(secret)
+    secret.chmod(0o600)
+    assert load_key_pair(secret).public == load_public_key(keys / "keys" / "server.key")

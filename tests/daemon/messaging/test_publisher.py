@@ -1,3 +1,4 @@
+import errno
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -5,6 +6,7 @@ from contextlib import closing
 
 import pytest
 import zmq
+import zmq.asyncio
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.client import Subscriber, receive_messages
@@ -162,3 +164,17 @@ def test_a_client_with_many_unknown_topics_is_disconnected(publisher, connect, t
         assert publisher.diagnostics() == {"errors": {"too many unknown topics": 1}}
         publisher.forward("health", {"number": 1})
         assert known.recv_multipart()[0] == b"health"
+
+
+async def test_an_ipc_path_that_is_removed_while_it_is_looked_at_is_bound(tmp_path, monkeypatch):
+    path = tmp_path / "publish"
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(path))
+
+    def removed(_path: str) -> int:
+        path.unlink()
+        return errno.ENOENT
+
+    monkeypatch.setattr("shearloop.daemon.messaging.bound_sockets.probe", removed)
+    with zmq.asyncio.Context() as context:
+        Publisher(context, f"ipc://{path}", Clock()).close()

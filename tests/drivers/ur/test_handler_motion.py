@@ -1,9 +1,11 @@
 """Motions and their ends: turning, linear moves, stops."""
 
+from dataclasses import replace
+
 import pytest
 
 from shearloop.drivers.ur.messages import Disconnect, MoveLinear, Stop, WristSpeed
-from tests.drivers.ur.flight import CYCLE_NS, LIMITS, POSE, Flight, flying, turning
+from tests.drivers.ur.flight import CYCLE_NS, LIMITS, POSE, SETTINGS, Flight, flying, turning
 
 
 def cycles_with_calls(flight: Flight, cycles: int) -> list[int]:
@@ -40,6 +42,26 @@ def test_wrist_speed_holds_from_its_decision_and_not_from_its_arrival() -> None:
     assert refused.refusal == "The wrist speed was decided 0.30 s ago: the computer is too busy."
     flight.fly(1)
     assert flight.state.motion == "idle"
+
+
+def test_wrist_does_not_turn_on_without_a_state():
+    """As on a link that is open one way: commands arrive, states are lost."""
+    flight = flying(replace(SETTINGS, command_timeout_s=0.1))
+    assert flight.ask(WristSpeed(0.5, 4.0)).accepted
+    flight.fly(5)
+    flight.arm.be(age_ns=90_000_000)
+    flight.fly(1)
+    assert flight.state.motion == "wrist"
+    flight.arm.be(age_ns=101_000_000)
+    flight.fly(1)
+    assert flight.state.motion == "stopping"
+    assert flight.state.end_reason == "the robot's last state is 0.10 s old"
+    assert (flight.arm.target, flight.arm.acceleration) == (0.0, LIMITS.wrist_acceleration_rad_per_s2.hard)
+    flight.fly_until(lambda state: state.motion == "idle")
+    refused = flight.ask(WristSpeed(0.5, 4.0))
+    assert refused.refusal == "The robot's last state is 0.10 s old: the wrist does not begin to turn."
+    flight.arm.be(age_ns=2_000_000)
+    assert flight.ask(WristSpeed(0.5, 4.0)).accepted
 
 
 def test_something_is_sent_in_each_cycle_of_a_motion():

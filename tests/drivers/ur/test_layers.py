@@ -181,6 +181,17 @@ def test_script_alone_ends_a_linear_move_in_time(guarded):
     assert flight.arm.reading.program_running != guarded
 
 
+def test_killed_worker_ends_a_linear_move_before_its_watchdog_would():
+    """So a busy computer, which delivers its last words late, does not break the promise."""
+    flight = moving_at_full_speed(control_script(DELIVERED))
+    for _ in range(int(1.0 / DELIVERED.watchdog_hz * 1e9 / CYCLE_NS)):
+        flight.arm.cycle()
+    assert not flight.arm.reading.program_running
+    for _ in range(3):
+        flight.arm.cycle()
+    assert flight.arm.reading.rests
+
+
 @pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "own"])
 def test_linear_move_of_a_living_daemon_arrives(guarded):
     flight = moving_at_full_speed(control_script(DELIVERED if guarded else None))

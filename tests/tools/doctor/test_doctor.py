@@ -156,8 +156,8 @@ def test_a_secret_key_that_others_can_read_is_reported(tmp_path):
     make_key_pair(tmp_path / "clients", "ada")
     assert doctor.check_keys(curve, {"publish": "tcp://0.0.0.0:1"}).found == "ada may connect to tcp://0.0.0.0:1"
     assert doctor.check_keys(curve, {}).state == "note"
-    secret.chmod(0o644)
-    assert "mode 644" in doctor.check_keys(curve, {}).found
+    secret.chmod(0o640)
+    assert "mode 640" in doctor.check_keys(curve, {}).found
     assert doctor.check_keys(None, {}).state == "good"
 
 

@@ -50,7 +50,13 @@ def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder,
 
 
 @pytest.mark.parametrize(
-    ("tool", "others"), [("20mm_1", "10mm_1 30mm_1 30mm_2 40mm_1"), ("40mm_1", "10mm_1 20mm_1 30mm_1 30mm_2")]
+    ("tool", "others"),
+    [
+        ("20mm_1", "10mm_1 30mm_1 30mm_2 40mm_1"),
+        ("20mm_1", "10mm_1 30mm_1 40mm_1"),
+        ("40mm_1", "10mm_1 20mm_1 30mm_1 30mm_2"),
+        ("40mm_1", "10mm_1 20mm_1 30mm_1"),
+    ],
 )
 def test_other_diameters_and_two_twists_estimate_the_torque_on_a_tool(
     tool, others, cylinder, loaded, tmp_path, ran, result_of
@@ -59,6 +65,7 @@ def test_other_diameters_and_two_twists_estimate_the_torque_on_a_tool(
     out, new = tmp_path / "tools.cal", tmp_path / "new.cal"
     printed = ran("calibrate", *recordings, "--load-cell-delay-s", "0", "--out", out).out
     assert "The tools' diameters are 10 to " in printed
+    assert "off by a factor of " in printed
     before = loaded(out, tested)
     assert before["coverage_95"] > 0.9, "a tool that was not calibrated"
     ran("adapt", out, tested, "--time-range", "0:0.28", "--out", new)

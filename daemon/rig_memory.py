@@ -1,0 +1,141 @@
+"""What must outlive the daemon's process: a stop, the experiment that runs, and the grip; a file for each robot."""
+
+import asyncio
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.safety import Fault, FaultCode
+
+VERSION = 1
+# The file follows the loop's state at this interval, besides the start of each experiment.
+FOLLOWS_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Remembered:
+    """The state of a rig; empty without a stop, an experiment and a grip."""
+
+    # The name of the experiment that runs.
+    running: str = ""
+    # Code and detail of each fault of the stop that waits for the operator.
+    stop: tuple[tuple[str, str], ...] = ()
+    # The wrist's angle at the grip, and the largest force of the fingers.
+    origin_rad: float | None = None
+    force_n: float | None = None
+
+    @classmethod
+    def of(cls, loop: ControlLoop) -> "Remembered":
+        """Return the present state of a control loop."""
+        running = loop.running.file.name if loop.running is not None else ""
+        stop = tuple((fault.code.name, fault.detail) for fault in loop.safety.stop_faults)
+        return cls(running, stop, *loop.grip)
+
+    def restore(self, loop: ControlLoop) -> None:
+        """Make a new control loop remember; a stop keeps the grip, whatever it did when it began."""
+        for name, detail in self.stop:
+            known = name in FaultCode.__members__
+            loop.safety.stop(Fault(FaultCode[name], detail) if known else Fault(FaultCode.DAEMON_ENDED, detail))
+        if self.running:
+            ended = f"it was killed, it crashed or the power failed while {self.running!r} was under way"
+            loop.safety.stop(Fault(FaultCode.DAEMON_ENDED, ended))
+        loop.restore_grip(self.origin_rad, self.force_n)
+
+
+@dataclass(slots=True)
+class RigMemory:
+    """Keeps a rig's state in a file, which is replaced as a whole; the task follows the control loop."""
+
+    path: Path
+    loop: ControlLoop
+    error: str = ""
+    # The experiment that is about to begin.
+    starting: str = ""
+    _written: Remembered = field(default_factory=Remembered)
+    _writing: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    def __post_init__(self) -> None:
+        """Restore what the last daemon of this robot has left."""
+        remembered = read_memory(self.path)
+        remembered.restore(self.loop)
+        self._written = remembered
+
+    async def run(self) -> None:
+        """Write every change until cancelled."""
+        while True:
+            await self.save(self._present())
+            await asyncio.sleep(FOLLOWS_S)
+
+    async def begins(self, experiment: str) -> str | None:
+        """Write that an experiment begins, before anything moves; return None, or why it cannot be written."""
+        self.starting = experiment
+        await self.save(self._present())
+        return self.error or None
+
+    def _present(self) -> Remembered:
+        state = Remembered.of(self.loop)
+        return replace(state, running=state.running or self.starting)
+
+    async def save(self, state: Remembered) -> None:
+        """Write a state, unless the file has it already; a failure is logged once, and tried again."""
+        async with self._writing:
+            if state == self._written and not self.error:
+                return
+            try:
+                await asyncio.to_thread(write_memory, self.path, state)
+            except OSError as error:
+                if not self.error:
+                    structlog.get_logger().warning("the rig's state cannot be kept", reason=str(error))
+                self.error = (
+                    f"the rig's state cannot be kept in {self.path} ({error.strerror}), and a stop would be forgotten "
+                    "with this process: make room, or make the folder writable"
+                )
+            else:
+                self.error, self._written = "", state
+
+    def diagnostics(self) -> Mapping[str, str]:
+        """Return the memory's part of `health`."""
+        return {"error": self.error} if self.error else {}
+
+
+def memory_path(host: str) -> Path:
+    """Return the file of the robot at this address: in systemd's state folder, or in the user's."""
+    # systemd separates several folders with colons; ours is one.
+    folder = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if not folder:
+        state = os.environ.get("XDG_STATE_HOME", "")
+        folder = str((Path(state) if os.path.isabs(state) else Path.home() / ".local" / "state") / "shearloop")
+    return Path(folder) / f"robot-{re.sub(r'[^A-Za-z0-9.-]', '_', host)}.json"
+
+
+def read_memory(path: Path) -> Remembered:
+    """Return the state in a file; one that cannot be read counts as a stop, a missing one as none."""
+    try:
+        content: Any = json.loads(path.read_text(encoding="utf-8"))
+        if content.pop("version") != VERSION:
+            raise ValueError("it has another version")
+        stop = tuple((str(code), str(detail)) for code, detail in content.pop("stop"))
+        return Remembered(stop=stop, **content)
+    except FileNotFoundError:
+        return Remembered()
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        unreadable = f"what it left in {path} cannot be read: {error}"
+        return Remembered(stop=((FaultCode.DAEMON_ENDED.name, unreadable),))
+
+
+def write_memory(path: Path, state: Remembered) -> None:
+    """Replace the file as a whole, on the disk when this returns; raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_suffix(".new")
+    with new.open("w", encoding="utf-8") as file:
+        json.dump({"version": VERSION, **asdict(state)}, file)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)

@@ -1,0 +1,124 @@
+"""A stop, and the grip, outlive the process: after a crash, a power cut or a restart nothing has been forgotten."""
+
+import asyncio
+import json
+from pathlib import Path
+
+import pytest
+
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.safety import Fault, FaultCode, Response
+from shearloop.daemon.rig_memory import Remembered, RigMemory, memory_path, read_memory, write_memory
+from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, started, stop
+
+WAIT = {"do": "wait", "wait_s": 60}
+
+
+def refusal(rig: Rig) -> str:
+    file = ExperimentFile.model_validate({"name": "next", "steps": [WAIT]})
+    return rig.control_loop.start(file, rig.t_ns) or ""
+
+
+def after_restart(before: Rig, path: Path) -> Rig:
+    """Return the rig with the loop of a new process, which finds what the old one has written."""
+    write_memory(path, Remembered.of(before.control_loop))
+    after = Rig(new_loop())
+    RigMemory(path, after.control_loop)
+    after.wrist_rad, after.force_n, after.width_mm = before.wrist_rad, before.force_n, before.width_mm
+    after.run(0.6)
+    return after
+
+
+def test_after_a_crash_nothing_moves_and_the_state_tells_of_the_tool(tmp_path):
+    rig = started(Rig(new_loop()), GRIP, WAIT)
+    rig.run(2)
+    after = after_restart(rig, tmp_path / "robot.json")
+    after.run(2)
+    assert after.begun == []
+    assert after.speed == 0.0
+    assert "while 'test' was under way" in refusal(after)
+    reasons = " ".join(after.control_loop.status.decision.reasons)
+    assert "the gripper still holds something: its fingers hold something 30.0 mm wide, with at most 60 N" in reasons
+    after.control_loop.acknowledge()
+    after.run(1)
+    assert (after.begun, after.speed) == ([], 0.0), "an acknowledgement moves nothing"
+
+
+@pytest.mark.parametrize("kind", ["operator", "fault"])
+def test_a_stop_is_remembered_until_it_is_acknowledged(kind, tmp_path):
+    path = tmp_path / "robot.json"
+    rig = started(Rig(new_loop()), GRIP, WAIT)
+    rig.run(2)
+    if kind == "operator":
+        stop(rig)
+    else:
+        rig.control_loop.on_fault(FaultCode.PROTECTIVE_STOP, "it met something")
+    rig.run(0.1)
+    after = after_restart(rig, path)
+    assert ("the operator stopped it" if kind == "operator" else "in a protective stop") in refusal(after)
+    after.control_loop.acknowledge()
+    again = after_restart(after, path)
+    assert refusal(again) == ""
+
+
+def test_a_stop_that_released_does_not_release_again_in_the_next_process():
+    rig = Rig(new_loop())
+    Remembered(stop=((FaultCode.TORQUE_LIMIT.name, "right measured 0.9 N·m"),)).restore(rig.control_loop)
+    rig.force_n = 60.0
+    for _ in range(20):
+        rig.step()
+        assert not rig.orders.release
+    assert rig.control_loop.status.decision.response is Response.STOP_AND_KEEP_GRIP
+
+
+def test_the_angle_of_a_grip_is_remembered_and_forgotten_with_the_grip(tmp_path):
+    rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 0.1})
+    rig.run(5)
+    gripped_rad = rig.wrist_rad
+    after = after_restart(rig, tmp_path / "robot.json")
+    assert after.control_loop.grip == (pytest.approx(gripped_rad), 60.0)
+    after.force_n = 0.0
+    after.run(0.1)
+    assert after.control_loop.grip == (None, None)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"version": 0, "stop": []}', '{"version": 1, "stop": 3}', "\x00"])
+def test_a_state_that_cannot_be_read_counts_as_a_stop(content, tmp_path):
+    path = tmp_path / "robot.json"
+    path.write_text(content)
+    ((code, detail),) = read_memory(path).stop
+    assert code == "DAEMON_ENDED"
+    assert str(path) in detail
+
+
+def test_a_fault_of_another_version_is_a_stop_all_the_same():
+    loop = new_loop()
+    Remembered(stop=(("NO_SUCH_FAULT", "it was hot"),)).restore(loop)
+    assert loop.safety.stop_faults == (Fault(FaultCode.DAEMON_ENDED, "it was hot"),)
+
+
+async def test_nothing_starts_where_a_stop_could_not_be_remembered(tmp_path):
+    (tmp_path / "file").write_text("")
+    memory = RigMemory(tmp_path / "robot.json", new_loop())
+    memory.path = tmp_path / "file" / "robot.json"
+    assert "cannot be kept" in (await memory.begins("test") or "")
+    memory.path = tmp_path / "robot.json"
+    assert await memory.begins("test") is None
+    assert json.loads(memory.path.read_text())["running"] == "test"
+
+
+async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it(tmp_path):
+    memory = RigMemory(tmp_path / "robot.json", new_loop())
+    assert await memory.begins("test") is None
+    following = asyncio.create_task(memory.run())
+    await asyncio.sleep(0)
+    following.cancel()
+    await asyncio.gather(following, return_exceptions=True)
+    assert read_memory(memory.path).running == "test"
+
+
+def test_the_file_is_in_systemds_state_folder_or_the_users(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert memory_path("192.168.1.10") == tmp_path / "shearloop" / "robot-192.168.1.10.json"
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/shearloop:/var/lib/other")
+    assert memory_path("a/../b") == Path("/var/lib/shearloop/robot-a_.._b.json")

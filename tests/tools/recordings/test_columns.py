@@ -1,0 +1,78 @@
+"""Contents that no recorder writes are refused with one sentence, and what is taken has the type of its column."""
+
+import json
+import math
+from typing import Any
+
+import pytest
+
+from shearloop.daemon.messaging.messages import TOPICS, wire_map
+from shearloop.daemon.recorder import schema
+from shearloop.tools.recordings.columns import ContentError, columns, read_content
+from tests.sample_messages import sample
+from tests.tools.recordings.every_message import made
+from tests.tools.recordings.test_damage import recorded
+
+STRANGE: list[Any] = [
+    *(2**70, -(2**70), 2**63, 10**400, 1e308, -1, 1.5, True, None, "x", "\ud800", [], [[1, 2], [3]], [1, [2]], [None]),
+    *([2**64], ["x"], [True], {}, {"a": [1]}),
+]
+PYTHON = {"number": float, "integer": int, "boolean": bool, "string": str, "object": dict, "array": list}
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_each_key_takes_its_own_type_alone(topic):
+    content = json.loads(schema.message_json(topic, wire_map(sample(TOPICS[topic]), 1.5, 3), 0))
+    name = schema.recorded_topic(topic, "right")
+    assert read_content(name, json.dumps(content).encode()).keys() == columns(topic).keys()
+    for key, column in columns(topic).items():
+        for value in STRANGE:
+            try:
+                found = read_content(name, json.dumps({**content, key: value}).encode())[key]
+            except ContentError:
+                continue
+            assert type(found) is PYTHON[column.kind] or (found is None and column.optional), (key, value)
+            if column.kind in ("integer", "number"):
+                assert math.isfinite(found or 0)
+                assert column.kind == "number" or abs(found) < 2**63
+        # Without a source it is an import's.
+        if not column.optional and key != "source":
+            with pytest.raises(ContentError, match=f"lacks the key '{key}'"):
+                read_content(name, json.dumps({one: content[one] for one in content if one != key}).encode())
+    with pytest.raises(ContentError, match="unknown key 'other'"):
+        read_content(name, json.dumps({**content, "other": 1}).encode())
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "mat", "rrd", "lerobot", "replay"])
+@pytest.mark.usefixtures("rerun_runtime")
+@pytest.mark.parametrize(
+    ("topic", "changes", "problem"),
+    [
+        ("eit.heatmap.right", {"scores_shape": [2, 2]}, "scores are no rectangle"),
+        ("robot.state", {"t_mono_ns": 2**62}, "which no clock shows"),
+        ("gripper.state", {"width_mm": [[1.0], 2.0]}, "width_mm is [[1.0], 2.0], not a number"),
+        ("load.torque", {"other": 1}, "it has the unknown key 'other'"),
+    ],
+)
+def test_every_way_out_refuses_a_strange_message(form, topic, changes, problem, config, tmp_path, mistake):
+    for module in {"parquet": ["pyarrow"], "lerobot": ["pyarrow"]}.get(form, []):
+        pytest.importorskip(module)
+    rows = [
+        (name, {key: value for key, value in row.items() if key not in ("log_time_ns", "publish_time_ns")})
+        for name, series in made(tmp_path).rows().items()
+        for row in series[:2]
+        # Its arrival would be days from the other times.
+        if not name.startswith("eit.frame")
+    ]
+    strange = [(name, {**row, **changes} if name == topic else row) for name, row in rows]
+    path = recorded(tmp_path / "x.mcap", *strange)
+    if form == "replay":
+        arguments = ["--config", config(), "--publish", f"ipc://{tmp_path}/r", "--speed", "max"]
+        said = mistake("replay", path, *arguments)
+    elif form == "lerobot" and topic == "eit.heatmap.right":
+        # A dataset has no heatmaps.
+        return
+    else:
+        said = mistake("recording", "export", path, "--format", form, "--out", tmp_path / "out")
+    assert problem in said
+    assert f"{path}: a message cannot be used: {topic}, number " in said

@@ -30,7 +30,7 @@ from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, fir
 from shearloop.estimation.interval_regressor import CensoredRidge, IntervalRegressor, fit_interval_regressor
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.novelty import NoveltyDetector
-from shearloop.estimation.regressors import ChannelImputer, later_origins
+from shearloop.estimation.regressors import ChannelImputer, later_levels
 from shearloop.estimation.session_state import ProcessedFrame, SessionState
 from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
 
@@ -305,7 +305,7 @@ def _fit_slices(
             values[known],
             of_value,
             strengths=estimator.strengths,
-            left_out=later_origins(n) if quantity == "torque" else (),
+            left_out=later_levels(values[known]) if quantity == "torque" else (),
             fit_line=line if quantity == "torque" else None,
             full_range=full_range,
         )

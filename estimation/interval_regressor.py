@@ -29,7 +29,7 @@ from shearloop.estimation.gain import (
     first_twists,
     loaded_log_gain,
 )
-from shearloop.estimation.regressors import InverseCalibration, later_splits, left_out_blocks, left_out_groups
+from shearloop.estimation.regressors import CurveMean, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.values import INLINE
 from shearloop.words import counted
 
@@ -140,7 +140,7 @@ class CensoredRidge(Ridge):
         return replace(Ridge.scaled(self, factor), sigma=factor * self.sigma)
 
 
-Regressor: TypeAlias = Ridge | CensoredRidge | InverseCalibration
+Regressor: TypeAlias = Ridge | CensoredRidge | CurveMean
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
 # Pairs of rows to fit to and rows to validate on.
@@ -279,7 +279,7 @@ class IntervalRegressor:
 
     def scaled(self, factor: float, spread: float) -> "IntervalRegressor":
         """Return the regressor of values larger by a factor, whose gain and zero have this spread."""
-        if isinstance(self.point, InverseCalibration):
+        if isinstance(self.point, CurveMean):
             raise CalibrationError("a curve of slices has no gain")
         return replace(
             self,
@@ -300,7 +300,7 @@ class IntervalRegressor:
         point = self.point
         least_nm = LOADED_SHARE * max(abs(self.range.low), abs(self.range.high))
         twists = [one for one in find_twists(torque_nm) if np.abs(torque_nm[one]).max() >= least_nm]
-        if isinstance(point, InverseCalibration) or not twists:
+        if isinstance(point, CurveMean) or not twists:
             raise CalibrationError(
                 f"no twist reaches {least_nm:.3g} N·m while an estimate is possible; twist further, some seconds "
                 "after the grip"
@@ -388,7 +388,7 @@ def fit_interval_regressor(
     point, truth = fit(features, values, strength), values[rows]
     residuals = reported - truth
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
-    inflation = 1.0 if isinstance(point, InverseCalibration) else _INFLATION
+    inflation = 1.0 if isinstance(point, CurveMean) else _INFLATION
     inflation = student_inflation(len(np.unique(rows))) if left_out else inflation
     of_loads = _inflation_of_twists(values, twists) if twists else None
     centre = features.mean(axis=0)

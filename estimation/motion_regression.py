@@ -50,7 +50,7 @@ from shearloop.estimation.motion_fit import (
     twists_left_out,
 )
 from shearloop.estimation.novelty import fitted_parts
-from shearloop.estimation.regressors import InverseCalibration, left_out_blocks
+from shearloop.estimation.regressors import CurveMean, left_out_blocks
 from shearloop.estimation.session_state import Motion
 
 # The directions are those of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err
@@ -71,9 +71,13 @@ _N_NUISANCE, _MOST_FRAMES = 16, 500
 _CLEAR, _LEAST_SHARE = 2.0, 0.2
 # Centred positions have one direction less than their number; the last one is rounding.
 _ROUNDING = 1e-9
-# Inverse calibration over torque and over diameter: degree, directions of drift, trend. The torque's have the least
-# mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones; docs/decisions/0042).
-_CURVES: dict[Quantity, tuple[int, int, bool]] = {"torque": (4, 3, True), "diameter": (1, 1, False)}
+# Inverse calibration over torque and over diameter: degrees whose curves are averaged, directions of drift, trend. The
+# torque's have the least mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones) with and
+# without the judged level of torque (docs/decisions/0045).
+_CURVES: dict[Quantity, tuple[tuple[int, ...], int, bool]] = {
+    "torque": ((1, 3, 4), 3, True),
+    "diameter": ((1,), 1, False),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,19 +267,19 @@ class MotionRegression(Estimator):
 
         Raises CalibrationError where a part of (n,) values has too few distinct ones.
         """
-        degree, n_drift, trend = _CURVES[quantity]
+        degrees, n_drift, trend = _CURVES[quantity]
         for rows in fitted_parts(len(values)) if np.ptp(values) > 0 else ():
             n_distinct = len(np.unique(values[rows]))
-            if n_distinct <= degree:
+            if n_distinct <= max(degrees):
                 raise CalibrationError(
                     f"{len(rows)} of the {len(values)} slices have too few different {quantity}s for the estimator "
                     f"motion_regression, {n_distinct}; record more of them, in turn"
                 )
 
-        def fit_of(degree: int) -> RegressorFit:
-            return lambda frames, known, _: InverseCalibration.fit(frames, known, degree, n_drift, trend=trend)
+        def fit_of(degrees: tuple[int, ...]) -> RegressorFit:
+            return lambda frames, known, _: CurveMean.fit(frames, known, degrees, n_drift, trend=trend)
 
-        return fit_of(degree), fit_of(1)
+        return fit_of(degrees), fit_of((1,))
 
 
 def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> IntervalRegressor:

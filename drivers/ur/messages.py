@@ -15,8 +15,8 @@ from shearloop.drivers.ur.settings import Six, Three, UrSettings
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal[
-    "unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "lost", "crashed", "hung",
-    "garbled",
+    "unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "script", "lost", "crashed",
+    "hung", "garbled",
 ]  # fmt: skip
 
 # `RobotState.end_reason` of a motion that ended as commanded; any other reason is a sentence.

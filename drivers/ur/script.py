@@ -20,6 +20,8 @@ _GRACE_S = 0.05
 
 # ur-rtde 1.6.5: the line before the main loop, and the thread that carries out speeds.
 _BEFORE_LOOP = "        keep_running = True\n"
+# ur-rtde writes the number of its first register where it has a comment.
+_REGISTER_OFFSET = re.compile(r"(global reg_offset_\w+ =) #.*")
 _SPEED_THREAD = re.compile(r"^    thread speed_thread\(\):\n.*?^    end\n", re.MULTILINE | re.DOTALL)
 
 # speedj returns after a cycle, so that each cycle checks. The clock starts at 0 in each program, and a deadline too far
@@ -119,5 +121,6 @@ def guard_script(script: str, settings: UrSettings) -> str:
         "force": limits.force_n.hard,
         "torque": limits.torque_nm.hard,
     }
+    script = _REGISTER_OFFSET.sub(r"\1 0", script)
     script = _SPEED_THREAD.sub(lambda _: _GUARD.format(**values), script)
     return f"def rtde_control():\n{script.replace(_BEFORE_LOOP, _START.format(**values) + _BEFORE_LOOP)}end\n"

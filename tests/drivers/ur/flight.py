@@ -180,13 +180,12 @@ class FakeArm:
                 self.end_program()
         return ""
 
-    def upload(self) -> bool:
+    def upload(self) -> None:
         self.calls.append("upload")
         if self.stale_command:
             self.target = 0.8
         self._watched = False
         self.be(runtime_state=2)
-        return True
 
     def arm_watchdog(self) -> bool:
         self.note("arm_watchdog")

@@ -5,7 +5,6 @@ import dataclasses
 import importlib
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import ClassVar
 
@@ -137,10 +136,8 @@ def test_register_is_cleared_once_the_client_knows_that_no_program_runs(arm):
 
 def test_sent_script_arms_its_watchdog(arm, monkeypatch):
     sent: list[str] = []
-    monkeypatch.setattr(
-        Client, "setCustomScriptFile", lambda _, path: sent.append(Path(path).read_text()), raising=False
-    )
-    assert arm.UrArm(SETTINGS, VERSION).upload()
+    monkeypatch.setattr(arm.ScriptPort, "send", lambda _, program: sent.append(program))
+    arm.UrArm(SETTINGS, VERSION).upload()
     assert 'rtde_set_watchdog("input_int_register_0", 10, "stop")' in sent[0]
 
 
@@ -159,15 +156,13 @@ def test_deadline_counts_from_the_latest_sample(arm):
     assert one._receiver.deadlines == [pytest.approx(20.07), NO_MOTION_S]
 
 
-def test_connection_that_takes_no_script_is_lost(arm, monkeypatch, capsys):
-    """Only a new worker opens the connection again."""
-
-    def refuse(_client: Client, _path: str) -> None:
-        raise RuntimeError("write: Broken pipe")
-
-    monkeypatch.setattr(Client, "setCustomScriptFile", refuse, raising=False)
+def test_script_port_is_read_until_the_program_plays(arm, monkeypatch):
+    calls: list[str] = []
+    for name in ("send", "drain", "close"):
+        monkeypatch.setattr(arm.ScriptPort, name, lambda *_, name=name: calls.append(name))
     one = arm.UrArm(SETTINGS, VERSION)
-    assert one.read().connected
-    assert not one.upload()
-    assert not one.read().connected
-    assert "could not be sent: write: Broken pipe" in capsys.readouterr().err
+    one.upload()
+    one.read()
+    one._receiver.sample = received(2.0, runtime_state=2)
+    one.read()
+    assert calls == ["send", "drain", "drain", "close"]

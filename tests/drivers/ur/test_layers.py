@@ -82,9 +82,8 @@ class ScriptedArm(FakeArm):
     def clear_command(self) -> bool:
         return self._write(0)
 
-    def upload(self) -> bool:
+    def upload(self) -> None:
         self.robot.upload(self._script)
-        return True
 
     def arm_watchdog(self) -> bool:
         return self._write(robots.SET_WATCHDOG, DELIVERED.watchdog_hz)

@@ -32,6 +32,7 @@ from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_b
 from shearloop.estimation.novelty import NoveltyDetector
 from shearloop.estimation.regressors import ChannelImputer, later_levels
 from shearloop.estimation.session_state import ProcessedFrame, SessionState
+from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
@@ -77,6 +78,7 @@ def fit(
         bank_identity=physics.bank.identity if physics.bank is not None and kind.needs == "bank" else "",
         tool_mm=tools[0].value if len(tools) == 1 else np.nan,
         validators=material.validators,
+        profile=TorqueProfile.fit(chosen),
     )
     if timing is None or not is_raw:
         return _fit_slices(blank, chosen, physics, full_range=full_range)

@@ -260,7 +260,9 @@ class SafetyDecision:
 class SafetyMonitor:
     """Judges faults: a hold ends with its cause, a stop stays until the operator acknowledges it."""
 
-    def __init__(self) -> None:
+    def __init__(self, patience: float = 1.0) -> None:
+        """`patience` is the factor on the longest holds; above 1 on an emulated rig alone."""
+        self._patience = patience
         # Hold timers of each fault and of the wrist, and the faults that held it at the last judgement.
         self._held_ns: dict[FaultCode, int] = {}
         self._wrist_ns = 0
@@ -277,9 +279,11 @@ class SafetyMonitor:
             self._count(active, t_ns)
         self._judged_ns = t_ns
         response = max(map(self._response, active), default=Response.NOTE)
-        if response is Response.HOLD and self._wrist_ns > HELD_AT_MOST_S * 1e9:
+        if response is Response.HOLD and self._wrist_ns > self._patience * HELD_AT_MOST_S * 1e9:
             active = (*active, Fault(FaultCode.HELD_TOO_LONG, self._hold_report()))
             response = TABLE[FaultCode.HELD_TOO_LONG].response
+        # What stops comes before what holds: it is the cause that is told first.
+        active = tuple(sorted(active, key=self._response, reverse=True))
         decision = SafetyDecision(response, self._explained(active, _explaining(active)))
         if response >= Response.STOP_AND_KEEP_GRIP and (self._stop is None or response > self._stop.response):
             self._stop = decision
@@ -358,7 +362,7 @@ class SafetyMonitor:
     def _response(self, fault: Fault) -> Response:
         rule = fault.rule
         longest_s = rule.hold_at_most_s
-        if longest_s is not None and self._held_ns[fault.code] > longest_s * 1e9:
+        if longest_s is not None and self._held_ns[fault.code] > self._patience * longest_s * 1e9:
             return Response.STOP_AND_KEEP_GRIP
         return rule.response
 

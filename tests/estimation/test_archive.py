@@ -78,7 +78,7 @@ def test_foreign_and_stale_files_are_refused(tmp_path, small):
         Calibration.load(tmp_path / "none.cal")
     for find, new, message in (
         (PAPER_TABLE.digest, f"'{'0' * 64}'", "channel table 000000000000…, expected"),
-        ("format_version: 9", "format_version: 8", "format version 8, expected 9; calibrate again"),
+        ("format_version: 10", "format_version: 9", "format version 9, expected 10; calibrate again"),
     ):
         with pytest.raises(CalibrationError, match=message):
             Calibration.load(edited(small, tmp_path / "stale.cal", find, new))

@@ -166,9 +166,13 @@ async def running(config: Path, *topics: str) -> AsyncIterator["tuple[Daemon, zm
         with context.socket(zmq.SUB) as subscriber:
             subscriber.setsockopt(zmq.RCVHWM, 0)
             subscriber.setsockopt(zmq.RCVTIMEO, RECEIVE_MS)
-            for topic in topics:
+            # Health comes once a second and shows that the daemon knows the subscriptions.
+            for topic in (*topics, "health"):
                 subscriber.setsockopt(zmq.SUBSCRIBE, topic.encode())
             subscriber.connect(loaded.publish)
+            while (await subscriber.recv_multipart())[0] != b"health":
+                continue
+            subscriber.setsockopt(zmq.UNSUBSCRIBE, b"health")
             yield daemon, subscriber
         daemon.stop()
         await task
@@ -325,12 +329,14 @@ def measure(rig: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         for kind in ("frame", "command", "calibration"):
             (Path(name) / kind).mkdir()
-        ways["calibration"] = trace_calibration(rig, Path(name) / "calibration")
-        ways["frame"] = asyncio.run(trace_frame(rig, Path(name) / "frame"))
-        ways["command"] = asyncio.run(trace_command(rig, Path(name) / "command"))
-    for kind, way in ways.items():
-        print("A {}: {functions} functions in {modules} modules".format(kind, **counts(way)))
-        print(diagram(way), end="\n\n")
+        for kind, trace in (
+            ("calibration", trace_calibration),
+            ("frame", lambda rig, folder: asyncio.run(trace_frame(rig, folder))),
+            ("command", lambda rig, folder: asyncio.run(trace_command(rig, folder))),
+        ):
+            way = ways[kind] = trace(rig, Path(name) / kind)
+            print("A {}: {functions} functions in {modules} modules".format(kind, **counts(way)))
+            print(diagram(way), end="\n\n", flush=True)
     loaded = loaded_by_run()
     return {kind: counts(way) for kind, way in ways.items()} | {
         "shearloop run": {"modules": len(loaded.modules), "lines": loaded.lines}

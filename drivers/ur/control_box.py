@@ -350,7 +350,8 @@ class SampleParser:
         v = _VALUES.unpack_from(data, start)
         tool = _NO_TOOL if size == _PACKAGE_BYTES else _TOOL_VALUES.unpack_from(data, start + _VALUES.size)
         motion = v[0], v[1:7], v[7:13], v[13:19], v[19:25], v[25:31]
-        return RtdeOutputs(*motion, *v[31:39], tool[0], tool[1:4], tool[4:])
+        modes, scalings, script = (v[31], v[32], v[33]), (v[34], v[35]), (v[36], v[37], v[38])
+        return RtdeOutputs(*motion, *modes, *scalings, *script, tool[0], tool[1:4], tool[4:])
 
 
 class RtdeReceiver:

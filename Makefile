@@ -44,7 +44,7 @@ system-packages:
 
 # The whole emulated rig; with RECORDING=FILE one fingertip that plays a recorded stream (.mat).
 demo: demo-python $(VENV)/.installed
-	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--recording '$(RECORDING)')
+	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--play '$(RECORDING)')
 
 # Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards, by themselves,
 # because a robot stops when its computer is busy; they may be repeated twice, and the summary names them. Status 5:

@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.common import parser_of, write_figures
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.daemon.control.loop_inputs import Creep
+from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.torque_controller import TorqueController
 from shearloop.daemon.run_summary import BAND
 from shearloop.drivers.defaults import FRAME_PERIOD_S

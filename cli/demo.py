@@ -28,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--folder", Path, "DIR", text, default=Path("shearloop-demo"))
     parser.add_argument("--prepare", action="store_true", help="only write the files; do not run")
     text = "play this .mat recording on one fingertip, without a robot: k, sigma and the heatmap"
-    add_option(parser, "--recording", Path, "FILE", text)
+    parser.add_argument("--play", "--recording", type=Path, metavar="FILE", help=text)
     parser.epilog = (
         "Builds a bank and calibrations, emulates the whole rig, grips a tool, identifies it, holds 0.10 N·m on it and "
         "lets go. Prints the address of the live page, which needs the extra `view`."
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     init.write_files(folder, {path: content for path, content in files.items() if not (folder / path).exists()})
     if args.prepare:
         try:
-            _prepare(folder, args.folder / "run", calibrated=args.recording is None)
+            _prepare(folder, args.folder / "run", calibrated=args.play is None)
         except KeyboardInterrupt as interrupt:
             # The demo that has started and ended this process says so.
             return interrupt_status(interrupt)
@@ -50,20 +50,20 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.config import load_daemon_config
     from shearloop.daemon.rig import open_settings
 
-    name = "demo.yaml" if args.recording is None else "fingertip_demo.yaml"
-    played = [] if args.recording is None else ["--recording", str(args.recording)]
+    name = "demo.yaml" if args.play is None else "fingertip_demo.yaml"
+    played = [] if args.play is None else ["--play", str(args.play)]
     config = load_daemon_config(folder / name)
     # Mistakes are found before anything is built and served.
     open_settings(config)
-    if args.recording is None and not config.autostart:
+    if args.play is None and not config.autostart:
         raise UserError(
             f"{folder / name} starts nothing by itself: it needs `emulated: true` and `autostart: true`; remove it, "
             "and `shearloop demo` writes it anew"
         )
-    if args.recording is not None:
+    if args.play is not None:
         from shearloop.tools.recordings.matlab_import import read_stream
 
-        read_stream(args.recording)
+        read_stream(args.play)
     print("The demo starts …", flush=True)
     # In a process of its own: the daemon would keep the memory of the fits.
     with running([*SHEARLOOP, "demo", "--prepare", "--folder", str(args.folder), *played]) as process:

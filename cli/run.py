@@ -27,7 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--show", action="store_true", help=text)
     text = "log JSON lines (the default under systemd)"
     parser.add_argument("--json-log", action="store_true", default=None, help=text)
-    add_option(parser, "--recording", Path, "FILE", "let the configuration's EIT emulators play this .mat recording")
+    text = "let the configuration's EIT emulators play this .mat recording"
+    parser.add_argument("--play", "--recording", type=Path, metavar="FILE", help=text)
     add_option(parser, "--record", Path, "DIR", "record everything into files in this folder")
     parser.epilog = (
         "Ends at Ctrl-C, SIGTERM, a closed terminal, `shearloop command stop`, or with the experiment if the "
@@ -79,7 +80,7 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
         # A second daemon is refused before its emulators find their ports taken.
         StopSocket(config.commands, {}, Refusals()).close()
     with ExitStack() as stack:
-        emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
+        emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.play))
         listeners: list[Listener] = [emulated]
         if args.show:
             listeners.append(stack.enter_context(StatusLine(out)) if terminal else partial(print_estimate, out))
@@ -102,15 +103,15 @@ def _config(args: argparse.Namespace) -> "DaemonConfig":
 
     config = load_daemon_config(args.config)
     options = check_emulators(config.emulators, args.config)
-    if args.recording is not None:
+    if args.play is not None:
         from shearloop.tools.recordings.matlab_import import read_stream
 
         boards = [given for given in options if given.device == "eit-kit"]
         if not boards:
-            raise UserError(f"{args.config} has no eit-kit among its `emulators` to play --recording {args.recording}")
+            raise UserError(f"{args.config} has no eit-kit among its `emulators` that --play {args.play} could use")
         for given in boards:
             # Without its frames the daemon would wait forever.
-            read_stream(args.recording, given.side)
+            read_stream(args.play, given.side)
     if args.record is not None:
         config = config.model_copy(update={"recording": RecordingConfig(folder=args.record)})
     return config

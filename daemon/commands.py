@@ -7,7 +7,7 @@ from pathlib import Path
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.experiment_schema import first_motion
-from shearloop.daemon.control.loop_runner import loop_state
+from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.experiment_files import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig, Sensors

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, ValidationInfo, WithJsonSchema, field_validator, model_validator
 
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
-from shearloop.daemon.control.loop_inputs import LoopConfig
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging import addresses
 from shearloop.drivers import ranges
 from shearloop.drivers.defaults import (

@@ -8,11 +8,13 @@ from pathlib import Path
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.control import experiment_check, experiment_schema
+from shearloop.daemon.control.action_executor import Tareable
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.loop_inputs import Creep, TorqueSource
-from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, Tareable, wrench_source
+from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
+from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.experiment_files import ExperimentFiles, read_document, without_mistakes
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.addresses import is_loopback_host

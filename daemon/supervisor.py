@@ -165,3 +165,8 @@ def _facts(reporter: Reporter) -> TaskFacts:
 def resident_memory_mb() -> float:
     """Return the resident memory of this process in megabytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def error_text(error: Exception) -> str:
+    """Return an error's type and message, shortened for messages."""
+    return f"{type(error).__name__}: {error}"[:MAX_ERROR_LENGTH]

@@ -50,7 +50,7 @@ class Parts:
 
 def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulators) -> Parts:
     """Return what each part of the configuration in this file is; opens every file that it names."""
-    from shearloop.daemon.control.loop_inputs import TorqueSource
+    from shearloop.daemon.control.samples import TorqueSource
     from shearloop.daemon.experiment_files import read_document
     from shearloop.daemon.rig import check_experiment, experiment_mistakes, gripper_model
     from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.loop_inputs import Creep
+from shearloop.daemon.control.creep import Creep
 from shearloop.errors import UserError
 from shearloop.tools.evaluate import EstimateTrack, values_of
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, Hold, StepCommand, TrackTorque
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
@@ -19,18 +20,11 @@ from shearloop.daemon.control.experiment_schema import (
     first_motion_before_grip,
 )
 from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
-from shearloop.daemon.control.loop_inputs import (
-    ArmStatus,
-    Creep,
-    GripperStatus,
-    LatestInputs,
-    LoopConfig,
-    TorqueSample,
-    TorqueSource,
-)
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
+from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs, TorqueSample, TorqueSource
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import WristController
+from shearloop.daemon.loop_config import LoopConfig
 
 # A zero that drifted by less than this is taken anew without a question.
 LOADED_NM = 0.05

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
-from shearloop.daemon.control.loop_inputs import LatestInputs, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.daemon.control.samples import LatestInputs, TorqueSample, TorqueSource
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import stale_after_s
 
 # 2.5 periods of their topics.

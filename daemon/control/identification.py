@@ -7,7 +7,8 @@ from statistics import fmean
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
+from shearloop.daemon.control.samples import TorqueSource
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.errors import UserError
 
 # The grid of the torque's lag behind its stamp.

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.identification import ToolModel, window_means
-from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.control.torque_controller import ControllerSettings
+from shearloop.daemon.loop_config import LoopConfig
 
 ComplexArray = NDArray[np.complex128]
 

@@ -33,7 +33,7 @@ from statistics import fmean
 
 import numpy as np
 
-from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.control.samples import TorqueSample
 from shearloop.errors import UserError
 
 # The ramp does not catch up when the loop was late for longer than this.

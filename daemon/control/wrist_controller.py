@@ -6,14 +6,15 @@ from collections import deque
 from shearloop.daemon.control.experiment import ConstantVelocity, Hold, MoveToAngle, TrackTorque, WristSetpoint
 from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
-from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
+from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.control.torque_controller import (
     LONGEST_STEP_NS,
     ControllerSettings,
     TorqueController,
     WristCommand,
 )
+from shearloop.daemon.loop_config import LoopConfig
 
 # Torques that wait for the next wrist angle.
 MOST_PENDING = 64

@@ -17,7 +17,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator

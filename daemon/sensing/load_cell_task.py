@@ -8,7 +8,7 @@ import structlog
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
+from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher

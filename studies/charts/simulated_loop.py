@@ -18,10 +18,11 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.experiment import TrackTorque
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
-from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
 from shearloop.daemon.control.margins import integral_gain
+from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController, WristCommand
 from shearloop.daemon.control.wrist_controller import controller_settings
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.run_summary import BAND, recovered_s
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 

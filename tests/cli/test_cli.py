@@ -267,8 +267,9 @@ def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(number, statu
     assert ran("evaluate", "a.cal", "b.mcap", status=status) == ("", INTERRUPTED)
 
 
-def test_recording_option_needs_an_emulator(config, mistake):
-    said = mistake("run", str(config()), "--recording", "some.mat")
+@pytest.mark.parametrize("option", ["--play", "--recording"])
+def test_a_played_file_needs_an_emulator(option, config, mistake):
+    said = mistake("run", str(config()), option, "some.mat")
     assert "has no eit-kit among its `emulators`" in said
 
 
@@ -446,7 +447,7 @@ def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, t
             assert "`emulators[0].arguments`: eit-kit: " in said
             assert part in said
     known = str(config(emulators=[{"device": "eit-kit"}]))
-    assert "the recording cannot be read" in mistake("run", known, "--recording", str(tmp_path / "none.mat"))
+    assert "the recording cannot be read" in mistake("run", known, "--play", str(tmp_path / "none.mat"))
 
 
 def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, capsys, tmp_path):

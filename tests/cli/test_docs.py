@@ -17,7 +17,7 @@ from shearloop.cli import COMMANDS, command_module
 from shearloop.cli.completion import full_parser
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import STEP_KINDS
-from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.rig import check_experiment
 from shearloop.estimation.estimator_names import ESTIMATORS
 from shearloop.tools.bank_config import load_bank_plan

@@ -103,8 +103,9 @@ def test_ctrl_c_reaches_no_process_of_the_demo(capfd):
     assert process.returncode == -signal.SIGTERM
 
 
-def test_the_demo_refuses_a_recording_that_is_not_there_at_once(tmp_path, mistake):
-    said = mistake("demo", "--folder", tmp_path, "--recording", tmp_path / "none.mat")
+@pytest.mark.parametrize("option", ["--play", "--recording"])
+def test_the_demo_refuses_a_recording_that_is_not_there_at_once(option, tmp_path, mistake):
+    said = mistake("demo", "--folder", tmp_path, option, tmp_path / "none.mat")
     assert "none.mat: the recording cannot be read: No such file" in said
 
 

@@ -6,8 +6,9 @@ import yaml
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import Watched, detect_faults
-from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LatestInputs, LoopConfig, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyMonitor
+from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs, TorqueSource
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.rig import EMULATED_PATIENCE, make_loop, open_settings
 from shearloop.errors import UserError
 from tests.fixtures.daemons import robot_at

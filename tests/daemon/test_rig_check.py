@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
-from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.rig import check_experiment
 from shearloop.errors import UserError
 

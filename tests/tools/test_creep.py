@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.daemon.config import CreepConfig
-from shearloop.daemon.control.loop_inputs import Creep
+from shearloop.daemon.control.creep import Creep
 from shearloop.emulators.scene import Twin, TwinSettings
 from shearloop.errors import UserError
 from shearloop.estimation import Estimate, FrameSeries

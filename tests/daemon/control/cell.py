@@ -14,8 +14,9 @@ from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.gripper_task import OPENING
-from shearloop.daemon.control.loop_inputs import GripperStatus, LoopConfig, TorqueSample
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
+from shearloop.daemon.control.samples import GripperStatus, TorqueSample
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, MoveLinear, RobotState, WristSpeed
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm, Flight

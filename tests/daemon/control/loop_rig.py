@@ -9,8 +9,9 @@ import numpy as np
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import Action, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
-from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.daemon.control.samples import ArmStatus, GripperStatus, TorqueSample, TorqueSource
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.emulators.scene import Twin, TwinSettings
 
 TICK_S = 0.008

@@ -5,16 +5,11 @@ import pytest
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, Grasp, Watched, compared_for_s, detect_faults
-from shearloop.daemon.control.loop_inputs import (
-    ArmStatus,
-    GripperStatus,
-    LatestInputs,
-    LoopConfig,
-    TorqueSample,
-    TorqueSource,
-)
-from shearloop.daemon.control.loop_runner import PUBLISH_EVERY, wrench_source
+from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.safety import TABLE, Fault, FaultCode, Response
+from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs, TorqueSample, TorqueSource
+from shearloop.daemon.control.state_publisher import PUBLISH_EVERY
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.drivers.ur.control_box import SampleAge
 
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)

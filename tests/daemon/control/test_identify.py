@@ -15,7 +15,8 @@ from shearloop.daemon.control.identification import (
     StiffnessExcitation,
     identify,
 )
-from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSource
+from shearloop.daemon.control.samples import TorqueSource
+from shearloop.daemon.loop_config import LoopConfig
 
 WINDOW_S = 0.5412
 

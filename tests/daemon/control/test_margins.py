@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shearloop.daemon.control.identification import ToolModel
-from shearloop.daemon.control.loop_inputs import LoopConfig
 from shearloop.daemon.control.margins import (
     MOST_GAIN,
     LoopModel,
@@ -27,6 +26,7 @@ from shearloop.daemon.control.margins import (
     wrist_response,
 )
 from shearloop.daemon.control.torque_controller import ControllerSettings
+from shearloop.daemon.loop_config import LoopConfig
 
 from .conftest import DEFAULTS
 

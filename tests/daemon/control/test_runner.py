@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from shearloop.daemon.control.action_executor import along_tool
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, along_tool
+from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.drivers.errors import DriverError

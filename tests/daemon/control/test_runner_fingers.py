@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from shearloop.daemon.control.loop_inputs import LoopConfig
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import Stop
 from tests.daemon.control.cell import GRIP, Cell, driven, experiment, no_tick

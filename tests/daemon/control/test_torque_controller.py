@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.control.torque_controller import AngleHistory, ControllerReason, JumpDetector, TorqueController
 from shearloop.errors import UserError
 

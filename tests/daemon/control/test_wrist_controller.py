@@ -5,9 +5,10 @@ import pytest
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import MoveToAngle, TrackTorque
 from shearloop.daemon.control.identification import ToolModel
-from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample, TorqueSource
 from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
+from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.control.wrist_controller import WristController
+from shearloop.daemon.loop_config import LoopConfig
 from tests.daemon.control.cell import Cell, driven
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS
 

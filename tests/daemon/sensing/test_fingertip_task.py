@@ -12,7 +12,7 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
-from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, DeadElectrodes, FingertipPipeline, FingertipTask
 from shearloop.daemon.sensing.frame_estimator import COMBINED

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from shearloop.daemon.app import Daemon
-from shearloop.daemon.control.loop_runner import tare_all
+from shearloop.daemon.control.action_executor import tare_all
 from shearloop.emulators.skin import SkinInstruments
 from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.errors import ActionError

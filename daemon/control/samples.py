@@ -1,4 +1,4 @@
-"""Inputs of the control loop: its settings, the latest torques and device states with times, and the creep of a gel."""
+"""What the control loop takes: torque samples, the states of arm and gripper with times, and the latest of each."""
 
 import math
 from bisect import bisect_left
@@ -6,37 +6,11 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from pydantic import Field
-
-from shearloop.daemon.config_file import ConfigModel
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
 # Torques between two ticks; more come only while the loop stands still.
 MOST_UNJUDGED = 256
-
-
-class LoopConfig(ConfigModel):
-    """Settings of the closed loop; docs/faults.md lists what each fault leads to."""
-
-    allowed_noise_nm: float = Field(default=0.0025, gt=0, le=1, description="true torque's std that noise may cause")
-    kp: float | None = Field(default=None, gt=0, le=1, description="fixes the gain, which else follows from the noise")
-    deadband_nm: float = Field(default=0.001, ge=0, le=1, description="error below which the wrist rests")
-    disagreement_nm: float = Field(default=0.05, gt=0, le=5, description="largest difference of two torque sources")
-    max_innovation_nm: float = Field(default=0.08, gt=0, le=5, description="largest error of the expected torque")
-    max_offset_drift_nm: float = Field(default=0.06, gt=0, le=5, description="drift at a fixed angle: slip")
-    wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14, description="largest wrist speed of the loop")
-    stale_after_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")
-    wrist_acceleration_rad_per_s2: float = Field(default=4.0, gt=0, le=1000, description="given to the robot")
-    angle_bandwidth_per_s: float = Field(default=5.0, gt=0, le=80, description="how fast the wrist approaches an angle")
-    torque_bandwidth_per_s: float = Field(default=4.0, gt=0, le=30, description="how fast it approaches a torque")
-    actuation_s: float = Field(default=0.02, ge=0, le=0.2, description="from sending a speed until the angle shows it")
-    gain_margin: float = Field(default=2.0, ge=1, le=100, description="least gain margin, as a factor")
-    phase_margin_deg: float = Field(default=45.0, ge=0, le=90, description="least phase margin")
-
-    @property
-    def planned_acceleration_rad_per_s2(self) -> float:
-        """The acceleration that controller and identification plan with; the robot keeps twice as much in reserve."""
-        return 0.5 * self.wrist_acceleration_rad_per_s2
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,34 +34,6 @@ class TorqueSample:
         if self.torque_nm is not None and not math.isfinite(self.torque_nm):
             object.__setattr__(self, "reason", f"it measured {self.torque_nm}, which is no number")
             object.__setattr__(self, "torque_nm", None)
-
-
-@dataclass(slots=True)
-class Creep:
-    """Converts shear into torque, reading by reading; `share` is the final loss of a held torque.
-
-    Under a held twist the gel's shear stays and its torque falls; a fingertip measures the shear. With γ the shear, as
-    the torque on a fresh gel, the torque is γ − share·c. Here c follows γ with a time constant: one Maxwell element in
-    parallel with a spring (the standard linear solid; Ferry, Viscoelastic Properties of Polymers, 1980, chapter 1).
-    """
-
-    share: float
-    time_s: float
-    crept_nm: float = 0.0
-    _t_ns: int | None = None
-    _shear_nm: float = 0.0
-
-    def torque_nm(self, shear_nm: float, t_ns: int) -> float:
-        """Return the torque of a reading at t_ns (monotonic clock)."""
-        if self._t_ns is not None and t_ns > self._t_ns:
-            decay = -math.expm1(-(t_ns - self._t_ns) / 1e9 / self.time_s)
-            self.crept_nm += (0.5 * (self._shear_nm + shear_nm) - self.crept_nm) * decay
-        self._t_ns, self._shear_nm = t_ns, shear_nm
-        return shear_nm - self.share * self.crept_nm
-
-    def reset(self) -> None:
-        """Restart with a gel at rest, after a release or a tare."""
-        self.crept_nm, self._t_ns, self._shear_nm = 0.0, None, 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,70 @@
+"""Sends wrist speeds and stops to the robot's process, and tells the control loop what was sent."""
+
+import asyncio
+from dataclasses import dataclass
+
+import structlog
+
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.stop_timeline import StopTimeline
+from shearloop.daemon.supervisor import error_text
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import CommandReply, Stop, WristSpeed
+
+
+@dataclass(slots=True)
+class CommandSender:
+    """Sends wrist velocities and stops to the robot's process, and reports the results to the control loop."""
+
+    robot: UrRobot
+    control_loop: ControlLoop
+    stops: StopTimeline
+    clock: Clock
+    # The speed that the robot's process accepted last.
+    sent_rad_per_s: float = 0.0
+    # Commands that wait for their replies.
+    unanswered: int = 0
+
+    @property
+    def stop_command(self) -> Stop:
+        """The stop of the arm, including a straight move."""
+        return Stop(self.control_loop.config.wrist_acceleration_rad_per_s2)
+
+    def stop(self) -> None:
+        """Stop the arm."""
+        self._send(self.stop_command)
+
+    def turn(self, rad_per_s: float, decided_ns: int) -> None:
+        """Turn the wrist, unless it stands still already or a command waits for its reply."""
+        if not self.unanswered and (rad_per_s or self.sent_rad_per_s):
+            acceleration_rad_per_s2 = self.control_loop.config.wrist_acceleration_rad_per_s2
+            self._send(WristSpeed(rad_per_s, acceleration_rad_per_s2, decided_ns))
+
+    def _send(self, command: WristSpeed | Stop) -> None:
+        self.unanswered += 1
+        try:
+            self.robot.send(command).add_done_callback(self._on_reply)
+        except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
+            self.unanswered -= 1
+            self._fail(error)
+
+    def _on_reply(self, replied: asyncio.Future[CommandReply]) -> None:
+        self.unanswered -= 1
+        try:
+            reply = replied.result()
+            if not reply.accepted:
+                unanswered = self.robot.state is None
+                code = FaultCode.COMMAND_UNANSWERED if unanswered else FaultCode.COMMAND_REFUSED
+                self.control_loop.on_fault(code, reply.refusal)
+            if isinstance(reply.sent, Stop):
+                self.stops.on_sent(self.clock.now_ns())
+            self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
+            self.control_loop.on_speed_sent(self.sent_rad_per_s)
+        except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        structlog.get_logger().exception("a command to the robot failed")
+        self.control_loop.on_fault(FaultCode.TASK_DIED, f"loop: {error_text(error)}")

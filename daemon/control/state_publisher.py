@@ -1,0 +1,118 @@
+"""Publishes the states of robot and loop: `robot.state`, `loop.state` and `loop.stop`."""
+
+import asyncio
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import structlog
+
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.experiment import Experiment
+from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.drivers.ur.messages import RobotState
+
+# Every fifth state is published, and its wrench is a torque sample: 25 a second.
+PUBLISH_EVERY = 5
+LOOP_STATE_PERIOD_S = 1.0
+# The columns of `robot.state` that the robot's state has under the same name.
+_SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s"}
+
+
+@dataclass(slots=True)
+class StatePublisher:
+    """Publishes the states of robot and loop, and wakes those who wait for a change of the loop's."""
+
+    publisher: Publisher
+    control_loop: ControlLoop
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+    # The experiment whose end was published last.
+    ended: Experiment | None = None
+    _block: int = -1
+    _key: tuple[object, ...] = ()
+    _hold: int = 0
+    _published_ns: int = 0
+
+    def publish_robot(self, state: RobotState) -> bool:
+        """Publish every fifth state; return whether it was this one."""
+        if (block := state.cycle // PUBLISH_EVERY) == self._block:
+            return False
+        self._block = block
+        same: dict[str, Any] = {name: getattr(state, name) for name in _SAME}
+        age_s = state.age_ns / 1e9
+        self.publisher.publish(RobotStateMessage(source="robot", joints_rad=state.q_rad, age_s=age_s, **same))
+        return True
+
+    def publish_loop(self, sent_rad_per_s: float, now_ns: int) -> None:
+        """Publish the loop's state at a change and once a second."""
+        status, experiment = self.control_loop.status, self.control_loop.experiment
+        key = (
+            status.phase,
+            tuple(fault.code for fault in status.decision.faults),
+            status.velocity.reasons,
+            experiment and experiment.step_number,
+        )
+        hold = experiment.command.hold_number if experiment is not None else 0
+        unchanged = (key, hold) == (self._key, self._hold)
+        if unchanged and now_ns - self._published_ns < LOOP_STATE_PERIOD_S * 1e9:
+            return
+        if key != self._key:
+            structlog.get_logger().info(
+                "loop", phase=status.phase, activity=status.activity, reasons=" ".join(status.decision.reasons)
+            )
+        self._key, self._hold, self._published_ns = key, hold, now_ns
+        self.publisher.publish(loop_state(self.control_loop, sent_rad_per_s, now_ns))
+        if experiment is not None and not experiment.running:
+            self.ended = experiment
+        self._notify()
+
+    def publish_stop(self, stop: LoopStop | None) -> None:
+        """Publish the times of a stop, if there is one."""
+        if stop is not None:
+            self.publisher.publish(stop)
+            self._notify()
+
+    def _notify(self) -> None:
+        # Wake the present waiters only.
+        self.changed.set()
+        self.changed.clear()
+
+
+def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) -> LoopState:
+    """Return the `loop.state` message at now_ns."""
+    status, experiment = control_loop.status, control_loop.experiment
+    driving = experiment.file.torque_source if experiment is not None else ""
+    latest = control_loop.inputs.torques.get(driving)
+    controller = control_loop.wrist.controller
+    tool = control_loop.wrist.tool
+    return LoopState(
+        source="loop",
+        t_mono_ns=now_ns,
+        phase=status.phase,
+        run=control_loop.runs,
+        experiment=experiment.file.name if experiment is not None else "",
+        step=experiment.step_number if experiment is not None else 0,
+        steps=len(experiment.file.steps) if experiment is not None else 0,
+        step_name=experiment.step.do if experiment is not None else "",
+        slices=experiment.file.slices or "" if experiment is not None else "",
+        hold=experiment.command.hold_number if experiment is not None else 0,
+        activity=status.activity,
+        progress=experiment.progress if experiment is not None else 0.0,
+        remaining_s=experiment.remaining_s if experiment is not None else 0.0,
+        tool_mm=experiment.file.tool_mm if experiment is not None else None,
+        torque_source=driving,
+        torque_nm=latest.torque_nm if latest is not None else None,
+        set_point_nm=controller.set_point_nm if controller is not None else None,
+        ramp_nm=controller.ramp_nm if controller is not None else None,
+        filtered_torque_nm=controller.torque_nm if controller is not None else None,
+        filtered_torque_std_nm=controller.torque_std_nm if controller is not None else None,
+        stiffness_nm_per_rad=tool.stiffness_nm_per_rad if tool is not None else None,
+        delay_s=tool.age_s + tool.significant_lag_s if tool is not None else None,
+        noise_nm=tool.noise_nm if tool is not None else None,
+        speed_command_rad_per_s=status.velocity.speed_rad_per_s,
+        speed_sent_rad_per_s=sent_rad_per_s,
+        response=status.decision.response.name.lower().replace("_", " "),
+        cause=next(iter(status.decision.reasons), ""),
+        faults=status.decision.codes,
+        reasons=" ".join((*status.decision.reasons, *status.velocity.reasons)),
+    )

@@ -1,0 +1,29 @@
+"""The settings of the closed loop, `loop` in the configuration."""
+
+from pydantic import Field
+
+from shearloop.daemon.config_file import ConfigModel
+
+
+class LoopConfig(ConfigModel):
+    """Settings of the closed loop; docs/faults.md lists what each fault leads to."""
+
+    allowed_noise_nm: float = Field(default=0.0025, gt=0, le=1, description="true torque's std that noise may cause")
+    kp: float | None = Field(default=None, gt=0, le=1, description="fixes the gain, which else follows from the noise")
+    deadband_nm: float = Field(default=0.001, ge=0, le=1, description="error below which the wrist rests")
+    disagreement_nm: float = Field(default=0.05, gt=0, le=5, description="largest difference of two torque sources")
+    max_innovation_nm: float = Field(default=0.08, gt=0, le=5, description="largest error of the expected torque")
+    max_offset_drift_nm: float = Field(default=0.06, gt=0, le=5, description="drift at a fixed angle: slip")
+    wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14, description="largest wrist speed of the loop")
+    stale_after_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")
+    wrist_acceleration_rad_per_s2: float = Field(default=4.0, gt=0, le=1000, description="given to the robot")
+    angle_bandwidth_per_s: float = Field(default=5.0, gt=0, le=80, description="how fast the wrist approaches an angle")
+    torque_bandwidth_per_s: float = Field(default=4.0, gt=0, le=30, description="how fast it approaches a torque")
+    actuation_s: float = Field(default=0.02, ge=0, le=0.2, description="from sending a speed until the angle shows it")
+    gain_margin: float = Field(default=2.0, ge=1, le=100, description="least gain margin, as a factor")
+    phase_margin_deg: float = Field(default=45.0, ge=0, le=90, description="least phase margin")
+
+    @property
+    def planned_acceleration_rad_per_s2(self) -> float:
+        """The acceleration that controller and identification plan with; the robot keeps twice as much in reserve."""
+        return 0.5 * self.wrist_acceleration_rad_per_s2

@@ -330,9 +330,9 @@ def measure(rig: Path) -> dict[str, Any]:
         for kind in ("frame", "command", "calibration"):
             (Path(name) / kind).mkdir()
         for kind, trace in (
-            ("calibration", trace_calibration),
             ("frame", lambda rig, folder: asyncio.run(trace_frame(rig, folder))),
             ("command", lambda rig, folder: asyncio.run(trace_command(rig, folder))),
+            ("calibration", trace_calibration),
         ):
             way = ways[kind] = trace(rig, Path(name) / kind)
             print("A {}: {functions} functions in {modules} modules".format(kind, **counts(way)))

@@ -97,7 +97,7 @@ class SkinLoop:
             gain_margin=1.0, phase_margin_deg=0.0,
         )  # fmt: skip
         self._case = case
-        self.brain = ControlLoop(config, {SKIN: replace(SOURCE, has_friction_band=case.band)}, ())
+        self.control_loop = ControlLoop(config, {SKIN: replace(SOURCE, has_friction_band=case.band)}, ())
         self._speeds = deque([0.0] * ACTUATION_TICKS)
         self._angle_rad = 0.0
         self._tick = self._samples = 0
@@ -114,8 +114,8 @@ class SkinLoop:
         """Run the experiment to its end; return how it ended."""
         for _ in range(50):
             self._step()
-        why = self.brain.start(_experiment(self._case.hold_s), self.t_ns)
-        experiment = self.brain.experiment
+        why = self.control_loop.start(_experiment(self._case.hold_s), self.t_ns)
+        experiment = self.control_loop.experiment
         if experiment is None:
             raise RuntimeError(why)
         while experiment.running and self._tick * TICK_S < most_s:
@@ -131,19 +131,19 @@ class SkinLoop:
             self._samples += 1
             self._measure()
         while self._due and self._due[0][0] <= self.t_ns:
-            self.brain.on_torque(self._due.pop(0)[1])
+            self.control_loop.on_torque(self._due.pop(0)[1])
             if self._zero_begun and self.estimator.zero is not None:
                 self._zero_begun = False
-                self.brain.on_action_ended()
-        self.brain.on_arm(ArmStatus(self._angle_rad, self.t_ns))
-        orders = self.brain.tick(self.t_ns)
+                self.control_loop.on_action_ended()
+        self.control_loop.on_arm(ArmStatus(self._angle_rad, self.t_ns))
+        orders = self.control_loop.tick(self.t_ns)
         speed = 0.0 if orders.ends_motion else orders.wrist_rad_per_s
-        self.brain.on_speed_sent(speed)
+        self.control_loop.on_speed_sent(speed)
         self._speeds.append(speed)
         if isinstance(orders.action, TareStep):
             self.estimator.tare()
             self._zero_begun = True
-        controller = self.brain.wrist.controller
+        controller = self.control_loop.wrist.controller
         wanted_nm = controller.set_point_nm if controller is not None else None
         self.trace.truth_n.append(self.skin.shear_n)
         self.trace.set_point_n.append(math.nan if wanted_nm is None else wanted_nm / RADIUS_MM * 1e3)

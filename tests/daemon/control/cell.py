@@ -264,7 +264,7 @@ class Cell:
 
 
 def no_tick(*_: object) -> ControlOutput:
-    """Die, in place of the brain's `tick`."""
+    """Die, in place of the control loop's `tick`."""
     raise ZeroDivisionError("a tick went wrong")
 
 

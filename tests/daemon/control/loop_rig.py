@@ -1,4 +1,4 @@
-"""The brain on a simulated rig, stepped in the loop's own ticks."""
+"""The control loop on a simulated rig, stepped in the loop's own ticks."""
 
 from collections import deque
 from dataclasses import replace

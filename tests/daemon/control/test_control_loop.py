@@ -1,4 +1,4 @@
-"""The brain when all is well: whole experiments, and what an operator may ask of one."""
+"""The control loop when all is well: whole experiments, and what an operator may ask of one."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""A loop that is late or was away: over the real pilot, with an arm and a gripper of this process."""
+"""A loop that is late or was away: over the real worker, with an arm and a gripper of this process."""
 
 from typing import Any
 

@@ -52,7 +52,7 @@ def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_p
 
     def drifting() -> tuple[float, float]:
         r1, r2 = measured()
-        controller = loop.brain.wrist.controller
+        controller = loop.control_loop.wrist.controller
         if controller is not None and not begin:
             begin.append(loop.t_ns)
         seconds = (loop.t_ns - begin[0]) / 1e9 - 8.0 if begin else 0.0

@@ -33,7 +33,7 @@ _UNREAD_BYTES = 4096
 _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
-    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence"),
+    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "protect-abrupt-ends"),
     *(
         "registers-in-use",
         "local-control",
@@ -111,6 +111,8 @@ class Controller:
                 self.robot.emergency_stop()
             case ["release"]:
                 self.robot.release()
+            case ["protect-abrupt-ends"]:
+                self.robot.protects_abrupt_ends = True
             case ["drop-rtde"]:
                 # The other ports live on.
                 for writer in list(self._rtde):

@@ -15,7 +15,7 @@ import script_client
 
 from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge, ScriptReadiness, command_dashboard
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, MoveLinear, RobotLostError, RtdeSample, WristSpeed
-from shearloop.drivers.ur.script import NO_MOTION_S, guard_script
+from shearloop.drivers.ur.script import NO_MOTION_TICKS, guard_script
 from shearloop.drivers.ur.script_port import ScriptPort
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -57,7 +57,7 @@ class UrArm:
         # A linear move was begun, and the wrist has not turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
-        self._script_readiness = ScriptReadiness(self._receiver, 1.0 / settings.watchdog_hz)
+        self._script_readiness = ScriptReadiness(self._receiver, settings.command_timeout_s)
 
     def read(self) -> RtdeSample:
         """Return the controller's latest sample and its age."""
@@ -144,11 +144,16 @@ class UrArm:
 
     def withdraw_deadline(self) -> None:
         """Let no motion go on, also not when a program that is paused now is resumed."""
-        self._receiver.write_deadline(NO_MOTION_S)
+        self._receiver.write_deadline(NO_MOTION_TICKS)
 
     def _write_deadline(self, left_s: float) -> None:
         # The latest sample is older than now, so that the deadline is never late.
-        self._receiver.write_deadline(self._receiver.latest().script_s + left_s)
+        sample = self._receiver.latest()
+        if sample.script_step_s > 0:
+            self._receiver.write_deadline(sample.script_ticks + int(left_s / sample.script_step_s))
+        else:
+            # No program has run yet.
+            self.withdraw_deadline()
 
     def _send_once(self, call: Callable[..., object], *arguments: object, **options: object) -> bool:
         """Send a command that the script carries out once."""

@@ -168,9 +168,10 @@ class RtdeOutputs:
     safety_mode: int
     runtime_state: int
     speed_scaling: float
-    # Of the control script: 1 when ready, 2 when done with a command; and its own clock.
+    # Of the control script: 1 when ready, 2 when done with a command; its clock, and the time of one tick.
     script_state: int
-    script_s: float
+    script_ticks: int
+    script_step_s: float
     # What is set at the pendant, at the flange; NaN where the controller does not report it.
     payload_kg: float
     payload_cog_m: Three

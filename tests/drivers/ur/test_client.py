@@ -24,8 +24,8 @@ pytestmark = pytest.mark.real_time
 
 pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
 
-# The promise for a twist whose client dies: the robot has stopped.
-STOPPED_WITHIN_S = 0.2
+# A twist whose client dies: its deadline in these tests, and the time to brake.
+STOPPED_WITHIN_S = settings_for("a-robot").standstill_s
 
 
 async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5) -> None:

@@ -179,6 +179,8 @@ class Arm:
         self._tool = np.eye(4) if tool is None else tool
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Speed | LinearMove | None = None
+        # The pendant's speed slider, a factor on commanded speeds.
+        self.speed_slider = 1.0
         self._framed_q_rad, self._last_frame = self.q_rad, tool_frames(self.q_rad, self._tool)[-1]
         self._plant = plant
         self._wrench = np.zeros(6)
@@ -213,10 +215,11 @@ class Arm:
 
     def turn(self, target_rad_per_s: Vector, acceleration: float) -> None:
         """Turn towards these joint speeds from now on."""
-        self.motion = Speed(target_rad_per_s, acceleration)
+        self.motion = Speed(self.speed_slider * target_rad_per_s, acceleration)
 
     def move_to(self, pose: Vector, speed: float, acceleration: float) -> None:
         """Begin a linear move."""
+        speed *= self.speed_slider
         self.motion = LinearMove(self._frame, frame_of_pose(pose), speed, acceleration, self._tool)
 
     def halt(self, deceleration: float) -> None:

@@ -1,4 +1,4 @@
-"""The loop's task over the real worker, with an arm and a gripper of this process: what it does when things go wrong."""
+"""The loop's task over the real worker, with an arm and a gripper of this process when things go wrong."""
 
 import asyncio
 from typing import Any

@@ -237,6 +237,7 @@ class LoopStop(Message):
 
     experiment: str = column("", "name of the experiment")
     cause: str = column("", "why it stopped, in sentences")
+    faults: str = column("", "codes of the faults that stopped it, separated by commas, the cause's first")
     response: str = column("", "the safety response")
     decided_after_s: float = column("s", "from the measurement or request that caused it to the decision")
     sent_after_s: float | None = column("s", "until the robot's process had sent the stop; nil if it did not answer")

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import platform
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -104,8 +105,11 @@ class HealthReporter:
     clock: Clock
     # Every device is emulated.
     emulated: bool = False
-    # Why `tare` is refused now, or None.
+    rig: str = ""
+    # Why each of these commands is refused now, or None.
     tare_refusal: Callable[[], str | None] = lambda: None
+    start_refusal: Callable[[], str | None] = lambda: None
+    release_refusal: Callable[[], str | None] = lambda: None
     reporters: dict[str, Reporter] = field(default_factory=dict)
 
     def tasks(self) -> dict[str, TaskFacts]:
@@ -144,8 +148,12 @@ class HealthReporter:
                 source="daemon",
                 t_mono_ns=self.clock.now_ns(),
                 tasks=self.tasks(),
+                host=platform.node(),
+                rig=self.rig,
                 emulated=self.emulated,
                 tare_refusal=self.tare_refusal() or "",
+                start_refusal=self.start_refusal() or "",
+                release_refusal=self.release_refusal() or "",
                 loop_lag_s=lag_s,
                 memory_mb=resident_memory_mb(),
                 cpu_percent=100.0 * used_s / passed_s,

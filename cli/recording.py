@@ -58,13 +58,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json(export)
     summary = "send a recording through the same estimators again, as if live"
     replay.configure(add_action(parts, "replay", summary, replay.run))
-    imported = parts.add_parser("import", help="import other formats", description="Import other formats.")
+    summary = "import other formats"
+    imported = parts.add_parser("import", help=summary, description=summary, epilog=PAPERS_RECORDINGS)
     formats = imported.add_subparsers(dest="format", metavar="FORMAT", required=True)
     mat = add_action(formats, "mat", "import the paper's MATLAB streams", _import)
     add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
     add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
     add_json(mat)
-    imported.epilog = PAPERS_RECORDINGS
 
 
 def _list(args: argparse.Namespace) -> int:

@@ -80,9 +80,11 @@ class Daemon:
             self.health = HealthReporter(self.publisher, self.supervisor, clock, config.emulated, config.name)
             self.sensors, self._rig = build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
             if self._rig is not None:
-                self.health.tare_refusal = self._rig.control_loop.tare_refusal
-                self.health.start_refusal = self._rig.runner.start_refusal
-                self.health.release_refusal = self._rig.runner.release_refusal
+                self.health.refusals |= {
+                    "tare": self._rig.control_loop.tare_refusal,
+                    "start": self._rig.runner.start_refusal,
+                    "release": self._rig.runner.release_refusal,
+                }
             self._experiment: ConfiguredExperiment | None = None
             if config.experiment is not None and self._rig is not None:
                 daemon_end = self._end if config.stop_when_done else None

@@ -1,7 +1,7 @@
 """The rig: builds sensors, gripper, robot and control loop from the configuration, and checks its experiment."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -42,6 +42,11 @@ from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
+
+# An emulated rig cannot hurt: its deadlines are longer by this factor, so that it survives a busy computer.
+EMULATED_PATIENCE = 10.0
+# A torque of an emulated sensor is fresh for this long.
+EMULATED_STALE_S = 5.0
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -98,7 +103,19 @@ def open_settings(config: DaemonConfig) -> UrSettings | None:
             f"{config.robot}: `host: {settings.host}` is not this computer, and the configuration says "
             "`emulated: true`: take that out for a real robot, or give 127.0.0.1 for an emulated one"
         )
-    return settings
+    return patient(settings) if config.emulated else settings
+
+
+def patient(settings: UrSettings) -> UrSettings:
+    """Return the settings of an emulated robot, with deadlines that fit a busy computer."""
+    return replace(
+        settings,
+        watchdog_hz=settings.watchdog_hz / EMULATED_PATIENCE,
+        command_timeout_s=EMULATED_PATIENCE * settings.command_timeout_s,
+        silence_timeout_s=EMULATED_PATIENCE * settings.silence_timeout_s,
+        state_timeout_s=1.0,
+        hang_timeout_s=10.0,
+    )
 
 
 def make_loop(
@@ -114,6 +131,9 @@ def make_loop(
         name: min(getattr(config.loop, name), getattr(robot.limits, name).inner)
         for name in ("wrist_speed_rad_per_s", "wrist_acceleration_rad_per_s2")
     }
+    patience = EMULATED_PATIENCE if config.emulated else 1.0
+    if config.emulated:
+        limited["stale_after_s"] = max(config.loop.stale_after_s, EMULATED_STALE_S)
     loop = config.loop.model_copy(update=limited)
     required = ("robot", "gripper") if config.gripper is not None else ("robot",)
     gels = {
@@ -121,7 +141,7 @@ def make_loop(
         for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
         if fingertip is not None and fingertip.creep is not None
     }
-    return ControlLoop(loop, sources, required, gels, dead_tasks)
+    return ControlLoop(loop, sources, required, gels, dead_tasks, patience)
 
 
 def make_gripper(config: GripperConfig, loop: ControlLoop, publisher: Publisher) -> GripperTask:
@@ -240,7 +260,7 @@ def build_rig(
     loop = make_loop(config, settings, sources, supervisor.dead)
     gripper = make_gripper(config.gripper, loop, publisher) if config.gripper is not None else None
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
-    robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)))
+    robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), warns=not config.emulated)
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, settings.limits, gripper_model(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}

@@ -30,17 +30,22 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
 # Emulated devices have these faults on command, or because their computer is too busy for them.
-_LATE_FAULTS = (
-    FaultCode.ESTIMATE_STALE,
-    FaultCode.STATE_STALE,
-    FaultCode.DEVICE_LOST,
-    FaultCode.ROBOT_LOST,
-    FaultCode.ROBOT_BLOCKED,
-    FaultCode.DAEMON_PAUSED,
-    FaultCode.LOOP_LATE,
-    FaultCode.STEP_OVERDUE,
+_LATE_FAULTS = frozenset(
+    code.text
+    for code in (
+        FaultCode.ESTIMATE_STALE,
+        FaultCode.STATE_STALE,
+        FaultCode.DEVICE_LOST,
+        FaultCode.ROBOT_LOST,
+        FaultCode.ROBOT_BLOCKED,
+        FaultCode.DAEMON_PAUSED,
+        FaultCode.LOOP_LATE,
+        FaultCode.STEP_OVERDUE,
+    )
 )
-_TOO_BUSY = "  The rig is emulated, and this computer was too busy for it: close other programs and run it again."
+_TOO_BUSY = "This computer was too busy for the emulated rig: close other programs and run it again."
+# Stops that a person asked for: they are no error, and need no cure.
+_ASKED_FOR = frozenset((FaultCode.OPERATOR_STOP.text, FaultCode.DAEMON_ENDED.text))
 # The time of each disturbance in ns, and its description.
 _Events: TypeAlias = Sequence[tuple[int, str]]
 
@@ -125,8 +130,8 @@ class RunSummary:
             self._run = None
             rig = self._emulated
             lines = list(_lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent))
-            if rig is not None and phase != "done" and _came_late(content["activity"]):
-                lines.append(_TOO_BUSY)
+            if rig is not None and phase != "done" and _LATE_FAULTS.intersection(_codes(content)):
+                lines.insert(0, _TOO_BUSY)
             self.text = ""
             self._add("\n".join(lines))
 
@@ -136,11 +141,9 @@ class RunSummary:
             self._out.write(f"\n{printable(text)}\n\n")
 
 
-def _came_late(reason: str) -> bool:
-    """Return whether the reason of a stop has a fault that a busy computer causes on an emulated rig."""
-    sentences = (fault.value.sentence.partition(":")[0] for fault in _LATE_FAULTS)
-    # The fault of a wrist that was held for too long lists the others by their names.
-    return any(text in reason for text in (*sentences, *(fault.text for fault in _LATE_FAULTS)))
+def _codes(content: Mapping[str, Any]) -> list[str]:
+    """Return the codes of the faults of a `loop.state`, the cause's first."""
+    return list(filter(None, content["faults"].split(", ")))
 
 
 def stop_sentence(content: Mapping[str, Any]) -> str:
@@ -191,10 +194,12 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
 
 def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[str]:
     done = run.last["phase"] == "done"
-    ended, took_s = "done" if done else "STOPPED before its end", _elapsed_s(run.first, run.last)
+    took_s, asked_for = _elapsed_s(run.first, run.last), bool(_ASKED_FOR.intersection(_codes(run.last)[:1]))
+    ended = "done" if done else "stopped as asked" if asked_for else "STOPPED before its end"
     yield f"What happened: {run.first['experiment']!r} was {ended}, after {took_s:.0f} s."
     if not done:
-        yield f"  {run.last['activity']}"
+        # The cause alone: the message has every reason.
+        yield f"  {run.last['activity'] if asked_for else run.last['cause'] or run.last['activity']}"
     for step in run.steps:
         took_s = (step.to_ns - step.from_ns) / 1e9
         details = {"identify": run.identified, "twist": f"   {counted(step.holds, 'angle')} held"}.get(step.name, "")

@@ -106,10 +106,8 @@ class HealthReporter:
     # Every device is emulated.
     emulated: bool = False
     rig: str = ""
-    # Why each of these commands is refused now, or None.
-    tare_refusal: Callable[[], str | None] = lambda: None
-    start_refusal: Callable[[], str | None] = lambda: None
-    release_refusal: Callable[[], str | None] = lambda: None
+    # Why each of some commands is refused now, or None.
+    refusals: dict[str, Callable[[], str | None]] = field(default_factory=dict)
     reporters: dict[str, Reporter] = field(default_factory=dict)
 
     def tasks(self) -> dict[str, TaskFacts]:
@@ -118,6 +116,9 @@ class HealthReporter:
         for name, reporter in self.reporters.items():
             gathered[name] = {**gathered.get(name, {}), **_facts(reporter)}
         return gathered
+
+    def _refusal(self, command: str) -> str:
+        return (self.refusals[command]() or "") if command in self.refusals else ""
 
     def publish_end(self, *, finished: bool, summary: str) -> None:
         """Publish that the daemon ends, as its last message."""
@@ -151,9 +152,9 @@ class HealthReporter:
                 host=platform.node(),
                 rig=self.rig,
                 emulated=self.emulated,
-                tare_refusal=self.tare_refusal() or "",
-                start_refusal=self.start_refusal() or "",
-                release_refusal=self.release_refusal() or "",
+                tare_refusal=self._refusal("tare"),
+                start_refusal=self._refusal("start"),
+                release_refusal=self._refusal("release"),
                 loop_lag_s=lag_s,
                 memory_mb=resident_memory_mb(),
                 cpu_percent=100.0 * used_s / passed_s,

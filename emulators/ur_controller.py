@@ -2,6 +2,8 @@
 
 import asyncio
 import re
+import socket
+import struct
 import time
 from collections.abc import AsyncIterator, Collection
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
@@ -23,11 +25,25 @@ BANNER = "Connected: Universal Robots Dashboard Server"
 _ROBOT_MODES = {MODE_POWER_OFF: "POWER_OFF", MODE_IDLE: "IDLE", MODE_RUNNING: "RUNNING"}
 # What changes the robot needs remote control; UR's words differ from version to version.
 _CONTROLS = ("power on", "brake release", "unlock protective stop", "stop", "close popup", "close safety popup")
+# By major version: the size of a state on the script port, and how many come a second (UR's page "Overview of client
+# interfaces").
+_STATE_BYTES, _STATES_HZ = {3: 1108, 5: 1220}, {3: 125.0, 5: 500.0}
+# What the kernel keeps of the states for a client that does not read.
+_UNREAD_BYTES = 4096
 _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
-    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence"),
-    *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "version", "payload", "normal"),
+    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "protect-abrupt-ends"),
+    *(
+        "registers-in-use",
+        "local-control",
+        "refuse-protocol",
+        "mute-dashboard",
+        "drop-scripts",
+        "version",
+        "payload",
+        "normal",
+    ),
 )
 
 
@@ -95,13 +111,17 @@ class Controller:
                 self.robot.emergency_stop()
             case ["release"]:
                 self.robot.release()
+            case ["protect-abrupt-ends"]:
+                self.robot.protects_abrupt_ends = True
             case ["drop-rtde"]:
                 # The other ports live on.
                 for writer in list(self._rtde):
                     writer.close()
             case ["silence", seconds]:
                 self.silence(number_between(seconds, 0.0, 86400.0, "not a time in seconds from 0 to 86400"))
-            case ["registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" as fault]:
+            case [
+                "registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" | "drop-scripts" as fault
+            ]:
                 self.faults.add(fault)
             case ["version", numbers]:
                 if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", numbers) is None:
@@ -127,7 +147,11 @@ class Controller:
 
     def _drop_all(self) -> None:
         for writer in self._connections.values():
-            writer.close()
+            # Closing waits until everything is sent, and the client may not read.
+            if writer.transport.get_write_buffer_size():
+                writer.transport.abort()
+            else:
+                writer.close()
 
     def _send(self, writer: asyncio.StreamWriter, data: bytes) -> None:
         if data and time.monotonic() >= self._silent_until_s and not writer.is_closing():
@@ -146,15 +170,38 @@ class Controller:
     async def _serve_scripts(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with connected(writer, self._connections):
             text = bytearray()
-            while data := await reader.read(65536):
+            async for data in self._stream_states(reader, writer):
                 text += data
                 if text.endswith(SCRIPT_END):
                     script = text.decode("utf-8", "replace")
                     with suppress(SyntaxError):  # which `upload` reports
                         # In a thread: it takes 40 ms, and the controller is never late.
                         await asyncio.to_thread(translate, script)
-                    self.robot.upload(script)
+                    if "drop-scripts" not in self.faults:
+                        self.robot.upload(script)
                     text.clear()
+
+    async def _stream_states(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> AsyncIterator[bytes]:
+        """Yield what a client sends, and send it a state in each cycle.
+
+        One thread does both: a client that does not read is not heard once its buffers are full.
+        """
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNREAD_BYTES)
+        writer.transport.set_write_buffer_limits(0)
+        major = 3 if self.robot.spec.version[0] == 3 else 5
+        # Its size, then values that no client of ours reads.
+        state = struct.pack(">I", _STATE_BYTES[major]).ljust(_STATE_BYTES[major], b"\x00")
+        while True:
+            self._send(writer, state)
+            await writer.drain()
+            try:
+                async with asyncio.timeout(1.0 / _STATES_HZ[major]):
+                    data = await reader.read(65536)
+            except TimeoutError:
+                continue
+            if not data:
+                return
+            yield data
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with connected(writer, self._connections):

@@ -4,6 +4,7 @@ Nothing here reads a clock. A process that plays more of the rig gives the robot
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 from shearloop.emulators.ur_arm import Arm, PathError, WristPlant
@@ -12,6 +13,7 @@ from shearloop.emulators.urscript import Program, ProgramEndedError, Registers
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 MODE_POWER_OFF, MODE_IDLE, MODE_RUNNING = 3, 5, 7
 SAFETY_NORMAL, SAFETY_PROTECTIVE_STOP, SAFETY_EMERGENCY_STOP = 1, 3, 7
+LOG_LINES = 100
 PROGRAM_END_DECELERATION, SAFETY_DECELERATION = 10.0, 20.0
 
 
@@ -52,6 +54,10 @@ class Robot:
         self.clock_s = 0.0
         self._events: list[RobotEvent] = []
         self._program: Program | None = None
+        # The last lines of the pendant's log.
+        self.log: deque[str] = deque(maxlen=LOG_LINES)
+        # Whether a program that ends by itself while the arm moves ends in a protective stop: reports differ.
+        self.protects_abrupt_ends = False
 
     def step(self, dt_s: float) -> None:
         """Run one control cycle."""
@@ -66,6 +72,8 @@ class Robot:
                     self._note(*event)
             except ProgramEndedError as ended:
                 self.end_program(str(ended))
+                if self.protects_abrupt_ends and self.arm.moving:
+                    self.protective_stop(f"the program ended while the arm moved: {ended}")
         self._move(dt_s)
         self.arm.feel(dt_s)
 
@@ -100,7 +108,7 @@ class Robot:
             return
         self.end_program("a new script arrived")
         try:
-            self._program = Program(text, self.registers, self.arm)
+            self._program = Program(text, self.registers, self.arm, self.log.append)
         except SyntaxError as error:
             self._note("script-refused", str(error))
             return
@@ -158,6 +166,7 @@ class Robot:
 
     def clear_faults(self) -> None:
         """Be safe and powered, without a program."""
+        self.protects_abrupt_ends = False
         self.end_program("the faults are cleared")
         self.robot_mode, self.safety_mode, self._power_step_s = MODE_RUNNING, SAFETY_NORMAL, math.inf
         self._note("faults-cleared")

@@ -28,11 +28,12 @@ from shearloop.estimation.estimator_names import estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.gain import GainCorrection, ToolLaw
 from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import INLINE, Kind, Measured
 from shearloop.files import open_file, refusing_damage, replace_file
 from shearloop.yaml_files import parse_yaml, shown
 
-FORMAT_VERSION = 8
+FORMAT_VERSION = 10
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"
 _FILE_KIND = "shearloop estimator calibration"
@@ -56,7 +57,7 @@ class Calibration:
 
     sides is empty where nothing is known of the fingertip (`uncalibrated`). validators are for raw frames.
     bank_identity is empty for an estimator without a bank. tool_mm is the diameter of the only tool in the recordings,
-    else NaN. With `tools` the torque is in units of their gain (`for_tool`).
+    else NaN. With `tools` the torque is in units of their gain (`for_tool`). `profile` is the torque without a sensor.
     """
 
     estimator: Estimator = field(metadata=INLINE)
@@ -70,6 +71,7 @@ class Calibration:
     diameter: OutputModel | None = None
     assumptions: tuple[Assumption, ...] = ()
     tools: ToolLaw | None = None
+    profile: TorqueProfile | None = None
 
     def for_tool(self, tool: Measured | None) -> Self:
         """Return the calibration for a tool, itself where it is made for that tool; else raises CalibrationError.

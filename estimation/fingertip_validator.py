@@ -48,7 +48,7 @@ _LEAST_IDLE, _LEAST_GRIPPED = 5, 20
 # deviation it is from the calibration's own session, and its score decides.
 _CLEARLY_NEARER, _SAME_SESSION, _GRIPPED_SCORE = 0.8, 0.01, 0.5
 # A grip ends when its score falls below this share of its mean over this many frames.
-_LOOSE_SHARE, _LEVEL_FRAMES = 0.5, 60
+_LOOSE_SHARE, _LEVEL_FRAMES = 0.4, 60
 # A large step exceeds the steps of twisting under load by this factor.
 _LARGE_STEP = 1.4
 # Frames below this share of the way from idle to loaded, in this running median, are idle. Gripped and not twisted they

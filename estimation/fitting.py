@@ -30,8 +30,9 @@ from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, fir
 from shearloop.estimation.interval_regressor import CensoredRidge, IntervalRegressor, fit_interval_regressor
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.novelty import NoveltyDetector
-from shearloop.estimation.regressors import ChannelImputer, later_origins
+from shearloop.estimation.regressors import ChannelImputer, later_levels
 from shearloop.estimation.session_state import ProcessedFrame, SessionState
+from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
@@ -77,6 +78,7 @@ def fit(
         bank_identity=physics.bank.identity if physics.bank is not None and kind.needs == "bank" else "",
         tool_mm=tools[0].value if len(tools) == 1 else np.nan,
         validators=material.validators,
+        profile=TorqueProfile.fit(chosen),
     )
     if timing is None or not is_raw:
         return _fit_slices(blank, chosen, physics, full_range=full_range)
@@ -138,7 +140,8 @@ def _fit_raw(
     estimator = calibration.estimator
     if not estimator.imputes_by_motion:
         estimator = replace(estimator, imputer=ChannelImputer.fit(rows.position, calibration.validators))
-    estimator, regressor, unexplained = estimator.fit_torque(rows.features, rows.torque_nm, bounds, rows.grip)
+    prepared = estimator
+    estimator, regressor, unexplained = prepared.fit_torque(rows.features, rows.torque_nm, bounds, rows.grip)
     # By age within the recordings, so that every part has all tools.
     order = np.argsort(rows.age_s, kind="stable")
     known = rows.where(order[np.isfinite(rows.diameter_mm[order])])
@@ -147,7 +150,7 @@ def _fit_raw(
     law = None
     if len(tools := _tools_of(recordings)) > 1:
         diameters_mm = np.array([np.nan if one.tool_mm is None else one.tool_mm.value for one in recordings])
-        fitted = _fit_tools(estimator, rows, diameters_mm) if enough else None
+        fitted = _fit_tools(prepared, rows, diameters_mm) if enough else None
         if fitted is not None:
             estimator, regressor, law = fitted
         elif unexplained > _TOOLS_MAY_LEAVE:
@@ -304,7 +307,7 @@ def _fit_slices(
             values[known],
             of_value,
             strengths=estimator.strengths,
-            left_out=later_origins(n) if quantity == "torque" else (),
+            left_out=later_levels(values[known]) if quantity == "torque" else (),
             fit_line=line if quantity == "torque" else None,
             full_range=full_range,
         )

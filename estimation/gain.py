@@ -17,9 +17,13 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import TWO_SIDED_95
 
-# Standard deviation of the logarithm of one fingertip's gain between recordings, and the recordings that it counts as.
-# Cylinders and days recorded twice differ by factors of 0.44 to 1.4.
-PRIOR_SPREAD, _PRIOR_RECORDINGS = 0.28, 3
+# Standard deviation of the logarithm of the gain between recordings, for one fingertip and for two, and the recordings
+# that it counts as. Cylinders and days recorded twice differ by factors of 0.44 to 1.4 for one fingertip, of 0.86 and
+# 1.2 for two (docs/decisions/0044).
+PRIOR_SPREADS, _PRIOR_RECORDINGS = {1: 0.28, 2: 0.16}, 3
+# The same of a calibration on fewer twists, where nothing shows that the torque repeats. Of two recordings with one
+# twist each the gains differ by factors of 3.0 (right), 2.2 (left) and 1.1 (both).
+_REPEATING_TWISTS, _UNREPEATED_SPREADS = 3, {1: 0.9, 2: 0.24}
 # The same of the first twist after a grip against the later ones, and the grips that its mean of 0 counts as.
 FIRST_SPREAD, _PRIOR_GRIPS = 0.2, 1
 # The same of a tool that was not calibrated, against the law over the diameter: a factor of 4 either way.
@@ -93,10 +97,12 @@ class GainSpread:
                 firsts += [gain - mean for gain, first in known if first]
         noise_nm = float(np.sqrt(np.mean(np.concatenate(noise) ** 2))) if noise else 0.0
         noise_nm = max(noise_nm, _LEAST_NOISE * float(np.abs(truth).max(initial=0.0)))
+        n_twists = sum(len(find_twists(truth[grips == one])) for one in np.unique(grips))
+        spreads = _UNREPEATED_SPREADS if 0 < n_twists < _REPEATING_TWISTS else PRIOR_SPREADS
         within = math.sqrt(squares / freedom) if freedom else 0.0
         first = sum(firsts) / (_PRIOR_GRIPS + len(firsts))
         prior = cls(
-            PRIOR_SPREAD / root,
+            spreads[fingertips],
             max(within, _LEAST_WITHIN),
             noise_nm,
             first=first,

@@ -29,7 +29,7 @@ from shearloop.estimation.gain import (
     first_twists,
     loaded_log_gain,
 )
-from shearloop.estimation.regressors import InverseCalibration, later_splits, left_out_blocks, left_out_groups
+from shearloop.estimation.regressors import CurveMean, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.values import INLINE
 from shearloop.words import counted
 
@@ -95,6 +95,10 @@ class Ridge:
         """Return the values of (…, d) features."""
         return np.asarray(self.offset + (features - self.mean) @ self.weights)
 
+    def scaled(self, factor: float) -> Self:
+        """Return the ridge of values larger by a factor."""
+        return replace(self, weights=factor * self.weights, offset=factor * self.offset)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CensoredRidge(Ridge):
@@ -131,10 +135,16 @@ class CensoredRidge(Ridge):
         error = float(np.sqrt(((y - predicted)[touching] ** 2).mean()))
         return cls(mean, weights, offset, strength, max(error, _LEAST_SIGMA_SHARE * float(y.max())), sign)
 
+    def scaled(self, factor: float) -> Self:
+        """Return the ridge of values larger by a factor."""
+        return replace(Ridge.scaled(self, factor), sigma=factor * self.sigma)
 
-Regressor: TypeAlias = Ridge | CensoredRidge | InverseCalibration
+
+Regressor: TypeAlias = Ridge | CensoredRidge | CurveMean
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
+# Pairs of rows to fit to and rows to validate on.
+LeftOut: TypeAlias = Sequence[tuple[IntArray, IntArray]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,9 +162,11 @@ class Intervals:
         edges: tuple[float, ...],
         inflation: float,
         least_half_width: float = 0.0,
+        inflation_of_loads: float | None = None,
     ) -> Self:
         """Fit to (n,) predictions and their residuals on data left out; a stratum with few of them joins the next.
 
+        The uppermost stratum has an inflation of its own where it is given: loads are fewer.
         Raises CalibrationError for too few residuals.
         """
         if len(residuals) < _LEAST_RESIDUALS:
@@ -170,6 +182,7 @@ class Intervals:
                 kept.append(float(edge))
         stratum = np.searchsorted(kept, predicted)
         widths = [_conformal_quantile(np.abs(residuals[stratum == i])) for i in range(len(kept) + 1)]
+        widths[-1] *= (inflation_of_loads or inflation) / inflation
         return cls(np.array(kept), np.maximum(inflation * np.array(widths), least_half_width))
 
     def half_width(self, predicted: float) -> float:
@@ -241,7 +254,7 @@ class IntervalRegressor:
         """
         rows = features[None] if complete is None else np.array([features, complete])
         raws = self.point.predict(rows)
-        raw, (value, *others) = float(raws[0]), _reported(self.point, raws).tolist()
+        raw, (value, *others) = float(raws[0]), reported_values(self.point, raws).tolist()
         widening = 1.0 / math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
         moved = others[0] - value if others else 0.0
@@ -266,14 +279,11 @@ class IntervalRegressor:
 
     def scaled(self, factor: float, spread: float) -> "IntervalRegressor":
         """Return the regressor of values larger by a factor, whose gain and zero have this spread."""
-        point = self.point
-        if isinstance(point, CensoredRidge):
-            point = replace(point, sigma=factor * point.sigma)
-        if isinstance(point, InverseCalibration):
+        if isinstance(self.point, CurveMean):
             raise CalibrationError("a curve of slices has no gain")
         return replace(
             self,
-            point=replace(point, weights=factor * point.weights, offset=factor * point.offset),
+            point=self.point.scaled(factor),
             intervals=Intervals(factor * self.intervals.edges, factor * self.intervals.half_widths),
             range=self.range.scaled(factor),
             gain=replace(self.gain, between=spread, zero=spread, noise_nm=factor * self.gain.noise_nm),
@@ -290,7 +300,7 @@ class IntervalRegressor:
         point = self.point
         least_nm = LOADED_SHARE * max(abs(self.range.low), abs(self.range.high))
         twists = [one for one in find_twists(torque_nm) if np.abs(torque_nm[one]).max() >= least_nm]
-        if isinstance(point, InverseCalibration) or not twists:
+        if isinstance(point, CurveMean) or not twists:
             raise CalibrationError(
                 f"no twist reaches {least_nm:.3g} N·m while an estimate is possible; twist further, some seconds "
                 "after the grip"
@@ -331,7 +341,7 @@ class IntervalRegressor:
         return ()
 
 
-def _reported(point: Regressor, raw: FloatArray) -> FloatArray:
+def reported_values(point: Regressor, raw: FloatArray) -> FloatArray:
     """Return the values that (n,) raw predictions mean: no torque where the lever would not touch."""
     return point.sign * np.maximum(raw, 0.0) if isinstance(point, CensoredRidge) else raw
 
@@ -343,7 +353,8 @@ def fit_interval_regressor(
     *,
     strengths: tuple[float, ...] = STRENGTHS,
     limit_features: bool = False,
-    left_out: Sequence[tuple[IntArray, IntArray]] = (),
+    left_out: LeftOut = (),
+    twists: LeftOut = (),
     fit_line: RegressorFit | None = None,
     bounds: tuple[FloatArray, FloatArray] | None = None,
     full_range: bool = False,
@@ -352,7 +363,8 @@ def fit_interval_regressor(
 ) -> IntervalRegressor:
     """Fit to (n, d) features and (n,) values in time order.
 
-    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. Torques of slices
+    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With `twists`
+    instead each pair with a load counts as one error, because the frames of a twist err alike. Torques of slices
     come with `fit_line`: they keep their sign, and unless they cover the `full_range` that will ever occur, it fits
     what reads values beyond it. `bounds` are the least and largest value (n,) that each frame may have: intervals
     extend to the further one. With the number of each row's recording, `recordings` (n,), intervals allow for the gain
@@ -364,45 +376,51 @@ def fit_interval_regressor(
             f"{np.max(values, initial=-np.inf):.3g} cannot determine a calibration; record more, at different loads"
         )
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
-    blocks = list(left_out or left_out_blocks(len(values)))
+    blocks = list(twists or left_out or left_out_blocks(len(values)))
 
     def refit(rows: IntArray, by: RegressorFit = fit) -> Regressor:
         return by(features[rows], values[rows], strength)
 
     parts = [refit(past) for past, _ in blocks]
     raw = [part.predict(features[future]) for part, (_, future) in zip(parts, blocks, strict=True)]
-    reported = np.concatenate([_reported(part, one) for part, one in zip(parts, raw, strict=True)])
+    reported = np.concatenate([reported_values(part, one) for part, one in zip(parts, raw, strict=True)])
     predicted, rows = np.concatenate(raw), np.concatenate([future for _, future in blocks])
     point, truth = fit(features, values, strength), values[rows]
     residuals = reported - truth
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
-    inflation = 1.0 if isinstance(point, InverseCalibration) else _INFLATION
-    if left_out:
-        inflation = student_inflation(len(np.unique(rows)))
+    inflation = 1.0 if isinstance(point, CurveMean) else _INFLATION
+    inflation = student_inflation(len(np.unique(rows))) if left_out else inflation
+    of_loads = _inflation_of_twists(values, twists) if twists else None
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
     least = LEAST_HALF_WIDTH * float(np.ptp(values))
-    intervals, widening = Intervals.fit(predicted, residuals, edges, inflation, least), 1.0
+    intervals, widening = Intervals.fit(predicted, residuals, edges, inflation, least, of_loads), 1.0
     # Before widening for unknown times: a load that is not seen is not seen at any time.
     half = np.array([intervals.half_width(one) for one in predicted])
     misses_loads = fit_line is None and _misses_loads(truth, np.abs(residuals) <= half)
     if bounds is not None:
-        if not left_out:
+        if not (twists or left_out):
             # Unknown times mean few loads, in a block or two each.
             inflation = student_inflation(len(blocks))
         errors = np.max([np.abs(truth + residuals - end[rows]) for end in bounds], axis=0)
         known = intervals.half_widths[-1]
-        intervals = Intervals.fit(predicted, errors, edges, inflation, least)
+        intervals = Intervals.fit(predicted, errors, edges, inflation, least, of_loads)
         widening = float(intervals.half_widths[-1] / known)
     span, line = ValueRange(float(values.min()), float(values.max())), None
     if fit_line is not None:
         refit_line = None if full_range else partial(refit, by=fit_line)
         span, line = _range_of_slices(point, features, values, refit, refit_line)
-    gains = [] if recordings is None else _gains_of_recordings(features, values, recordings, refit)
     gain = GainSpread()
     if recordings is not None:
+        gains = _gains_of_recordings(features, values, recordings, refit)
         gain = _spread_of_gain(values, recordings, rows, reported, gains, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain, line)
+
+
+def _inflation_of_twists(values: FloatArray, twists: LeftOut) -> float:
+    """Return Student's factor for as many errors as parts of the (n,) values have a load."""
+    loads = np.concatenate(find_twists(values))
+    return student_inflation(sum(bool(np.isin(part, loads).any()) for _, part in twists))
 
 
 def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: IntArray, refit: Refit) -> list[float]:
@@ -412,7 +430,7 @@ def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: I
     for kept, out in left_out_groups(recordings):
         if len(kept) and np.ptp(values[kept]) > 0 and np.abs(values[out]).max() > least:
             part = refit(kept)
-            gain = loaded_log_gain(_reported(part, part.predict(features[out])), values[out])
+            gain = loaded_log_gain(reported_values(part, part.predict(features[out])), values[out])
             gains += [] if gain is None else [gain]
     return gains
 
@@ -466,7 +484,7 @@ def _range_end(
     out, kept = order[:n_out], np.sort(order[n_out:])
 
     def median(by: Regressor, rows: IntArray) -> float:
-        return float(np.median(sign * _reported(by, by.predict(features[rows]))))
+        return float(np.median(sign * reported_values(by, by.predict(features[rows]))))
 
     end, outermost = float(outward.min()), median(point, order[: max(n_out // 2, 1)])
     if len(kept) < _LEAST_FRAMES or np.ptp(values[kept]) == 0:
@@ -508,7 +526,7 @@ def best_strength(
 
     def squared_error(strength: float, past: IntArray, future: IntArray) -> float:
         point = fit(features[past], values[past], strength)
-        return float(((_reported(point, point.predict(features[future])) - values[future]) ** 2).mean())
+        return float(((reported_values(point, point.predict(features[future])) - values[future]) ** 2).mean())
 
     errors = {one: float(np.mean([squared_error(one, *split) for split in splits])) for one in strengths}
     best = max(strength for strength, error in errors.items() if error <= min(errors.values()) * 1.001)

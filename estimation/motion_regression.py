@@ -1,8 +1,9 @@
 """The estimator of motion, the default: the gel's motion over the last seconds; for slices a curve over the value.
 
-Its features are how far the frame has moved since each of the last frames, in a few directions per fingertip. The gel
-creeps for seconds under a held twist, so its speed shows torque that its position does not, and slow drift of the
-baseline leaves no trace. Where the gel holds its position, that position is a feature too and shows a long twist.
+Its features are how far the frame has moved since some frames ago, in a few directions per fingertip; older frames are
+averaged in growing steps. The gel creeps for seconds under a held twist, so its speed shows torque that its position
+does not, and slow drift of the baseline leaves no trace. Where the gel holds its position, that position is a feature
+too and shows a long twist. `motion_fit` chooses directions and memory.
 """
 
 import math
@@ -36,18 +37,30 @@ from shearloop.estimation.interval_regressor import (
     RegressorFit,
     Ridge,
     ValueRange,
-    best_strength,
     fit_interval_regressor,
     is_one_sided,
 )
+from shearloop.estimation.motion_fit import (
+    MEMORY_EDGES,
+    MOST_DIRECTIONS,
+    Layout,
+    LinearFit,
+    MotionFit,
+    choose_motion,
+    twists_left_out,
+)
 from shearloop.estimation.novelty import fitted_parts
-from shearloop.estimation.regressors import InverseCalibration, left_out_blocks
+from shearloop.estimation.regressors import CurveMean, left_out_blocks
 from shearloop.estimation.session_state import Motion
 
-# Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
-_N_DIRECTIONS, _N_LAGS = 4, 12
-# A hundred features of a few directions need little penalty.
-_MOTION_STRENGTHS = (1e-6, 1e-5, 1e-4, 1e-3)
+# The directions are those of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err
+# more, over 12 frames later twists do (docs/decisions/0044).
+_DIRECTION_FRAMES = 8
+# An estimate needs this many frames of the grip before its own, 6.5 s. An older part of the memory counts as the oldest
+# of them, so that the memory costs no twist.
+_LEAST_LAGS = 12
+# A longer memory in a file would fill the session's own.
+_MOST_LAGS = 1000
 # Positions drift between recordings, motion does not. So motion alone is preferred unless it leaves more than the first
 # share of the torque's variance unexplained on frames left out and the position lowers the error by the second.
 _MOTION_MAY_LEAVE, _POSITION_MUST_GAIN = 0.5, 0.5
@@ -58,20 +71,25 @@ _N_NUISANCE, _MOST_FRAMES = 16, 500
 _CLEAR, _LEAST_SHARE = 2.0, 0.2
 # Centred positions have one direction less than their number; the last one is rounding.
 _ROUNDING = 1e-9
-# Inverse calibration over torque and over diameter: degree, directions of drift, trend. The torque's have the least
-# mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones; docs/decisions/0042).
-_CURVES: dict[Quantity, tuple[int, int, bool]] = {"torque": (4, 3, True), "diameter": (1, 1, False)}
+# Inverse calibration over torque and over diameter: degrees whose curves are averaged, directions of drift, trend. The
+# torque's have the least mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones) with and
+# without the judged level of torque (docs/decisions/0045).
+_CURVES: dict[Quantity, tuple[tuple[int, ...], int, bool]] = {
+    "torque": ((1, 3, 4), 3, True),
+    "diameter": ((1,), 1, False),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TemporalFeatures(Motion):
     """Directions (m, p, c) along which each side's motion is measured, in units of noise, and how far back.
 
-    With uses_position the position relative to the idle frame is a feature too.
+    edges (s + 1,) are the ends of the memory's s steps in frames back. With uses_position the position relative to the
+    idle frame is a feature too.
     """
 
     directions: FloatArray
-    n_lags: int
+    edges: IntArray
     uses_position: bool = False
 
     @classmethod
@@ -79,10 +97,33 @@ class TemporalFeatures(Motion):
         """Fit the main directions of motion to each recording's (n, m, c) gripped frames."""
         directions = []
         for layer, one in enumerate(validators):
-            moved = np.vstack([(part[_N_LAGS:, layer] - part[:-_N_LAGS, layer]) / one.noise for part in parts])
-            rows = np.linalg.svd(moved, full_matrices=False)[2][:_N_DIRECTIONS] / one.noise
+            moved = np.vstack(
+                [(part[_DIRECTION_FRAMES:, layer] - part[:-_DIRECTION_FRAMES, layer]) / one.noise for part in parts]
+            )
+            rows = np.linalg.svd(moved, full_matrices=False)[2][:MOST_DIRECTIONS] / one.noise
             directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
-        return cls(np.array(directions), _N_LAGS, uses_position=True)
+        return cls(np.array(directions), np.array(MEMORY_EDGES), uses_position=True)
+
+    @property
+    def n_lags(self) -> int:
+        """How many frames back the memory reaches."""
+        return int(self.edges[-1]) - 1
+
+    @property
+    def n_needed(self) -> int:
+        """How many positions of a grip an estimate needs."""
+        return min(self.n_lags, _LEAST_LAGS) + 1
+
+    @property
+    def layout(self) -> Layout:
+        """What the columns of the features are."""
+        m, p, _ = self.directions.shape
+        return Layout(len(self.edges) - 1, m, p)
+
+    def reduced(self, to: MotionFit) -> Self:
+        """Return the features that a fit uses."""
+        directions = self.directions[:, : to.n_directions].copy()
+        return replace(self, directions=directions, edges=self.edges[: to.n_steps + 1], uses_position=to.position)
 
     def project(self, channels: FloatArray) -> FloatArray:
         """Return the (…, m·p) positions of (…, m, c) frames along the directions."""
@@ -105,12 +146,15 @@ class TemporalFeatures(Motion):
         return np.where(usable, moved, imputed)
 
     def features(self, positions: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
-        """Return n_lags · m·p features of motion, nearest lag first, and m·p of position where it is used.
+        """Return s · m·p features of motion, nearest step first, and m·p of position where it is used.
 
-        positions are the last n_lags + 1 (m·p,) positions; from_idle (m·p,) is the newest one relative to idle.
+        positions are the last (m·p,) positions, up to n_lags + 1; from_idle (m·p,) is the newest one relative to idle.
         """
-        rows = np.array(positions)
-        moved = (rows[-1] - rows[-2::-1]).ravel()
+        missing = self.n_lags + 1 - len(positions)
+        rows = np.array([*[positions[0]] * missing, *positions])
+        starts, counts = self.edges[:-1] - 1, np.diff(self.edges)
+        before = np.add.reduceat(rows[-2::-1], starts, axis=0) / counts[:, None]
+        moved = (rows[-1] - before).ravel()
         return np.concatenate([moved, from_idle]) if self.uses_position else moved
 
 
@@ -164,7 +208,16 @@ class MotionRegression(Estimator):
             raise ValueError(f"directions have the shape {directions.shape}, expected {m} sides of {c} channels")
         if quantity == "diameter":
             return m * c
-        return m * int(directions.shape[1]) * (self.temporal.n_lags + self.temporal.uses_position)
+        edges = self.temporal.edges
+        if (
+            edges.ndim != 1
+            or len(edges) < 2
+            or edges[0] < 1
+            or (np.diff(edges) < 1).any()
+            or edges[-1] > _MOST_LAGS + 1
+        ):
+            raise ValueError(f"the memory ends at {edges.tolist()} frames, expected up to {_MOST_LAGS} that rise")
+        return m * int(directions.shape[1]) * (len(edges) - 1 + self.temporal.uses_position)
 
     def position_noise_mm(self, regressor: IntervalRegressor) -> float:
         """Return the diameter's 95 % error from the noise of one frame, where each feature has a noise of 1.
@@ -180,25 +233,24 @@ class MotionRegression(Estimator):
     def fit_torque(
         self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
     ) -> tuple[Self, IntervalRegressor, float]:
-        """Return the torque's regressor, and the estimator with position where that does better on blocks left out."""
-        fit = CensoredRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
+        """Return the torque's regressor, and the estimator with the chosen features."""
         if (temporal := self.temporal) is None:
             raise ValueError("raw frames have motion")
-        m = temporal.directions.shape[0]
-        n_motion = temporal.n_lags * m * temporal.directions.shape[1]
-        choices, variance = {False: features[:, :n_motion], True: features}, float(torque_nm.var())
-        best = {
-            used: best_strength(one, torque_nm, fit, _MOTION_STRENGTHS, left_out_blocks(len(torque_nm)))
-            for used, one in choices.items()
-        }
-        alone, with_position = best[False][1], best[True][1]
-        used = alone > _MOTION_MAY_LEAVE * variance and with_position < _POSITION_MUST_GAIN * alone
-        strength, error = best[used]
+        fit_one: LinearFit = CensoredRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
+        twists, variance = twists_left_out(torque_nm), float(torque_nm.var())
+        left_out = twists or left_out_blocks(len(torque_nm))
+        alone, with_position = (
+            choose_motion(features, torque_nm, temporal.layout, fit_one, left_out, position=used)
+            for used in (False, True)
+        )
+        needs_position = alone.squared_error > _MOTION_MAY_LEAVE * variance
+        gains = with_position.squared_error < _POSITION_MUST_GAIN * alone.squared_error
+        chosen = with_position if needs_position and gains else alone
         regressor = fit_interval_regressor(
-            choices[used], torque_nm, fit, strengths=(strength,), limit_features=True, bounds=bounds,
-            recordings=recordings, fingertips=m,
+            features[:, chosen.columns], torque_nm, chosen.fit_used, strengths=(0.0,), limit_features=True,
+            twists=twists, bounds=bounds, recordings=recordings, fingertips=len(temporal.directions),
         )  # fmt: skip
-        return replace(self, temporal=replace(temporal, uses_position=used)), regressor, error / variance
+        return replace(self, temporal=temporal.reduced(chosen)), regressor, chosen.squared_error / variance
 
     def side_of_features(self, n_features: int) -> IntArray:
         """Return the side (d,) that each of the torque's features comes from."""
@@ -215,19 +267,19 @@ class MotionRegression(Estimator):
 
         Raises CalibrationError where a part of (n,) values has too few distinct ones.
         """
-        degree, n_drift, trend = _CURVES[quantity]
+        degrees, n_drift, trend = _CURVES[quantity]
         for rows in fitted_parts(len(values)) if np.ptp(values) > 0 else ():
             n_distinct = len(np.unique(values[rows]))
-            if n_distinct <= degree:
+            if n_distinct <= max(degrees):
                 raise CalibrationError(
                     f"{len(rows)} of the {len(values)} slices have too few different {quantity}s for the estimator "
                     f"motion_regression, {n_distinct}; record more of them, in turn"
                 )
 
-        def fit_of(degree: int) -> RegressorFit:
-            return lambda frames, known, _: InverseCalibration.fit(frames, known, degree, n_drift, trend=trend)
+        def fit_of(degrees: tuple[int, ...]) -> RegressorFit:
+            return lambda frames, known, _: CurveMean.fit(frames, known, degrees, n_drift, trend=trend)
 
-        return fit_of(degree), fit_of(1)
+        return fit_of(degrees), fit_of((1,))
 
 
 def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> IntervalRegressor:

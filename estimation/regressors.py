@@ -4,7 +4,7 @@
 generalised least squares). Unlike a ridge it does not pull estimates towards the mean.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -18,6 +18,8 @@ from shearloop.words import counted
 
 N_BLOCKS = 5
 FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
+# Values within this share of their range are of one level: half of the way to the next of ten, and a little more.
+NEAR_LEVEL = 0.06
 # Penalties of the curve's higher terms and of the trend, as this many frames without them. From 10 to 100 for the trend
 # the error on later slices is nearly the same; without a trend it is a sixth larger (docs/decisions/0042).
 _CURVATURE, _TREND, N_TREND = 3.0, 30.0, 2
@@ -128,6 +130,24 @@ class InverseCalibration:
         return parabola_top(-cost, int(np.argmin(cost)), grid)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CurveMean:
+    """The mean value of several curves: what they err by alone differs, between the levels of the values above all."""
+
+    curves: tuple[InverseCalibration, ...]
+
+    @classmethod
+    def fit(
+        cls, frames: FloatArray, values: FloatArray, degrees: Sequence[int], n_drift: int, *, trend: bool = False
+    ) -> Self:
+        """Fit a curve of each degree as `InverseCalibration.fit` does."""
+        return cls(tuple(InverseCalibration.fit(frames, values, one, n_drift, trend=trend) for one in degrees))
+
+    def predict(self, features: FloatArray) -> FloatArray:
+        """Return the values of (…, d + 1) frames; the last column is the time."""
+        return np.asarray(np.mean([one.predict(features) for one in self.curves], axis=0))
+
+
 def parabola_top(scores: FloatArray, i: int, grid: FloatArray) -> float:
     """Return the top of a parabola through a maximum and its neighbours."""
     if i in (0, len(grid) - 1) or not np.isfinite(scores[[i - 1, i + 1]]).all():
@@ -224,6 +244,22 @@ def later_origins(n: int) -> list[tuple[IntArray, IntArray]]:
     if first < LEAST_BEFORE_ORIGIN:
         return []
     return [(np.arange(cut), np.arange(cut, n)) for cut in range(first, n - 1, max(1, n // N_ORIGINS))]
+
+
+def later_levels(values: FloatArray) -> list[tuple[IntArray, IntArray]]:
+    """Return (earlier, later) parts of (n,) values as `later_origins`, without earlier values near the later one.
+
+    Torques repeat. With the same level among the earlier ones, a flexible curve learns the levels and not the torque.
+    Where too few other values remain, the level stays.
+    """
+    near = NEAR_LEVEL * float(np.ptp(values))
+    parts: dict[tuple[int, bytes], tuple[IntArray, list[int]]] = {}
+    for earlier, later in later_origins(len(values)):
+        for row in later.tolist():
+            rest = earlier[np.abs(values[earlier] - values[row]) > near]
+            kept = rest if len(rest) >= LEAST_BEFORE_ORIGIN else earlier
+            parts.setdefault((len(earlier), kept.tobytes()), (kept, []))[1].append(row)
+    return [(kept, np.array(rows)) for kept, rows in parts.values()]
 
 
 def later_splits(n: int) -> Iterator[tuple[IntArray, IntArray]]:

@@ -36,8 +36,8 @@ _LARGEST_GAP_S = 1.4
 _STEPS, _MISSING_SHARE, _LARGEST_GAP_SHARE = 9, 1.5, 2.5
 # A baseline of fewer frames accepts only grips of at least half the calibrated strength.
 _LEAST_IDLE, _OUTRIGHT = 5, 0.5
-# Most interpolated frames among those remembered.
-_LARGEST_BRIDGED = 3
+# Most frames in a row that are interpolated, and most of those remembered, as a share.
+_LARGEST_BRIDGED, _LARGEST_BRIDGED_SHARE = 3, 0.25
 # The paper's method refuses frames with more unusable channels than this.
 _PAPER_UNUSABLE_SHARE = 0.10
 # Degrees of freedom of the mean variance of all channels in each channel's own.
@@ -72,14 +72,22 @@ class ProcessedFrame:
 class Motion:
     """What a session remembers of the gel's motion: nothing, for estimators that read each frame alone."""
 
-    n_lags: int = 0
+    @property
+    def n_lags(self) -> int:
+        """How many frames back the memory reaches."""
+        return 0
+
+    @property
+    def n_needed(self) -> int:
+        """How many positions of a grip an estimate needs."""
+        return 1
 
     def project(self, channels: FloatArray) -> FloatArray:
         """Return the (…, p) positions of (…, m, c) frames."""
         return np.zeros((*channels.shape[:-2], 0))
 
     def features(self, _positions: Sequence[FloatArray], _from_idle: FloatArray) -> FloatArray:
-        """Return the features of the last n_lags + 1 (p,) positions, and of the newest one's (p,) way from idle."""
+        """Return the features of the last n_needed to n_lags + 1 (p,) positions, and of the newest one's from idle."""
         return np.zeros(0)
 
     def impute(
@@ -219,9 +227,12 @@ class GripMemory:
         elif self.positions:
             self._repeat_position(1 + missing)
 
-    def remember(self, channels: FloatArray, difference: FloatArray, missing: int) -> str:
-        """Take the next gripped frame, interpolate those before it, and return the reason against an estimate."""
-        position, from_idle = self._motion.project(np.array([channels, difference]))
+    def remember(self, channels: FloatArray, moved: FloatArray, difference: FloatArray, missing: int) -> str:
+        """Take the next gripped frame, interpolate those before it, and return the reason against an estimate.
+
+        moved (m, c) is its way from the idle frame, and difference the same at the calibration's gain.
+        """
+        position, from_idle = self._motion.project(np.array([channels, moved]))
         self._skipped_in_a_row = 0
         if missing and self.positions:
             self._repeat_position(missing)
@@ -232,9 +243,9 @@ class GripMemory:
                 self.positions[i - 1 - between] = begin + i / (between + 1) * (position - begin)
         self.positions.append(position)
         self._bridged.append(False)
-        if wanted := self._motion.n_lags + 1 - len(self.positions):
+        if (wanted := self._motion.n_needed - len(self.positions)) > 0:
             return f"gripped too recently: {counted(wanted, 'more frame is', 'more frames are')} needed"
-        if sum(self._bridged) > _LARGEST_BRIDGED:
+        if sum(self._bridged) > max(_LARGEST_BRIDGED, _LARGEST_BRIDGED_SHARE * (len(self.positions) - 1)):
             return "too many of the last frames were disturbed or are missing"
         self.held_frames = min(self.held_frames + 1, _HELD_FRAMES)
         self.mean_difference = self.mean_difference + (difference - self.mean_difference) / self.held_frames
@@ -358,11 +369,11 @@ class SessionState:
             self._idle.follow(layer, channels[layer], restart=bool(back.any()))
 
     def _finish(self, channels: FloatArray, usable: BoolArray, missing: int) -> ProcessedFrame:
-        # At the calibration's gain. It does not change while gripped.
-        idle, difference, loose = self._idle, channels - self._idle.baselines, []
+        idle, from_idle, loose = self._idle, channels - self._idle.baselines, []
         if not usable.all():
-            difference = self._motion.impute(difference, usable, self._fingertips.sides, from_idle=True)
-        difference = difference / idle.gains
+            from_idle = self._motion.impute(from_idle, usable, self._fingertips.sides, from_idle=True)
+        # At the calibration's gain. It does not change while gripped.
+        difference = from_idle / idle.gains
         for layer, (one, grip) in enumerate(zip(self._fingertips.sides, self._grips, strict=True)):
             known = idle.baselines[layer], idle.gains[layer], idle.least_scores[layer]
             if not grip.update(channels[layer], *known):
@@ -372,7 +383,8 @@ class SessionState:
             reason = f"no grip at the {' and '.join(loose)} fingertip"
             return ProcessedFrame(difference, (reason,), usable, held_frames=0)
         memory = self._memory
-        if reason := memory.remember(channels / self._idle.gains, difference, missing):
+        # Motion is read in volts: after a release a gel's idle voltages recover for minutes, which is no gain.
+        if reason := memory.remember(channels, from_idle, difference, missing):
             return ProcessedFrame(difference, (reason,), usable)
         return ProcessedFrame(
             difference, (), usable, memory.mean_difference, memory.features, memory.held_frames, self._idle.complete

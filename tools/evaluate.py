@@ -35,12 +35,15 @@ class EstimateTrack:
     series: FrameSeries
     estimates: tuple[Estimate, ...]
     latency_ms: FloatArray
+    # The torque (n,) by the calibration's mean twist at the same phase, without a sensor.
+    profile_nm: FloatArray | None = None
 
     def since(self, first_frame: int) -> "EstimateTrack":
         """Return the part from a frame of the recording on."""
         first = first_frame - self.series.first_frame
         series = self.series.between(first, len(self.estimates))
-        return EstimateTrack(series, self.estimates[first:], self.latency_ms[first:])
+        profile_nm = None if self.profile_nm is None else self.profile_nm[first:]
+        return EstimateTrack(series, self.estimates[first:], self.latency_ms[first:], profile_nm)
 
 
 def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> EstimateTrack:
@@ -53,7 +56,8 @@ def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | 
         begun = time.perf_counter()
         estimates.append(session.estimate(TactileFrame.of(float(t_s), channels)))
         latency.append(1e3 * (time.perf_counter() - begun))
-    return EstimateTrack(chosen, tuple(estimates), np.array(latency))
+    profile_nm = None if calibration.profile is None else calibration.profile.predict(chosen)
+    return EstimateTrack(chosen, tuple(estimates), np.array(latency), profile_nm)
 
 
 def estimate_in_worker(shared: tuple[Calibration, str | None], series: FrameSeries) -> EstimateTrack:
@@ -90,13 +94,15 @@ def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_N
     """Return the torque's figures of `loaded` frames, with a torque of loaded_nm or more in size, and of the others.
 
     n frames have a known truth, and valid_fraction of them an estimate. Only these are judged. gain is the mean
-    estimate over the mean truth, both along the truth.
+    estimate over the mean truth, both along the truth. For loaded frames baseline_zero_rmse_nm and
+    baseline_profile_rmse_nm are errors without a sensor, and baseline_ratio is the estimate's over the smaller one.
     """
     frames = _known_frames(tracks, "torque")
     is_loaded = np.abs(frames[0]) >= loaded_nm
     found = {"loaded": _compare(frames[:, is_loaded], "nm"), "unloaded": _compare(frames[:, ~is_loaded], "nm")}
     for figures in found.values():
         del figures["r"]
+    found["loaded"] |= _baselines(frames[:, is_loaded])
     del found["unloaded"]["gain"]
     return found
 
@@ -119,6 +125,21 @@ def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
     return sorted(found, key=lambda reason: -reason.frames)
 
 
+def _baselines(frames: FloatArray) -> Figures:
+    """Return the errors on the same frames (5, n) without a sensor, and the estimate's over the smaller of them."""
+    truth, value, _, _, profile = frames[:, np.isfinite(frames[1])]
+    if len(truth) < 2:
+        return dict.fromkeys(("baseline_zero_rmse_nm", "baseline_profile_rmse_nm", "baseline_ratio"))
+    known = bool(np.isfinite(profile).all())
+    zero_nm, profile_nm, own_nm = (float(np.sqrt(((one - truth) ** 2).mean())) for one in (0.0, profile, value))
+    least_nm = min(zero_nm, profile_nm) if known else zero_nm
+    return {
+        "baseline_zero_rmse_nm": zero_nm,
+        "baseline_profile_rmse_nm": profile_nm if known else None,
+        "baseline_ratio": own_nm / least_nm if least_nm else None,
+    }
+
+
 def values_of(estimates: Sequence[Estimate], quantity: str = "torque") -> FloatArray:
     """Return estimate and the interval's ends (3, n) in N·m or mm, NaN without an estimate."""
     names = [f"{quantity}{end}_{_UNITS[quantity]}" for end in _ENDS]
@@ -127,20 +148,21 @@ def values_of(estimates: Sequence[Estimate], quantity: str = "torque") -> FloatA
 
 
 def _frames(track: EstimateTrack, quantity: str) -> FloatArray:
-    """Return truth, estimate and the interval's ends (4, n) of all frames, NaN for unknown ones."""
+    """Return truth, estimate, the interval's ends and the profile (5, n) of all frames, NaN for unknown ones."""
     truth = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
-    return np.array([truth, *values_of(track.estimates, quantity)])
+    profile = track.profile_nm if quantity == "torque" and track.profile_nm is not None else np.full(len(truth), np.nan)
+    return np.array([truth, *values_of(track.estimates, quantity), profile])
 
 
 def _known_frames(tracks: Sequence[EstimateTrack], quantity: str) -> FloatArray:
-    """Return truth, estimate and the interval's ends (4, n) of the frames with a known truth."""
+    """Return truth, estimate, the interval's ends and the profile (5, n) of the frames with a known truth."""
     frames = np.concatenate([_frames(track, quantity) for track in tracks], axis=1)
     return frames[:, np.isfinite(frames[0])]
 
 
 def _compare(frames: FloatArray, unit: str) -> Figures:
-    """Return the figures of a quantity's frames (4, n), None where fewer than two of them are estimated."""
-    truth, value, low, high = frames[:, np.isfinite(frames[1])]
+    """Return the figures of a quantity's frames (5, n), None where fewer than two of them are estimated."""
+    truth, value, low, high, _ = frames[:, np.isfinite(frames[1])]
     n = frames.shape[1]
     counts: Figures = {"n": n, "valid_fraction": len(truth) / n if n else None}
     if len(truth) < 2:
@@ -188,7 +210,7 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
         slices = track.series.kind == "difference"
         # A stream has one tool: its diameter would be a flat line.
         is_torque = not slices or not np.isfinite(track.series.diameter_mm).any()
-        truth, value, low, high = _frames(track, "torque" if is_torque else "diameter")
+        truth, value, low, high, _ = _frames(track, "torque" if is_torque else "diameter")
         t_s = track.series.t_s
         known = "load cell" if is_torque else "known diameter"
         axes.plot(t_s, truth, "ko" if slices else "k-", linewidth=1.0, markersize=5, label=known)

@@ -89,14 +89,16 @@ class ControlLoop:
         required: tuple[str, ...],
         creep: Mapping[str, Creep] = MappingProxyType({}),
         dead_tasks: Mapping[str, str] = MappingProxyType({}),
+        patience: float = 1.0,
     ) -> None:
         """Take all torque sources by name, the required devices, and the creep of sources that measure shear.
 
         Each source that measures torque may drive. `dead_tasks` has the error of each task that is dead at present.
+        `patience` is the factor on the deadlines, above 1 on an emulated rig alone.
         """
         kept_s = max(ADAPTED_OVER_S, compared_for_s(sources.values(), config))
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
-        self.safety = SafetyMonitor()
+        self.safety = SafetyMonitor(patience)
         self.experiment: Experiment | None = None
         # How many experiments have begun.
         self.runs = 0
@@ -114,6 +116,7 @@ class ControlLoop:
             supervising=self._others(self.wrist.source),
             limits=ExperimentLimits(),
             required=required,
+            patience=patience,
         )
         self._gripped = _GrippedTool()
         # Faults that were reported since the latest tick.

@@ -45,6 +45,8 @@ class Watched:
     twisted_rad: float = 0.0
     expected_nm: float | None = None
     overdue: str | None = None
+    # Factor on the deadlines for states and decisions: above 1 on an emulated rig alone, which cannot hurt.
+    patience: float = 1.0
 
 
 def compared_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> float:
@@ -73,10 +75,11 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
     found += _device_faults(inputs, watched, t_ns)
     for name, reason in inputs.died.items():
         found.append(Fault(FaultCode.TASK_DIED, f"{name}: {reason}"))
-    if inputs.late_s > LONGEST_HANG_S - LONGEST_TICK_S:
-        stood = f"it stood still for {inputs.late_s + LONGEST_TICK_S:.1f} s, and {LONGEST_HANG_S:g} s are allowed"
+    longest_hang_s = watched.patience * LONGEST_HANG_S
+    if inputs.late_s > longest_hang_s - LONGEST_TICK_S:
+        stood = f"it stood still for {inputs.late_s + LONGEST_TICK_S:.1f} s, and {longest_hang_s:g} s are allowed"
         found.append(Fault(FaultCode.DAEMON_PAUSED, stood))
-    elif inputs.late_s > LATEST_LOOP_S:
+    elif inputs.late_s > watched.patience * LATEST_LOOP_S:
         found.append(Fault(FaultCode.LOOP_LATE, f"the loop ran {inputs.late_s * 1e3:.0f} ms late"))
     if inputs.recording_error:
         found.append(Fault(FaultCode.RECORDING_FAILED, inputs.recording_error))
@@ -173,7 +176,7 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
         waits = (f"{name}, {lost[name].removesuffix('.')}" if name in lost else name for name in awaited)
         found.append(Fault(FaultCode.DEVICE_AWAITED, "; ".join(waits)))
     if arm is not None:
-        if t_ns - arm.t_ns > ARM_STALE_S * 1e9:
+        if t_ns - arm.t_ns > watched.patience * ARM_STALE_S * 1e9:
             stale = f"the robot last reported its state {(t_ns - arm.t_ns) / 1e9:.2f} s ago"
             found.append(Fault(FaultCode.STATE_STALE, stale, t_ns=arm.t_ns))
         elif arm.emergency_stop:
@@ -187,7 +190,7 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
             found.append(Fault(FaultCode.ROBOT_BLOCKED, arm.blocked, t_ns=arm.t_ns))
     if gripper is not None and has_gripper:
         age_s = (t_ns - gripper.t_ns) / 1e9
-        if age_s > HAND_STALE_S:
+        if age_s > watched.patience * HAND_STALE_S:
             silent = f"the gripper last reported its state {age_s:.1f} s ago"
             found.append(Fault(FaultCode.STATE_STALE, silent, t_ns=gripper.t_ns))
         elif gripper.fault:

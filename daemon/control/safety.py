@@ -23,8 +23,8 @@ class Response(IntEnum):
 class Rule:
     """One row: the response, the operator's sentence with its cure, and how long a hold may last before it stops.
 
-    A fault that `is_past` is detected after it is over, such as a pause of the loop. A stop by a fault that `explains`
-    is reported first, and faults that only hold the wrist count as its consequences: queued data is old, and boards
+    A fault that `is_past` is detected after it is over, such as a pause of the loop. A fault that `explains` is
+    reported first, and faults that only hold the wrist count as its consequences: queued data is old, and boards
     seem lost.
     """
 
@@ -149,6 +149,7 @@ class FaultCode(Enum):
         "End other programs on this computer, or see the service's real-time options.",
         hold_at_most_s=5.0,
         is_past=True,
+        explains=True,
     )
     HELD_TOO_LONG = Rule(
         _KEEP,
@@ -231,15 +232,22 @@ class SafetyDecision:
     faults: tuple[Fault, ...] = ()
 
     @property
+    def reported(self) -> tuple[Fault, ...]:
+        """The faults without consequences, the cause first."""
+        return tuple(fault for fault in self.faults if not fault.is_consequence)
+
+    @property
     def reasons(self) -> tuple[str, ...]:
         """One sentence per fault, without consequences."""
-        return tuple(fault.sentence for fault in self.faults if not fault.is_consequence)
+        return tuple(fault.sentence for fault in self.reported)
 
 
 class SafetyMonitor:
     """Judges faults: a hold ends with its cause, a stop stays until the operator acknowledges it."""
 
-    def __init__(self) -> None:
+    def __init__(self, patience: float = 1.0) -> None:
+        """`patience` is the factor on the longest holds; above 1 on an emulated rig alone."""
+        self._patience = patience
         # Hold timers of each fault and of the wrist, and the faults that held it at the last judgement.
         self._held_ns: dict[FaultCode, int] = {}
         self._wrist_ns = 0
@@ -256,9 +264,11 @@ class SafetyMonitor:
             self._count(active, t_ns)
         self._judged_ns = t_ns
         response = max(map(self._response, active), default=Response.NOTE)
-        if response is Response.HOLD and self._wrist_ns > HELD_AT_MOST_S * 1e9:
+        if response is Response.HOLD and self._wrist_ns > self._patience * HELD_AT_MOST_S * 1e9:
             active = (*active, Fault(FaultCode.HELD_TOO_LONG, self._hold_report()))
             response = TABLE[FaultCode.HELD_TOO_LONG].response
+        # What stops comes before what holds: it is the cause that is told first.
+        active = tuple(sorted(active, key=self._response, reverse=True))
         decision = SafetyDecision(response, self._explained(active, _explaining(active)))
         if response >= Response.STOP_AND_KEEP_GRIP and (self._stop is None or response > self._stop.response):
             self._stop = decision
@@ -303,8 +313,14 @@ class SafetyMonitor:
     def _with_stop(cls, stop: SafetyDecision, active: tuple[Fault, ...]) -> SafetyDecision:
         """Return the stop's faults, updated with the present ones."""
         codes = {fault.code for fault in active}
-        past = tuple(fault for fault in stop.faults if fault.code not in codes)
-        return SafetyDecision(stop.response, cls._explained((*past, *active), _explaining(stop.faults)))
+        # In the order of the stop, so that its cause stays first.
+        known = {fault.code for fault in stop.faults}
+        kept = [fault for fault in stop.faults if fault.code not in codes]
+        kept += [fault for fault in active if fault.code in known]
+        order = list(dict.fromkeys(fault.code for fault in stop.faults))
+        kept.sort(key=lambda fault: order.index(fault.code))
+        new = (fault for fault in active if fault.code not in known)
+        return SafetyDecision(stop.response, cls._explained((*kept, *new), _explaining(stop.faults)))
 
     def _count(self, active: tuple[Fault, ...], t_ns: int) -> None:
         """Advance the hold timers to t_ns: up for faults that held until now, down for the others."""
@@ -331,7 +347,7 @@ class SafetyMonitor:
     def _response(self, fault: Fault) -> Response:
         rule = fault.rule
         longest_s = rule.hold_at_most_s
-        if longest_s is not None and self._held_ns[fault.code] > longest_s * 1e9:
+        if longest_s is not None and self._held_ns[fault.code] > self._patience * longest_s * 1e9:
             return Response.STOP_AND_KEEP_GRIP
         return rule.response
 

@@ -227,6 +227,8 @@ class LoopState(Message):
     speed_command_rad_per_s: float = column("rad/s", "the commanded wrist speed, before clipping")
     speed_sent_rad_per_s: float = column("rad/s", "the wrist speed that was sent, after clipping")
     response: str = column("", "the safety response")
+    cause: str = column("", "the first of the reasons, which may have caused the others; empty without one")
+    faults: str = column("", "their codes, separated by commas, the cause's first; see faults.md")
     reasons: str = column("", "every reason for holding or stopping, in sentences")
 
 

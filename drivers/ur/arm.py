@@ -14,14 +14,17 @@ import rtde_control
 import script_client
 
 from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge, ScriptReadiness, command_dashboard
-from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeSample, WristSpeed
-from shearloop.drivers.ur.script import NO_MOTION_S, guard_script
+from shearloop.drivers.ur.messages import RUNTIME_PLAYING, MoveLinear, RobotLostError, RtdeSample, WristSpeed
+from shearloop.drivers.ur.script import NO_MOTION_TICKS, guard_script
+from shearloop.drivers.ur.script_port import ScriptPort
 from shearloop.drivers.ur.settings import UrSettings
 
 # A thread of ur-rtde polls its socket every 0.1 ms, which takes 5 % of a core. With this timer slack it wakes once per
 # two samples. One-time commands wait for that thread, so that the slack is at most a sixth of the watchdog's time.
 _LONGEST_POLL_SLACK_NS, _SLACKS_PER_WATCHDOG = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
+# The longest time for sending the script.
+_UPLOAD_S = 1.0
 
 
 class UrArm:
@@ -50,21 +53,25 @@ class UrArm:
         _set_timer_slack(min(_LONGEST_POLL_SLACK_NS, int(watchdog_ns / _SLACKS_PER_WATCHDOG)))
         self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
         _set_timer_slack(0)
-        self._accepts_scripts = True
+        self._script_port = ScriptPort(settings.host, _UPLOAD_S)
         # A linear move was begun, and the wrist has not turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
-        self._script_readiness = ScriptReadiness(self._receiver, 1.0 / settings.watchdog_hz)
+        self._script_readiness = ScriptReadiness(self._receiver, settings.command_timeout_s)
 
     def read(self) -> RtdeSample:
         """Return the controller's latest sample and its age."""
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
+        # The controller listens to a script's sender only while the sender reads.
+        self._script_port.drain()
+        if sample.runtime_state == RUNTIME_PLAYING:
+            self._script_port.close()
         return RtdeSample(
             **vars(sample),
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
-            connected=self._receiver.connected and self._accepts_scripts and self._control.isConnected(),
+            connected=self._receiver.connected and self._control.isConnected(),
             moving_linearly=self._may_move_linearly
             and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
@@ -116,19 +123,15 @@ class UrArm:
         """Make the present wrench zero."""
         return self._send_once(self._control.zeroFtSensor)
 
-    def upload(self) -> bool:
-        """Send the control script; the program starts by itself, and ends when it receives nothing."""
-        try:
-            with open(os.memfd_create("control.script"), "w") as file:
-                file.write(self._script)
-                file.flush()
-                self._control.setCustomScriptFile(f"/proc/self/fd/{file.fileno()}")
-        except RuntimeError as error:
-            # The controller closed the script connection, and ur-rtde does not reopen it.
-            sys.stderr.write(f"The control script could not be sent: {error}.\n")
-            self._accepts_scripts = False
+    def upload(self) -> None:
+        """Send the control script; the program starts by itself, and ends when it receives nothing.
+
+        Raises:
+            RobotLostError: the controller does not take the script.
+        """
+        # ur-rtde's own script connection is never read, so that the controller soon stops listening to it.
+        self._script_port.send(self._script)
         self._script_readiness.command_sent()
-        return self._accepts_scripts
 
     def arm_watchdog(self) -> bool:
         """Arm the robot's watchdog after an upload; accepted only by a program that answers."""
@@ -141,11 +144,16 @@ class UrArm:
 
     def withdraw_deadline(self) -> None:
         """Let no motion go on, also not when a program that is paused now is resumed."""
-        self._receiver.write_deadline(NO_MOTION_S)
+        self._receiver.write_deadline(NO_MOTION_TICKS)
 
     def _write_deadline(self, left_s: float) -> None:
         # The latest sample is older than now, so that the deadline is never late.
-        self._receiver.write_deadline(self._receiver.latest().script_s + left_s)
+        sample = self._receiver.latest()
+        if sample.script_step_s > 0:
+            self._receiver.write_deadline(sample.script_ticks + int(left_s / sample.script_step_s))
+        else:
+            # No program has run yet.
+            self.withdraw_deadline()
 
     def _send_once(self, call: Callable[..., object], *arguments: object, **options: object) -> bool:
         """Send a command that the script carries out once."""

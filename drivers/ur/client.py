@@ -55,8 +55,10 @@ def missing_library() -> str:
 class UrRobot:
     """A UR arm: `run` in a task of the daemon, `send` commands, read `state` (None while there is no connection)."""
 
-    def __init__(self, settings: UrSettings, monitor: LinkMonitor | None = None) -> None:
+    def __init__(self, settings: UrSettings, monitor: LinkMonitor | None = None, *, warns: bool = True) -> None:
+        """`warns`: say at each connection that the deadlines are longer than promised."""
         self.settings = settings
+        self._promise = settings.warning if warns else ""
         self.state: messages.RobotState | None = None
         self.monitor = monitor or LinkMonitor()
         self.losses: Counter[str] = Counter()
@@ -139,7 +141,7 @@ class UrRobot:
                 self.states += 1
                 if before is None:
                     connected = f"The robot at {self.settings.host} is connected."
-                    said = (connected, self._warning, self.settings.warning, message.blocked)
+                    said = (connected, self._warning, self._promise, message.blocked)
                     self.monitor.connected(" ".join(filter(None, said)), time.monotonic_ns())
                 waiting, self._waiting = self._waiting, []
                 for one in waiting:
@@ -257,7 +259,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         cause = ": it lost the controller" if -status in (signal.SIGSEGV, signal.SIGABRT) else ""
         return RobotLostError(
             "crashed",
-            f"The robot's process {end} while {self._activity}{cause}. The robot's watchdog ends the motion; the "
+            f"The robot's process {end} while {self._activity}{cause}. The script on the robot stops the arm; the "
             f"process is started again with motion disabled.{self._last_words()}",
         )
 
@@ -266,8 +268,8 @@ class WorkerConnection(asyncio.SubprocessProtocol):
             sentence = silent_sentence(self._settings.host, self._settings.connect_timeout_s, self._activity)
         else:
             sentence = (
-                f"The robot's process did not answer for {seconds:.1f} s and was ended. The robot's watchdog ends the "
-                "motion; the process is started again with motion disabled."
+                f"The robot's process did not answer for {seconds:.1f} s and was ended. The script on the robot stops "
+                "the arm; the process is started again with motion disabled."
             )
         return sentence + self._last_words()
 

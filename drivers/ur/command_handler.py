@@ -20,6 +20,7 @@ from shearloop.drivers.ur.messages import (
     Enable,
     Heartbeat,
     MoveLinear,
+    RobotLostError,
     RobotState,
     RtdeSample,
     Stop,
@@ -37,9 +38,15 @@ if TYPE_CHECKING:
 _RETRY_S = 1.0
 # A program without heartbeats has ended by its watchdog after this time.
 ENDS_ITSELF_S = 2.0
+# A program that does not play so long after its first upload does not start with this worker.
+STARTS_WITHIN_S = 2.0
 
 NOT_ENABLED = "Motion has not been enabled since the robot's process was started: enable it when the arm may move."
 BEING_MADE_READY = "The robot is being made ready (safety, power, control program); this takes some seconds."
+NOT_STARTING = (
+    "The controller took the control program and does not play it: look at the teach pendant for a message, for local "
+    "control, and for the log's last lines. The robot's process is started again with motion disabled."
+)
 LEAVING = "The daemon disconnects from the robot: start it again to go on."
 
 
@@ -57,7 +64,9 @@ class Recovery:
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
         self._timeout_s = timeout_s
         self._asked_ns: dict[str, int] = {}
-        self._cleared = self._uploaded = False
+        self._cleared = False
+        # When the control program was first sent.
+        self._uploaded_ns: int | None = None
         # The controller's latest refusal of a request that could be done without.
         self._answered = ""
         # Whether the attempt has succeeded, or why it has ended otherwise.
@@ -74,7 +83,11 @@ class Recovery:
         self.refusal = reason
 
     def advance(self, sample: RtdeSample, now_ns: int, *, recent: bool) -> bool:
-        """Do the step that is due in this cycle, unless the sample is old; return whether the attempt has ended."""
+        """Do the step that is due in this cycle, unless the sample is old; return whether the attempt has ended.
+
+        Raises:
+            RobotLostError: the control program cannot be sent, or does not start.
+        """
         if self.refusal is None and now_ns > self._deadline_ns:
             self.refusal = (
                 f"The robot did not get ready within {self._timeout_s:g} s (robot mode: {sample.robot_mode_name}, "
@@ -84,6 +97,8 @@ class Recovery:
         if self.refusal is None and recent:
             try:
                 self._step(sample, now_ns)
+            except RobotLostError:
+                raise
             except DriverError as error:
                 self.refusal = str(error)
         return self.ready or self.refusal is not None
@@ -94,7 +109,7 @@ class Recovery:
             self._make_safe(sample, now_ns, safe)
             return
         self._close_popups(now_ns)
-        if self._uploaded and sample.program_running:
+        if self._uploaded_ns is not None and sample.program_running:
             # The control connection may see the program a sample later; then try again in the next cycle.
             self.ready = self._arm.arm_watchdog()
         elif sample.runtime_state != RUNTIME_STOPPED:
@@ -107,13 +122,16 @@ class Recovery:
             # Registers outlive the program: a new one would first execute the last command.
             self._cleared = self._arm.clear_command()
         else:
-            if self._uploaded:
+            if self._uploaded_ns is None:
+                self._uploaded_ns = now_ns
+            elif now_ns >= self._uploaded_ns + int(STARTS_WITHIN_S * 1e9):
+                raise RobotLostError("script", NOT_STARTING)
+            else:
                 # A heartbeat, for a script that arms its watchdog before its loop.
                 self._arm.clear_command()
             # The controller may be busy and drop an upload.
             if self._is_due("upload", now_ns):
                 self._arm.upload()
-            self._uploaded = True
 
     def _make_safe(self, sample: RtdeSample, now_ns: int, safe: bool) -> None:
         if not self.operator_asked:

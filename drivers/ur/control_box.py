@@ -17,7 +17,7 @@ from typing import Final
 
 from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs
-from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER
+from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, STEP_REGISTER
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # The services behind the ports, as PolyScope's menu names them.
@@ -63,18 +63,19 @@ _TYPES: Final = {
     "runtime_state": "UINT32",
     "speed_scaling": "DOUBLE",
     "output_int_register_0": "INT32",
-    CLOCK_REGISTER: "DOUBLE",
+    CLOCK_REGISTER: "INT32",
+    STEP_REGISTER: "DOUBLE",
 }
 # Outputs that controllers have from PolyScope 3.12 and 5.5.1 on.
 _TOOL_TYPES: Final = {"payload": "DOUBLE", "payload_cog": "VECTOR3D", "tcp_offset": "VECTOR6D"}
 # The same outputs, after the header and the recipe's number.
-_VALUES: Final = struct.Struct(">d30d2iIdid")
+_VALUES: Final = struct.Struct(">d30d2iId2id")
 _TOOL_VALUES: Final = struct.Struct(">d3d6d")
 _PACKAGE_BYTES: Final = HEADER.size + 1 + _VALUES.size
 _PACKAGE_SIZES: Final = (_PACKAGE_BYTES, _PACKAGE_BYTES + _TOOL_VALUES.size)
 _NO_TOOL: Final = (math.nan,) * 10
 # An input package: the header, the recipe's number and one value.
-_DEADLINE: Final = struct.Struct(">HBBd")
+_DEADLINE: Final = struct.Struct(">HBBi")
 # One second of samples.
 _READ_BYTES = 1 << 15
 # The smallest clock offset may rise by this share of the time. Clocks drift by up to 500 ppm, and a simulator's may be
@@ -348,7 +349,7 @@ class SampleParser:
         v = _VALUES.unpack_from(data, start)
         tool = _NO_TOOL if size == _PACKAGE_BYTES else _TOOL_VALUES.unpack_from(data, start + _VALUES.size)
         motion = v[0], v[1:7], v[7:13], v[13:19], v[19:25], v[25:31]
-        return RtdeOutputs(*motion, v[31], v[32], v[33], v[34], v[35], v[36], tool[0], tool[1:4], tool[4:])
+        return RtdeOutputs(*motion, v[31], v[32], v[33], v[34], v[35], v[36], v[37], tool[0], tool[1:4], tool[4:])
 
 
 class RtdeReceiver:
@@ -408,10 +409,10 @@ class RtdeReceiver:
             self._sample = self._receive() or self._sample
         return self._sample
 
-    def write_deadline(self, script_s: float) -> None:
+    def write_deadline(self, script_ticks: int) -> None:
         """Write when the motion has to end, by the script's clock."""
         try:
-            self._connection.send(_DEADLINE.pack(_DEADLINE.size, _DATA, self._recipe, script_s))
+            self._connection.send(_DEADLINE.pack(_DEADLINE.size, _DATA, self._recipe, script_ticks))
         except OSError:
             # Also where the socket is full: the controller has read nothing for long.
             self.connected = False
@@ -477,7 +478,7 @@ class ScriptReadiness:
     """
 
     def __init__(self, samples: RtdeReceiver, timeout_s: float) -> None:
-        """Wait for `timeout_s` at most: the time after which the robot's watchdog ends the program."""
+        """Wait for `timeout_s` at most: meanwhile nothing else is sent, and nothing extends a motion."""
         self._samples, self._timeout_s = samples, timeout_s
         # By the controller's clock; only a later sample shows the script after the command.
         self._command_s = -math.inf

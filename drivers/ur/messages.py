@@ -15,8 +15,8 @@ from shearloop.drivers.ur.settings import Six, Three, UrSettings
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal[
-    "unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "lost", "crashed", "hung",
-    "garbled",
+    "unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "script", "lost", "crashed",
+    "hung", "garbled",
 ]  # fmt: skip
 
 # `RobotState.end_reason` of a motion that ended as commanded; any other reason is a sentence.
@@ -168,9 +168,10 @@ class RtdeOutputs:
     safety_mode: int
     runtime_state: int
     speed_scaling: float
-    # Of the control script: 1 when ready, 2 when done with a command; and its own clock.
+    # Of the control script: 1 when ready, 2 when done with a command; its clock, and the time of one tick.
     script_state: int
-    script_s: float
+    script_ticks: int
+    script_step_s: float
     # What is set at the pendant, at the flange; NaN where the controller does not report it.
     payload_kg: float
     payload_cog_m: Three

@@ -1,38 +1,65 @@
 """The control script on the robot: ur-rtde's own, with a watchdog and limits that need no client.
 
 The client gives each motion a deadline, by the script's own clock, in an input register that ur-rtde leaves free, and
-extends it. The script turns the wrist no further than the deadline, its range and its largest force and torque allow. A
-linear move that its client does not stop ends with the program.
+extends it. The script turns the wrist no further than the deadline, its range and its largest force and torque allow.
+It stops a linear move that its client does not stop, and ends. The watchdog is slower: a program that ends while the
+arm moves may end in a protective stop.
 """
 
 import re
 
 from shearloop.drivers.ur.settings import UrSettings
 
-# RTDE guide: other clients may use the double registers from 24 on; ur-rtde uses lower ones.
-DEADLINE_REGISTER, CLOCK_REGISTER = "input_double_register_24", "output_double_register_24"
+# RTDE guide: the registers from 24 on are for RTDE clients; ur-rtde uses the first ones of either half.
+_REGISTER = 47
+DEADLINE_REGISTER, CLOCK_REGISTER = f"input_int_register_{_REGISTER}", f"output_int_register_{_REGISTER}"
+# The time of one tick of the clock, in s.
+STEP_REGISTER = f"output_double_register_{_REGISTER}"
 # The clock starts at 0: with this deadline no motion begins or goes on.
-NO_MOTION_S = -1.0
+NO_MOTION_TICKS = -1
 # A deadline lies this much further ahead at most: a cycle of the slowest controller, for rounding.
 _SLACK_S = 0.008
-# The client has this time to stop a linear move after its deadline.
+# The client has this time to stop a linear move after its deadline; then the script does.
 _GRACE_S = 0.05
 
 # ur-rtde 1.6.5: the line before the main loop, and the thread that carries out speeds.
 _BEFORE_LOOP = "        keep_running = True\n"
+# ur-rtde writes the number of its first register where it has a comment.
+_REGISTER_OFFSET = re.compile(r"(global reg_offset_\w+ =) #.*")
 _SPEED_THREAD = re.compile(r"^    thread speed_thread\(\):\n.*?^    end\n", re.MULTILINE | re.DOTALL)
 
 # speedj returns after a cycle, so that each cycle checks. The clock starts at 0 in each program, and a deadline too far
-# ahead is an older program's. An overload stops the wrist until the client asks for rest.
+# ahead is an older program's. It counts cycles: a sum of times would drift, for URScript's numbers may have 32 bits. An
+# overload stops the wrist until the client asks for rest.
 _GUARD = """\
-    global guard_s = 0.0
+    global guard_ticks = 0
+
+    def guard_left_s():
+        return (read_input_integer_register({register}) - guard_ticks) * {step}
+    end
+
+    def guard_end_move():
+        # Two threads that move the arm are an error: the others end first.
+        enter_critical
+        kill move_thrd
+        move_thrd = 0
+        if stop_thrd != 0:
+            kill stop_thrd
+            stop_thrd = 0
+        end
+        exit_critical
+        textmsg("shearloop: the straight move was not renewed in time: the arm stops and the program ends")
+        stopj({hardest})
+        halt
+    end
 
     thread guard_clock():
+        write_output_float_register({register}, {step})
         while (True):
-            guard_s = guard_s + {step}
-            write_output_float_register(24, guard_s)
-            if move_thrd != 0 and guard_s > read_input_float_register(24) + {grace}:
-                halt
+            guard_ticks = guard_ticks + 1
+            write_output_integer_register({register}, guard_ticks)
+            if move_thrd != 0 and guard_left_s() < -{grace}:
+                guard_end_move()
             end
             sync()
         end
@@ -46,7 +73,7 @@ _GUARD = """\
     end
 
     def guard_largest_speed(asked):
-        left = read_input_float_register(24) - guard_s
+        left = guard_left_s()
         q = get_actual_joint_positions()
         room = ({upper}) - q[5]
         if asked < 0:
@@ -64,6 +91,7 @@ _GUARD = """\
 
     thread speed_thread():
         overloaded = False
+        late = False
         while (True):
             enter_critical
             asked = speed_target[5]
@@ -71,6 +99,11 @@ _GUARD = """\
             exit_critical
             overloaded = asked != 0 and (overloaded or guard_is_overloaded())
             largest = guard_largest_speed(asked)
+            was_late = late
+            late = asked != 0 and guard_left_s() < 0
+            if late and not was_late:
+                textmsg("shearloop: the wrist's speed was not renewed in time: the wrist stops")
+            end
             if overloaded:
                 largest = 0.0
             end
@@ -107,6 +140,7 @@ def guard_script(script: str, settings: UrSettings) -> str:
     margin = limits.joints.margin_rad
     values = {
         # CB3 controllers do not have the function; their cycle takes 8 ms.
+        "register": _REGISTER,
         "step": "get_steptime()" if "get_steptime()" in script else "0.008",
         "watchdog_hz": settings.watchdog_hz,
         "grace": _GRACE_S,
@@ -119,5 +153,6 @@ def guard_script(script: str, settings: UrSettings) -> str:
         "force": limits.force_n.hard,
         "torque": limits.torque_nm.hard,
     }
+    script = _REGISTER_OFFSET.sub(r"\1 0", script)
     script = _SPEED_THREAD.sub(lambda _: _GUARD.format(**values), script)
     return f"def rtde_control():\n{script.replace(_BEFORE_LOOP, _START.format(**values) + _BEFORE_LOOP)}end\n"

@@ -21,6 +21,8 @@ Three = tuple[float, float, float]
 _Deadline = Annotated[float, Field(gt=0, le=1)]
 # The wrist stands this long after the last decision (docs/safety.md).
 _PROMISED_S = 0.2
+# The watchdog is slower than a stop by this factor.
+_WATCHDOG_FACTOR = 1.5
 
 
 class _Checked:
@@ -195,8 +197,6 @@ class UrSettings(_Checked):
     """What the pendant must have for motion."""
     rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
     """Robot states per second."""
-    watchdog_hz: Annotated[float, Field(ge=1, le=150)] = 10.0
-    """The robot ends its program when it receives nothing for 1/watchdog_hz."""
     command_timeout_s: _Deadline = 0.1
     """A wrist speed holds for this long after its decision, and after the robot's last state; then the wrist stops."""
     silence_timeout_s: _Deadline = 0.1
@@ -213,14 +213,9 @@ class UrSettings(_Checked):
     """Delay until a commanded speed takes effect; distances to the joint limits include it."""
 
     def __post_init__(self) -> None:
-        """Refuse a host that is none, and rates that contradict each other."""
+        """Refuse a host that is none."""
         if reason := why_no_host(self.host):
             raise ValueError(f"host {reason}; give the robot's address")
-        if self.rate_hz < 3 * self.watchdog_hz:
-            raise ValueError(
-                f"rate_hz ({self.rate_hz:g}) must be at least three times watchdog_hz ({self.watchdog_hz:g}), "
-                "or one late cycle ends the robot's program"
-            )
 
     @property
     def standstill_s(self) -> float:
@@ -228,6 +223,14 @@ class UrSettings(_Checked):
         wrist = self.limits
         braking_s = wrist.wrist_speed_rad_per_s.inner / wrist.wrist_acceleration_rad_per_s2.hard
         return max(self.command_timeout_s, self.silence_timeout_s) + 2 / self.rate_hz + braking_s
+
+    @property
+    def watchdog_hz(self) -> float:
+        """The robot ends its program when it receives nothing for one period of this.
+
+        The arm then stands already: a program that ends while the arm moves may end in a protective stop.
+        """
+        return 1.0 / (_WATCHDOG_FACTOR * self.standstill_s)
 
     @property
     def warning(self) -> str:

@@ -2,7 +2,7 @@
 
 It runs 125 cycles a second and sends the state of each. ur-rtde may hang or crash at any time, so that the worker
 holds nothing worth saving. Before each stretch that may hang it sets an alarm, and the kernel ends it in time; the
-robot's watchdog then ends the motion. When stdin ends the daemon is gone: the worker stops the arm and exits.
+script on the robot then stops the arm. When stdin ends the daemon is gone: the worker stops the arm and exits.
 """
 
 import contextlib

@@ -191,7 +191,7 @@ async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_
     why = "the daemon ended: the wrist is stopped, a gripped tool stays gripped"
     assert not daemon.finished
     assert (watcher.seen["loop.state"][-1]["phase"], watcher.seen["loop.state"][-1]["activity"]) == ("stopped", why)
-    assert "STOPPED before its end" in out.getvalue()
+    assert "stopped as asked" in out.getvalue()
     assert f"  {why}\n" in out.getvalue()
     assert "the experiment has ended" in log.said
 

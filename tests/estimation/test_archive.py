@@ -78,7 +78,7 @@ def test_foreign_and_stale_files_are_refused(tmp_path, small):
         Calibration.load(tmp_path / "none.cal")
     for find, new, message in (
         (PAPER_TABLE.digest, f"'{'0' * 64}'", "channel table 000000000000…, expected"),
-        ("format_version: 8", "format_version: 5", "format version 5, expected 8; calibrate again"),
+        ("format_version: 10", "format_version: 9", "format version 9, expected 10; calibrate again"),
     ):
         with pytest.raises(CalibrationError, match=message):
             Calibration.load(edited(small, tmp_path / "stale.cal", find, new))
@@ -216,7 +216,7 @@ def test_arrays_that_fit_each_other_and_not_the_channel_table_are_refused(motion
     estimator = motion_calibration.estimator
     temporal = estimator.temporal
     if change == "fewer lags":
-        changed = replace(temporal, n_lags=temporal.n_lags - 1)
+        changed = replace(temporal, edges=temporal.edges[:-1])
     else:
         changed = replace(temporal, directions=temporal.directions[:, :, :-1].copy())
     replace(motion_calibration, estimator=replace(estimator, temporal=changed)).save(tmp_path / "x.cal")

@@ -41,7 +41,7 @@ def taring(motion_calibration):
 def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(motion_calibration, like):
     """A zero that is asked for while a tool is held, which is let go and gripped again before it is complete."""
     tracker, reasons = EstimatorSession(motion_calibration), []
-    n_lags = motion_calibration.estimator.motion.n_lags
+    n_lags = motion_calibration.estimator.motion.n_needed - 1
     before = [*np.zeros(12), *UP, *np.ones(n_lags)]
     for i, share in enumerate([*before, *DOWN, *UP, *np.ones(n_lags + 1)]):
         if i == len(before):
@@ -57,9 +57,10 @@ def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(motion_calibra
 def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(motion_calibration, process):
     """What a grip was before a zero says nothing of the next one, which comes before an idle frame was seen again."""
     tracker = EstimatorSession(motion_calibration)
-    process(tracker, [*np.zeros(12), *UP, *np.ones(13)])
+    n_lags = motion_calibration.estimator.motion.n_needed - 1
+    process(tracker, [*np.zeros(12), *UP, *np.ones(n_lags + 1)])
     tracker.tare(10)
-    assert not process(tracker, [*np.zeros(10), *np.full(18, 0.3)], start_s=100.0)[-1].reasons
+    assert not process(tracker, [*np.zeros(10), *np.full(n_lags + 6, 0.3)], start_s=100.0)[-1].reasons
 
 
 def test_a_zero_during_which_a_tool_is_let_go_begins_anew(taring, process, like):
@@ -93,7 +94,7 @@ def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(taring, process):
 
 
 def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(motion_calibration, taring, process):
-    seen = process(taring(2), [0, 0, *np.full(18, 0.3)])
+    seen = process(taring(2), [0, 0, *np.full(motion_calibration.estimator.motion.n_needed + 5, 0.3)])
     assert not seen[-1].reasons
     steps = np.array([guard.gripped - guard.idle for guard in motion_calibration.validators])
     assert seen[-1].difference == pytest.approx(0.3 * steps)
@@ -105,7 +106,8 @@ def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(
     motion_calibration, process, like, spoilt, kind
 ):
     tracker, rng = EstimatorSession(motion_calibration), np.random.default_rng(4)
-    shares = [*np.zeros(12), *UP, *np.ones(14)]
+    n_lags = motion_calibration.estimator.motion.n_needed - 1
+    shares = [*np.zeros(12), *UP, *np.ones(n_lags + 2)]
     assert process(tracker, shares)[-1].valid
     for i in range(len(shares), len(shares) + spoilt):
         frame = like(0.5 * i, 1.0)
@@ -115,18 +117,19 @@ def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(
             frame = TactileFrame.of(frame.t_s, frame.channels, rng.random(frame.channels.shape) > 0.4)
         assert "fingertip" in tracker.estimate(frame).reasons[0]
     after = tracker.estimate(like(0.5 * (len(shares) + spoilt), 1.0))
-    assert after.reasons == (() if spoilt <= 3 else ("gripped too recently: 12 more frames are needed",))
+    assert after.reasons == (() if spoilt <= 3 else (f"gripped too recently: {n_lags} more frames are needed",))
 
 
 @pytest.mark.parametrize("lost", [2, 3, 4])
 def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(motion_calibration, process, lost):
     """A frame is put halfway where one is missing: with more of them lost, all before would be of another time."""
     tracker = EstimatorSession(motion_calibration, period_s=0.27)
-    shares = [*np.zeros(12), *UP, *np.ones(14)]
+    n_lags = motion_calibration.estimator.motion.n_needed - 1
+    shares = [*np.zeros(12), *UP, *np.ones(n_lags + 2)]
     assert process(tracker, shares, step_s=0.27)[-1].valid
     after = [one.reasons for one in process(tracker, [1.0, 1.0], 0.27 * (len(shares) + lost), 0.27)]
     assert after[0] == ("there is no earlier frame to compare with",)
-    assert after[1] == ("gripped too recently: 12 more frames are needed",)
+    assert after[1] == (f"gripped too recently: {n_lags} more frames are needed",)
 
 
 def test_a_board_that_turns_out_slower_than_its_first_frames_is_followed(motion_calibration, like):
@@ -147,7 +150,7 @@ def sessions(draw):
     for _ in range(draw(st.integers(3, 8))):
         some = draw(st.lists(st.sampled_from(sorted(STEPS_S)), max_size=4))
         frames += [(kind, draw(st.booleans())) for kind in some] + [("good", draw(st.booleans()))]
-        frames += [("good", False)] * draw(st.sampled_from((0, 1, 2, 14)))
+        frames += [("good", False)] * draw(st.sampled_from((0, 1, 2, 20)))
     return frames
 
 
@@ -155,12 +158,12 @@ def test_what_is_valid_is_of_one_grip_and_hardly_made_up(motion_calibration):
     """Against a plain account of what happened: whatever frames are lost or spoilt, and whatever happens meanwhile."""
     guards, motion = motion_calibration.validators, motion_calibration.estimator.motion
     idle, gripped = (np.array([getattr(guard, name) for guard in guards]) for name in ("idle", "gripped"))
-    begun = [*[("good", False)] * 12, ("good", True), *[("good", False)] * 14]
+    begun = [*[("good", False)] * 12, ("good", True), *[("good", False)] * 20]
 
     @given(sessions(), st.sampled_from((0.5, np.inf)))
     @settings(max_examples=100, deadline=None)
     @example(session=[*[("gap", False)] * 4, ("good", False), ("late", False), ("gap", False), *[("good", True)] * 6,
-                      *[("good", False)] * 14], period_s=np.inf)  # fmt: skip
+                      *[("good", False)] * 20], period_s=np.inf)  # fmt: skip
     def holds(session, period_s):
         memory, rng = SessionState(guards, motion, period_s), np.random.default_rng(0)
         t_s, held, before, other, account, steps_s = 0.0, False, None, None, [], []
@@ -187,10 +190,10 @@ def test_what_is_valid_is_of_one_grip_and_hardly_made_up(motion_calibration):
             account.append(None if spoilt or changed else held)
             before, other = before if spoilt or changed else held, changed
             if not moment.reasons:
-                last = account[-motion.n_lags - 1 :]
+                last = account[-motion.n_needed :]
                 assert not spoilt
-                assert len(last) == motion.n_lags + 1
-                assert last.count(None) <= 3
+                assert len(last) == motion.n_needed
+                assert last.count(None) <= max(3, motion.n_lags // 4)
                 assert set(last) <= {True, None}
                 for found in (moment.difference, moment.mean_difference):
                     np.testing.assert_allclose(found, gripped - idle, atol=1e-9)

@@ -78,7 +78,7 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
     stopped = taking_turns(*((event, each_s) for event in events))
     stopped_s, gate = stopped
     assert stopped_s == pytest.approx(HELD_AT_MOST_S, abs=2 * TICK_S)
-    reason = gate.report([]).reasons[-1]
+    (reason,) = (one for one in gate.report([]).reasons if "held for too long" in one)
     assert "held for too long" in reason
     assert all(f"{event.text} for " in reason for event in events[:4])
 
@@ -209,6 +209,11 @@ def test_a_pause_of_the_daemon_stops_and_what_it_leads_to_is_not_repeated():
     assert {one.code for one in later.faults} == {one.code for one in (paused, invalid, old, lost)}
     gate.acknowledge()
     assert gate.report([invalid]).reasons == (invalid.sentence,)
+
+
+def test_what_stops_is_told_before_what_holds():
+    held, stops = trouble(FaultCode.ESTIMATE_STALE), trouble(FaultCode.ROBOT_BLOCKED)
+    assert SafetyMonitor().judge([held, stops], 0).reasons == (stops.sentence, held.sentence)
 
 
 @pytest.mark.parametrize("code", ["ROBOT_STARTING", "ROBOT_BLOCKED", "ROBOT_LOST", "DEVICE_LOST"])

@@ -33,7 +33,7 @@ def control_script(settings: UrSettings | None = None, version: tuple[int, int] 
     text = script_client.ScriptClient("", *version).getScript()
     script = guard_script(text, settings) if settings is not None else f"def rtde_control():\n{text}end\n"
     # ur-rtde inserts the registers' numbers when it sends it.
-    return re.sub(r"(# (?:float|int) register offset\n)", r"\g<1>0", script)
+    return re.sub(r"= # (?:float|int) register offset\n", "= 0\n", script)
 
 
 def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> None:

@@ -24,8 +24,8 @@ pytestmark = pytest.mark.real_time
 
 pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
 
-# The promise for a twist whose client dies: the robot has stopped.
-STOPPED_WITHIN_S = 0.2
+# A twist whose client dies: its deadline in these tests, and the time to brake.
+STOPPED_WITHIN_S = settings_for("a-robot").standstill_s
 
 
 async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5) -> None:
@@ -174,6 +174,27 @@ async def test_protective_stop_is_reported_and_unlocked_by_the_same_worker(contr
         assert not controller.happened("motion-started", asked_ns), "the speed from before the stop was taken up again"
         await turn(robot, controller, -0.5)
         assert pid_of(robot) == pid
+
+
+async def test_program_starts_again_long_after_the_first_upload(controller):
+    """The controller streams to ur-rtde's own script connection, which is never read, until it listens no longer."""
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        pid, first = pid_of(robot), await robot.next_state()
+        await until(robot, lambda state: state.timestamp_s > first.timestamp_s + 4.0)
+        await controller.fault("normal")  # ends the program
+        await until(robot, lambda state: not state.program_running)
+        assert (await robot.send(Unlock())).accepted
+        assert pid_of(robot) == pid
+
+
+async def test_worker_whose_scripts_are_dropped_is_replaced_until_one_starts(controller, link):
+    await controller.fault("drop-scripts")
+    async with running(settings_for(controller.host), link) as robot:
+        assert "does not play it" in (await link.down()).sentence
+        assert robot.losses["script"] == 1
+        await controller.fault("normal")
+        await enable(robot)
 
 
 async def test_emergency_stop_is_reported_and_recovered_from(controller):

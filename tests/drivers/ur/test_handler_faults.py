@@ -2,7 +2,7 @@
 
 import pytest
 
-from shearloop.drivers.ur.messages import Disconnect, Enable, Stop, Unlock, WristSpeed
+from shearloop.drivers.ur.messages import Disconnect, Enable, RobotLostError, Stop, Unlock, WristSpeed
 from tests.drivers.ur.flight import SETTINGS, Flight, flying, moving, turning
 
 
@@ -189,7 +189,8 @@ def test_ended_program_is_reported_and_restarted_on_unlock():
 def test_recovery_times_out_and_reports_the_modes():
     flight = flying()
     flight.arm.end_program()
-    flight.arm.upload = lambda: True  # an upload that never takes
+    flight.arm.be(robot_mode=3)
+    flight.arm.ignores["power on"] = "The controller says nothing"
     begun_ns = flight.now_ns
     reply = flight.ask(Unlock())
     assert "within 30 s" in reply.refusal
@@ -261,6 +262,20 @@ def test_unlocking_with_old_samples_times_out():
     flight.arm.calls.clear()
     flight.fly(100)
     assert flight.arm.calls == [], "nothing is unlocked so long after the operator's word"
+
+
+def test_worker_whose_uploads_start_nothing_is_replaced():
+    """A new one has new connections. A lost upload is sent once more before."""
+    flight = flying()
+    flight.arm.end_program()
+    flight.arm.calls.clear()
+    flight.arm.upload = lambda: flight.arm.calls.append("upload")
+    begun_ns = flight.now_ns
+    with pytest.raises(RobotLostError, match="does not play it") as lost:
+        flight.ask(Unlock())
+    assert lost.value.kind == "script"
+    assert flight.arm.calls.count("upload") == 2
+    assert flight.now_ns - begun_ns == pytest.approx(2e9, rel=0.02)
 
 
 def test_slowly_starting_program_gets_heartbeats(monkeypatch):

@@ -52,7 +52,7 @@ def test_clocks_that_drift_apart_do_not_make_samples_old(drift):
 def test_samples_of_a_slow_clock_become_old():
     ages = ages_s([0.001] * 900, drift=0.05)
     old_s = next(number * PERIOD_NS / 1e9 for number, age_s in enumerate(ages) if age_s > 0.25)
-    assert old_s == pytest.approx(6.25, abs=0.1), "as docs/holds.md says: it cannot be told from a network's delay"
+    assert old_s == pytest.approx(6.25, abs=0.1), "as docs/faults.md says: it cannot be told from a network's delay"
 
 
 def test_controller_clock_pause_is_forgotten_in_time():

@@ -33,7 +33,8 @@ def test_script_differs_in_its_speed_thread_and_before_its_loop():
     assert all(first <= begin <= end < after for _, begin, end, *_ in speeds)
     _, begin, end, here, _ = start
     assert begin == end < own.index("        while keep_running:")
-    assert guarded[here].strip() == 'rtde_set_watchdog("input_int_register_0", 10, "stop")'
+    armed = f'rtde_set_watchdog("input_int_register_0", {DELIVERED.watchdog_hz:g}, "stop")'
+    assert guarded[here].strip() == armed
     # What comes before it in the program itself, beside functions, reads nothing.
     assert not any("read_input" in line for line in own[own.index("# HEADER_END") : begin])
 

@@ -1,0 +1,185 @@
+"""Which of the gel's motion a torque is fitted to: directions, memory and penalty, by twists left out.
+
+Few directions and a long memory in growing steps generalise to other twists, grips and days; how few depends on the
+fingertips. So every combination is fitted with each twist left out, and judged on the loaded frames of that twist:
+the many frames without a load would decide otherwise. The fits that are nearly as good as the best are averaged, which
+is again one linear map. A penalty shrinks the estimates; the left-out twists show by how much, and the map is divided
+by it.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TypeAlias
+
+import numpy as np
+
+from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.estimation.gain import find_twists
+from shearloop.estimation.interval_regressor import CensoredRidge, LeftOut, Ridge, reported_values
+from shearloop.estimation.regressors import left_out_groups
+
+# Ends of the steps of the memory in frames back: 18 frames are 10 s, and the gel creeps for some seconds.
+MEMORY_EDGES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 16, 19)
+# Directions per fingertip, steps of the memory (12 and 18 frames), and penalties to choose from.
+MOST_DIRECTIONS = 3
+_DIRECTIONS, _STEPS, _PENALTIES = (1, 2, 3), (10, 12), (1e-5, 1e-4)
+# Where the gel holds its position, that position shows a long twist, and the shortest memory serves.
+_STEPS_WITH_POSITION = (8,)
+# Fits whose left-out error is within this factor of the least one are averaged.
+_NEARLY_AS_GOOD = 1.25
+# Fewest twists that are left out one by one, and most parts; with more twists, neighbours are left out together.
+_LEAST_TWISTS, _MOST_PARTS = 3, 10
+# Where loads are rarer than this share of the frames, few twists are left out by so many frames.
+_RARE_LOAD, _FRAMES_OF_FEW_TWISTS = 0.5, 2
+# The slope is divided out where left-out loads err by less than this share: a poor estimate has no sure slope. On the
+# recorded stream both fingertips have 0.08, right 0.11, left 0.25.
+_SURE_SLOPE = 0.15
+
+# Fits (n, d) features to (n,) values with a penalty.
+LinearFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Ridge]
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What the columns of the features of motion are: steps of the memory × sides × directions, then positions."""
+
+    n_steps: int
+    n_sides: int
+    n_directions: int
+
+    def columns(self, n_steps: int, n_directions: int, *, position: bool) -> BoolArray:
+        """Return which columns (d,) belong to the nearest steps, the first directions, and perhaps their positions."""
+        shape = self.n_steps, self.n_sides, self.n_directions
+        step, _, direction = np.indices(shape)
+        moved = (step < n_steps) & (direction < n_directions)
+        positions = np.indices(shape[1:])[1] < n_directions
+        return np.concatenate([moved.ravel(), positions.ravel() & position])
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One choice of directions per fingertip, steps of the memory, and penalty."""
+
+    n_directions: int
+    n_steps: int
+    penalty: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionFit:
+    """The chosen candidates, whose mean is the fit; its slope on frames left out; and its mean squared error there."""
+
+    layout: Layout
+    fit_one: LinearFit
+    position: bool
+    candidates: tuple[Candidate, ...]
+    slope: float = 1.0
+    squared_error: float = field(default=np.inf)
+
+    @property
+    def n_directions(self) -> int:
+        """The most directions of a candidate."""
+        return max(one.n_directions for one in self.candidates)
+
+    @property
+    def n_steps(self) -> int:
+        """The most steps of a candidate."""
+        return max(one.n_steps for one in self.candidates)
+
+    @property
+    def columns(self) -> BoolArray:
+        """Which columns (d,) of the features are used."""
+        return self.layout.columns(self.n_steps, self.n_directions, position=self.position)
+
+    def fit(self, features: FloatArray, values: FloatArray, _strength: float = 0.0) -> Ridge:
+        """Return the mean of the candidates' fits to (n, d) features and (n,) values, divided by the slope."""
+        members = [self._fit_candidate(one, features, values) for one in self.candidates]
+        return mean_ridge(members).scaled(1.0 / self.slope)
+
+    def fit_used(self, features: FloatArray, values: FloatArray, strength: float = 0.0) -> Ridge:
+        """Return `fit` for features (n, d) that are reduced to the used `columns`."""
+        whole = np.zeros((len(features), len(self.columns)))
+        whole[:, self.columns] = features
+        found = self.fit(whole, values, strength)
+        return replace(found, mean=found.mean[self.columns], weights=found.weights[self.columns])
+
+    def _fit_candidate(self, one: Candidate, features: FloatArray, values: FloatArray) -> Ridge:
+        columns = self.layout.columns(one.n_steps, one.n_directions, position=self.position)
+        found = self.fit_one(features[:, columns], values, one.penalty)
+        mean, weights = np.zeros((2, features.shape[1]))
+        mean[columns], weights[columns] = found.mean, found.weights
+        return replace(found, mean=mean, weights=weights)
+
+
+def mean_ridge(members: Sequence[Ridge]) -> Ridge:
+    """Return the linear map whose prediction is the mean of the members' predictions."""
+    centre = np.mean([one.mean for one in members], axis=0)
+    weights = np.mean([one.weights for one in members], axis=0)
+    offset = float(np.mean([one.offset + (centre - one.mean) @ one.weights for one in members]))
+    first = members[0]
+    if isinstance(first, CensoredRidge):
+        squares = [one.sigma**2 for one in members if isinstance(one, CensoredRidge)]
+        first = replace(first, sigma=float(np.sqrt(np.mean(squares))))
+    strength = float(np.mean([one.strength for one in members]))
+    return replace(first, mean=centre, weights=weights, offset=offset, strength=strength)
+
+
+def twists_left_out(torque_nm: FloatArray) -> LeftOut:
+    """Return (rest, part) of (n,) torques in time order, where a part is a twist or some, with frames on both sides.
+
+    Of fewer than three twists among many frames without a load, a part is two frames: a whole twist left out would
+    leave nothing to learn from. The list is empty for a load that hardly ever ends.
+    """
+    n, twists = len(torque_nm), find_twists(torque_nm)
+    if len(twists) >= _LEAST_TWISTS:
+        ends = [(before[-1] + after[0] + 1) // 2 for before, after in itertools.pairwise(twists)]
+        number = np.searchsorted(ends, np.arange(n), side="right")
+        return left_out_groups(number * min(len(twists), _MOST_PARTS) // len(twists))
+    if sum(map(len, twists)) > _RARE_LOAD * n:
+        return []
+    return left_out_groups(np.arange(n) // _FRAMES_OF_FEW_TWISTS)
+
+
+def choose_motion(
+    features: FloatArray,
+    torque_nm: FloatArray,
+    layout: Layout,
+    fit_one: LinearFit,
+    left_out: LeftOut,
+    *,
+    position: bool,
+) -> MotionFit:
+    """Return the fit of (n, d) features, with all of the layout's columns, to (n,) torques."""
+    twists = find_twists(torque_nm)
+    loaded = np.concatenate(twists)
+    # A single twist cannot tell which fit another one needs: one direction is the safest.
+    can_choose = len(twists) >= _LEAST_TWISTS or len(loaded) > _RARE_LOAD * len(torque_nm)
+    directions, steps = _DIRECTIONS if can_choose else (1,), _STEPS_WITH_POSITION if position else _STEPS
+    candidates = tuple(itertools.starmap(Candidate, itertools.product(directions, steps, _PENALTIES)))
+    fits = [MotionFit(layout, fit_one, position, (one,)) for one in candidates]
+    predicted = np.array([_predict_left_out(one, features, torque_nm, left_out) for one in fits])
+    reported = partial(reported_values, fits[0].fit(features, torque_nm))
+    squares = ((reported(predicted) - torque_nm)[:, loaded] ** 2).mean(axis=1)
+    good = squares <= _NEARLY_AS_GOOD**2 * squares.min() if can_choose else np.ones(len(fits), dtype=np.bool_)
+    left_out_nm = reported(predicted[good].mean(axis=0))
+    slope = _shrinkage(left_out_nm[loaded], torque_nm[loaded]) if can_choose else 1.0
+    error = float(((left_out_nm - torque_nm) ** 2).mean())
+    return MotionFit(layout, fit_one, position, tuple(itertools.compress(candidates, good)), slope, error)
+
+
+def _predict_left_out(one: MotionFit, features: FloatArray, values: FloatArray, left_out: LeftOut) -> FloatArray:
+    """Return the (n,) predictions by fits that have not seen them."""
+    predicted = np.zeros(len(values))
+    for rest, part in left_out:
+        predicted[part] = one.fit(features[rest], values[rest]).predict(features[part])
+    return predicted
+
+
+def _shrinkage(predicted: FloatArray, truth: FloatArray) -> float:
+    """Return the slope of (n,) predictions over the truth of loaded frames, 1 where they are too poor to show it."""
+    power = float(truth @ truth)
+    if float(((predicted - truth) ** 2).sum()) > _SURE_SLOPE**2 * power:
+        return 1.0
+    return float(predicted @ truth) / power

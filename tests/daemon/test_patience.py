@@ -1,0 +1,56 @@
+"""An emulated rig survives a busy computer; a real one keeps its deadlines."""
+
+import pytest
+import yaml
+
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.control.experiment_schema import ExperimentLimits
+from shearloop.daemon.control.fault_detection import Watched, detect_faults
+from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LatestInputs, LoopConfig, TorqueSource
+from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyMonitor
+from shearloop.daemon.rig import EMULATED_PATIENCE, make_loop, open_settings
+from shearloop.errors import UserError
+from tests.fixtures.daemons import robot_at
+
+SECOND = 1_000_000_000
+EIT = TorqueSource(name="right", period_s=0.5412)
+
+
+def codes(patience: float, **changes: object) -> set[FaultCode]:
+    """Return what is found of states that are half a second old."""
+    arm, gripper = ArmStatus(0.0, 0), GripperStatus(0, 20.0, holding=False, moving=False)
+    inputs = LatestInputs(10.0, arm=arm, gripper=gripper, **changes)
+    limits = ExperimentLimits()
+    watched = Watched(driving=EIT, supervising=(), limits=limits, required=("robot", "gripper"), patience=patience)
+    return {fault.code for fault in detect_faults(inputs, watched, LoopConfig(), SECOND // 2)}
+
+
+@pytest.mark.parametrize(("late_s", "code"), [(0.2, FaultCode.LOOP_LATE), (0.5, FaultCode.DAEMON_PAUSED)])
+def test_a_busy_computer_is_no_fault_of_an_emulated_rig_alone(late_s, code):
+    assert codes(1.0, late_s=late_s) == {FaultCode.STATE_STALE, code}
+    assert codes(EMULATED_PATIENCE, late_s=late_s) == set()
+
+
+@pytest.mark.parametrize(("patience", "response"), [(1.0, Response.STOP_AND_KEEP_GRIP), (10.0, Response.HOLD)])
+def test_a_hold_of_an_emulated_rig_may_last_longer(patience, response):
+    gate, stale = SafetyMonitor(patience), Fault(FaultCode.STATE_STALE, "the gripper")
+    for second in range(4):
+        decision = gate.judge([stale], second * SECOND)
+    assert decision.response is response
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_only_an_emulated_rig_has_longer_deadlines(tmp_path):
+    robot_at("127.0.0.1", tmp_path)
+    content = {"fingertips": {"right": {"device": {"path": str(tmp_path / "right")}}}, "robot": "ur.yaml"}
+    found = {}
+    for emulated in (False, True):
+        (tmp_path / "rig.yaml").write_text(yaml.safe_dump({**content, "emulated": emulated}))
+        config = load_daemon_config(tmp_path / "rig.yaml")
+        settings = open_settings(config)
+        loop = make_loop(config, settings, {"right": EIT}, {})
+        found[emulated] = settings.command_timeout_s, settings.watchdog_hz, EIT.fresh_s(loop.config)
+    assert found == {False: (0.1, 10.0, pytest.approx(2.5 * 0.5412)), True: (1.0, 1.0, 5.0)}
+    robot_at("192.168.1.10", tmp_path)
+    with pytest.raises(UserError, match="is not this computer"):
+        open_settings(load_daemon_config(tmp_path / "rig.yaml"))

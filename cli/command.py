@@ -126,5 +126,9 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
         own = reply["configured"]
         known = [(one["path"], one["name"], "configured" if one["path"] == own else "") for one in reply["experiments"]]
         return table(("file", "name", ""), known)
+    if name == "stop":
+        if reply.get("ended"):
+            return ["stop: nothing was moving; the daemon has ended"]
+        return [f"stop: stopped {reply['stopped']}" if reply.get("stopped") else "stop: nothing was moving"]
     values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
     return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -1,6 +1,7 @@
 """The daemon's commands: one handler each, which executes the command or refuses it with a reason."""
 
 import asyncio
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -146,10 +147,11 @@ class Commands:
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()
+        daemon = {"process": os.getpid(), "folder": os.getcwd(), "rig": self.health.rig}
         if self.rig is None:
-            return {"tasks": tasks}
+            return {"tasks": tasks, "daemon": daemon}
         state = loop_state(self.rig.control_loop, 0.0, 0)
-        return {"tasks": tasks, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
+        return {"tasks": tasks, "daemon": daemon, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
 
     async def _stop(self, request: Request) -> Reply:
         spare_daemon = bool(request.get("spare_daemon"))
@@ -162,7 +164,7 @@ class Commands:
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
         # Nothing moves, so the daemon itself stops, once the reply is sent.
         asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
-        return {}
+        return {"ended": True}
 
 
 def required_rig(rig: Rig | None) -> Rig:

@@ -190,7 +190,7 @@ def test_a_command_line_mistake_is_one_sentence(arguments, part, mistake):
         ("run x.yaml --set loop.kp", "--set loop.kp is not of the form KEY=VALUE, such as loop.kp=0.5"),
         ("listen --timeout", "--timeout: expected one argument"),
         ("command strat", "there is no 'strat'; did you mean status?"),
-        ("command relase", "there is no 'relase'; there are tare, status, start,"),
+        ("command relase", "there is no 'relase'; there are tare, status, experiments, start,"),
         ("bank info", "the following arguments are required: PATH"),
         ("chart scene --out DIR --bnak my.bank", "unrecognized arguments: --bnak my.bank; did you mean --bank?"),
         ("command stauts", "there is no 'stauts'; did you mean status?"),
@@ -586,7 +586,7 @@ def test_a_stop_imports_little():
 
         def reply():
             request, client = daemon.recvfrom(1024)
-            assert msgpack.unpackb(request) == {"command": "stop"}
+            assert msgpack.unpackb(request)["command"] == "stop"
             daemon.sendto(msgpack.packb({"ok": True, "stopped": "one"}), client)
 
         threading.Thread(target=reply, daemon=True).start()

@@ -68,7 +68,7 @@ def test_list_shows_the_recordings_of_a_folder_with_what_is_known_of_each(record
         Path("torn.mcap.partial"),
     ]
     assert lines[1].split()[3] == "2"
-    assert "the recording was not closed, or is damaged" in lines[3]
+    assert "this is not an MCAP file, or is empty" in lines[3]
     assert "not closed, or being written" in lines[4]
     found = [json.loads(line) for line in ran("recording", "list", tmp_path, "--json").out.splitlines()]
     assert [one["closed"] for one in found] == [True, True, True, False]

@@ -40,7 +40,9 @@ def rig_config(config, tiny_bank, tmp_path) -> Path:
     calibration = tmp_path / "rig.cal"
     paper_curve(Bank.open(tiny_bank).identity, torque=(sigma, torque_of(sigma))).save(calibration)
     robot_at(HOST, tmp_path)
+    # With the deadlines of an emulated rig: the tests of faults have the real ones.
     return config(
+        emulated=True,
         right={"calibration": str(calibration), "frame_period_s": 0.5412 / SPEED},
         load_cell={"device": {"path": "load-cell"}, "rate_hz": 10.9 * SPEED},
         robot="ur.yaml",

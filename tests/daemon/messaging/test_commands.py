@@ -141,7 +141,7 @@ async def test_commands_are_told_with_their_answer_and_questions_are_not():
         rig=None,
         sensors=sensors,
         experiment=None,
-        health=SimpleNamespace(tasks=dict),
+        health=SimpleNamespace(tasks=dict, rig="bench"),
         daemon_end=asyncio.Event(),
         tell=lambda answered: told.append((answered.name, answered.refusal)),
     ).handlers()

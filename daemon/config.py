@@ -41,6 +41,7 @@ TAKEN_NAMES = {
 def _known_transport(address: str) -> str:
     if not address.startswith(("ipc://", "tcp://")):
         raise ValueError("must be ipc or a tcp address, for this machine only a loopback one: tcp://127.0.0.1:7761")
+    address = addresses.expanded(address)
     if not addresses.has_valid_port(address):
         raise ValueError(
             f"must end in a port, a whole number up to {addresses.LARGEST_PORT}, as in tcp://127.0.0.1:7761"
@@ -284,7 +285,7 @@ class DaemonConfig(ConfigModel):
         if not info.context:
             return folders
         own: Path = info.context["folder"]
-        return tuple(Path(os.path.normpath(own / folder)) for folder in folders) or (own,)
+        return folders or (own,)
 
     @property
     def experiment_folders(self) -> tuple[Path, ...]:

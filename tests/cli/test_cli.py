@@ -3,6 +3,7 @@
 import argparse
 import ctypes
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -23,6 +24,7 @@ from shearloop.bank.models import MODELS
 from shearloop.cli import COMMANDS, GROUPS, OTHER_SPELLINGS, command_module, main
 from shearloop.cli.bank import MODEL_NAMES
 from shearloop.cli.completion import full_parser
+from shearloop.cli.options import path_of
 from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
@@ -352,6 +354,47 @@ def test_every_argument_has_a_help_text():
     for parser in parsers(full_parser()):
         unsaid = [one.dest for one in parser._actions if not one.help or one.help.startswith(("default", "(default"))]
         assert unsaid == [], parser.prog
+
+
+def path_actions() -> list[tuple[str, argparse.Action]]:
+    """Every argument that takes a path, by its name or by its type, with its command."""
+    named = re.compile(r"(FILE|DIR|PATH|REC|CAL|SRC|CONFIG|TABLE|RIG|YAML|RECORDINGS?)(\.\w+)?")
+    return [
+        (f"{parser.prog} {action.dest}", action)
+        for parser in parsers(full_parser())
+        for action in parser._actions
+        if action.type in (Path, path_of) or (isinstance(action.metavar, str) and named.fullmatch(action.metavar))
+    ]
+
+
+def test_every_path_of_a_command_is_expanded(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/person")
+    monkeypatch.setenv("DATA", "/data")
+    found = path_actions()
+    assert len(found) > len(COMMANDS)
+    written = {
+        "~/a.mcap": "/home/person/a.mcap",
+        "$HOME/a": "/home/person/a",
+        "${DATA}/a": "/data/a",
+        "a~/b$1": "a~/b$1",
+    }
+    for name, action in found:
+        assert {text: str(action.type(text)) for text in written} == written, name
+
+
+@pytest.mark.parametrize("option", ["--config", "--config="])
+def test_a_path_that_cannot_be_expanded_is_refused(mistake, monkeypatch, option):
+    monkeypatch.delenv("NOWHERE", raising=False)
+    options = [f"{option}$NOWHERE/a"] if option.endswith("=") else [option, "$NOWHERE/a"]
+    assert "$NOWHERE/a has the variable $NOWHERE, which is not set here" in mistake("check", "a.yaml", *options)
+    assert "begins with ~no-such-user, the home of an unknown user" in mistake("check", "~no-such-user/a.yaml")
+
+
+def test_an_address_with_a_home_is_expanded(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/person")
+    parser = _command("command")
+    assert parser.parse_args(["status", "--connect=ipc://~/run/commands"]).connect == "ipc:///home/person/run/commands"
+    assert parser.parse_args(["status", "--connect", "tcp://~:1"]).connect == "tcp://~:1"
 
 
 # What a script needs no `--json` of, and why.

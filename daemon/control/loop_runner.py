@@ -1,4 +1,4 @@
-"""The task that runs the control loop: robot states in, commands out, 125 times a second; the operator's commands."""
+"""The task that runs the control loop: robot states in, commands out, 125 times a second; and its messages."""
 
 import asyncio
 from collections.abc import Mapping

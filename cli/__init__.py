@@ -41,6 +41,7 @@ COMMANDS = {
     "adapt": ("adapt", "correct a calibration's gain by one or a few twists of known torque"),
     "chart": ("chart", "chart speed against accuracy, stability, and how much model is needed"),
     "check": ("check", "check a configuration and the files it names"),
+    "commission": ("commission", "measure what a real rig is and does, stage after stage, into a report"),
     "schema": ("schema", "print the JSON Schema of a configuration, an experiment or another file"),
     "listen": ("listen", "print what a running daemon publishes"),
     "command": ("command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),

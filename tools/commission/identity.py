@@ -49,6 +49,13 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
     untested = untested_sentence(identity.polyscope)
     lines = [
         _judged("PolyScope", identity.polyscope, "a version that ur-rtde is tested on", not untested, "known versions"),
+        _judged(
+            "generation",
+            f"PolyScope {identity.polyscope.split('.', maxsplit=1)[0]}",
+            settings.facts.name,
+            int(identity.polyscope.split(".", maxsplit=1)[0]) == settings.facts.major,
+            "limits of force and torque fit the arm",
+        ),
         Line(what="ur-rtde", value=identity.ur_rtde),
         _judged("robot mode", identity.robot_mode, "RUNNING", identity.robot_mode == "RUNNING", "ready to move"),
         _judged("safety mode", identity.safety_mode, "NORMAL", identity.safety_mode == "NORMAL", "ready to move"),

@@ -1,6 +1,7 @@
 """The report and stage 0 of a commissioning: each seeded fault fails its own line, and no other."""
 
 import io
+import json
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -37,6 +38,7 @@ def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
     [
         (GOOD, []),
         (replace(GOOD, polyscope="5.99.0.0"), ["PolyScope"]),
+        (replace(GOOD, polyscope="3.15.8.0"), ["generation"]),
         (replace(GOOD, robot_mode="IDLE"), ["robot mode"]),
         (replace(GOOD, safety_mode="PROTECTIVE_STOP"), ["safety mode"]),
         (replace(GOOD, safety_checksum=""), ["safety checksum"]),
@@ -89,6 +91,9 @@ def test_stage_0_is_run_on_an_emulated_controller_with_scripted_answers(tmp_path
         monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
         assert main(["commission", str(path), "--out", str(out)]) == 0
         assert "passed payload: 1.400 kg" in capsys.readouterr().out
+        monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
+        assert main(["commission", str(path), "--out", str(out), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == yaml.safe_load(out.read_text())
         (stage,) = yaml.safe_load(out.read_text())["stages"]
         assert (stage["stage"], stage["operator"]) == ("0 identity", "Ada")
         assert "A1B2" in out.with_suffix(".html").read_text()

@@ -122,8 +122,8 @@ def memory_path(host: str) -> Path:
 def sole_driver(host: str) -> Iterator[None]:
     """Keep other daemons of this user away from a robot; raises UserError if one of them has it.
 
-    Two daemons would share the robot's memory, and neither would know of the other's stops and grips. The lock ends with
-    the process, however that ends. Where the file cannot be made, no experiment starts, and nothing is locked.
+    Two daemons would share the robot's memory, and neither would know of the other's stops and grips. The lock ends
+    with the process, however that ends. Where the file cannot be made, no experiment starts, and nothing is locked.
     """
     path = memory_path(host).with_suffix(".lock")
     with contextlib.ExitStack() as opened:

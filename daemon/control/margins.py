@@ -274,8 +274,8 @@ def margin_refusal(settings: ControllerSettings, found: ToolModel, config: LoopC
     model = loop_model(settings, found)
     if _sees_its_own_correction(model):
         return (
-            f"controller refused: its torques arrive {found.age_s:.3g} s after the middle of their acquisition, which is "
-            f"said to take {settings.window_s:.3g} s; give the sensor's true period in the configuration "
+            f"controller refused: its torques arrive {found.age_s:.3g} s after the middle of their acquisition, which "
+            f"is said to take {settings.window_s:.3g} s; give the sensor's true period in the configuration "
             "(`frame_period_s`, for the load cell `rate_hz`), and identify again"
         )
     has = margins(model)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from shearloop.errors import UserError
 from shearloop.printable import printable
-from shearloop.tools.task_row import task_row
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
@@ -216,6 +215,8 @@ def loop_line(content: Mapping[str, Any]) -> str:
 
 
 def _health(content: Mapping[str, Any]) -> str:
+    from shearloop.tools.task_row import task_row
+
     rows = [task_row(name, facts) for name, facts in content["tasks"].items()]
     tasks = (f"{name} {', '.join(filter(None, cells))}" for name, *cells in rows)
     return f"{content['memory_mb']:.0f} MB  {content['cpu_percent']:.1f} % CPU  " + "; ".join(tasks)

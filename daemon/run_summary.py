@@ -171,8 +171,7 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
     if run.last["phase"] == "held":
         run.held_s += _elapsed_s(run.last, content)
     if content["response"] == "hold" and run.last["response"] != "hold":
-        # The reason without its numbers.
-        run.hold_reasons[content["reasons"].split(":")[0].rstrip(".")] += 1
+        run.hold_reasons[FaultCode.of_text(_codes(content)[0]).value.kind] += 1
     run.last = content
     if run.steps:
         run.steps[-1].to_ns = now_ns

@@ -131,6 +131,8 @@ class Arm:
         self.q_rad: Vector = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Speed | LinearMove | None = None
+        # The pendant's speed slider, a factor on commanded speeds.
+        self.speed_slider = 1.0
         self._framed_q_rad, self._last_frame = self.q_rad, link_frames(self.q_rad)[-1]
         self._plant = plant
         self._wrench = np.zeros(6)
@@ -165,13 +167,13 @@ class Arm:
 
     def turn(self, target_rad_per_s: Vector, acceleration: float) -> None:
         """Turn towards these joint speeds from now on."""
-        self.motion = Speed(target_rad_per_s, acceleration)
+        self.motion = Speed(self.speed_slider * target_rad_per_s, acceleration)
 
     def move_to(self, pose: Vector, speed: float, acceleration: float) -> None:
         """Begin a linear move."""
         goal = np.eye(4)
         goal[:3, :3], goal[:3, 3] = Rotation.from_rotvec(pose[3:]).as_matrix(), pose[:3]
-        self.motion = LinearMove(self._frame, goal, speed, acceleration)
+        self.motion = LinearMove(self._frame, goal, self.speed_slider * speed, acceleration)
 
     def halt(self, deceleration: float) -> None:
         """Slow every joint down to rest."""

@@ -166,7 +166,7 @@ class Robot:
 
     def clear_faults(self) -> None:
         """Be safe and powered, without a program."""
-        self.protects_abrupt_ends = False
+        self.protects_abrupt_ends, self.arm.speed_slider = False, 1.0
         self.end_program("the faults are cleared")
         self.robot_mode, self.safety_mode, self._power_step_s = MODE_RUNNING, SAFETY_NORMAL, math.inf
         self._note("faults-cleared")

@@ -35,6 +35,9 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   local-control           leave remote control
   refuse-protocol         refuse the RTDE protocol version
   mute-dashboard          accept connections to the dashboard, and send nothing on them
+  drop-scripts            take programs, and play none
+  protect-abrupt-ends     end in a protective stop when a program ends while the arm moves
+  slider FRACTION         move the pendant's speed slider, 1 at its right end
   version A.B.C.D         report this version of PolyScope to later connections
   payload KG              have another payload set at the pendant
   normal                  end all of them

@@ -61,6 +61,7 @@ _TYPES: Final = {
     "robot_mode": "INT32",
     "safety_mode": "INT32",
     "runtime_state": "UINT32",
+    "target_speed_fraction": "DOUBLE",
     "speed_scaling": "DOUBLE",
     "output_int_register_0": "INT32",
     CLOCK_REGISTER: "INT32",
@@ -69,7 +70,7 @@ _TYPES: Final = {
 # Outputs that controllers have from PolyScope 3.12 and 5.5.1 on.
 _TOOL_TYPES: Final = {"payload": "DOUBLE", "payload_cog": "VECTOR3D", "tcp_offset": "VECTOR6D"}
 # The same outputs, after the header and the recipe's number.
-_VALUES: Final = struct.Struct(">d30d2iId2id")
+_VALUES: Final = struct.Struct(">d30d2iI2d2id")
 _TOOL_VALUES: Final = struct.Struct(">d3d6d")
 _PACKAGE_BYTES: Final = HEADER.size + 1 + _VALUES.size
 _PACKAGE_SIZES: Final = (_PACKAGE_BYTES, _PACKAGE_BYTES + _TOOL_VALUES.size)
@@ -349,7 +350,8 @@ class SampleParser:
         v = _VALUES.unpack_from(data, start)
         tool = _NO_TOOL if size == _PACKAGE_BYTES else _TOOL_VALUES.unpack_from(data, start + _VALUES.size)
         motion = v[0], v[1:7], v[7:13], v[13:19], v[19:25], v[25:31]
-        return RtdeOutputs(*motion, v[31], v[32], v[33], v[34], v[35], v[36], v[37], tool[0], tool[1:4], tool[4:])
+        modes, scalings, script = (v[31], v[32], v[33]), (v[34], v[35]), (v[36], v[37], v[38])
+        return RtdeOutputs(*motion, *modes, *scalings, *script, tool[0], tool[1:4], tool[4:])
 
 
 class RtdeReceiver:

@@ -15,7 +15,7 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur.control_box import RtdeReceiver, SampleParser
 from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
 
-TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32,INT32,DOUBLE"
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,DOUBLE,INT32,INT32,DOUBLE"
 TOOL_TYPES = TYPES + b",DOUBLE,VECTOR3D,VECTOR6D"
 # The answer of a controller before PolyScope 5.5.1.
 WITHOUT_TOOL = TYPES + b",NOT_FOUND,NOT_FOUND,NOT_FOUND"
@@ -29,7 +29,7 @@ def package(kind: bytes, payload: bytes) -> bytes:
 def data(number: int, *, tool: bool = True) -> bytes:
     """Return the package of a sample with this timestamp."""
     values = [round(number + 0.01 * index, 2) for index in range(30)]
-    content = struct.pack(">d30diiIdiid", number, *values, 7, -1, 2, 0.5, 1, 4750, 0.002)
+    content = struct.pack(">d30diiIddiid", number, *values, 7, -1, 2, 0.75, 0.5, 1, 4750, 0.002)
     return package(b"U", b"\x01" + content + (struct.pack(">10d", *TOOL) if tool else b""))
 
 
@@ -49,7 +49,8 @@ def test_sample_has_the_values_in_their_order():
         robot_mode=7,
         safety_mode=-1,
         runtime_state=2,
-        speed_scaling=0.5,
+        speed_slider=0.75,
+        limiter_scaling=0.5,
         payload_kg=1.5,
         payload_cog_m=(0.1, 0.2, 0.3),
         tcp_offset=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0),

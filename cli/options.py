@@ -68,7 +68,7 @@ def add_option(
     parser: argparse._ActionsContainer,
     name: str,
     kind: Callable[[str], Any],
-    metavar: str | tuple[str, str],
+    metavar: str | tuple[str, ...],
     text: str,
     **more: Any,
 ) -> None:

@@ -30,18 +30,21 @@ def print_result(result: object, sentences: Iterable[str], *, as_json: bool) -> 
     return 0
 
 
-def print_estimate(out: "TextIO | NonBlockingWriter", topic: str, content: Mapping[str, Any]) -> None:
-    """Print a message that is an estimate."""
+def print_estimate(
+    out: "TextIO | NonBlockingWriter", topic: str, content: Mapping[str, Any], *, label: str = ""
+) -> None:
+    """Print a message that is an estimate, behind a label."""
     if topic in ("eit.estimate", "skin.shear"):
-        out.write(printable(message_line(topic, content)) + "\n")
+        out.write(printable(label + message_line(topic, content)) + "\n")
         out.flush()
 
 
 class StatusLine:
     """Shows a daemon's state on one line of a terminal, as a context that leaves an empty line."""
 
-    def __init__(self, out: "TextIO | NonBlockingWriter") -> None:
+    def __init__(self, out: "TextIO | NonBlockingWriter", label: str = "") -> None:
         self._out = out
+        self._label = label
         self._state = self._torque = ""
         # None until a control loop reports; a daemon without a robot has no loop.
         self._driving: str | None = None
@@ -73,6 +76,7 @@ class StatusLine:
         from shearloop.daemon.logs import CLEAR_LINE
 
         # A longer line would wrap, and could not be cleared.
+        text = f"{self._label}{text}" if text else ""
         text, end = (printable(part).replace("\n", " ") for part in (text, end))
         width = shutil.get_terminal_size().columns - 1 - len(end)
         self._out.write(f"{CLEAR_LINE}{text if len(text) <= width else text[: width - 1] + '…'}{end}")

@@ -46,7 +46,7 @@ _VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
     "external_force_torque": ("VECTOR6D", lambda _: (0.0,) * 6),
     "payload": ("DOUBLE", lambda robot: robot.spec.payload_kg),
     "payload_cog": ("VECTOR3D", lambda robot: robot.spec.payload_cog_m),
-    "tcp_offset": ("VECTOR6D", lambda _: (0.0,) * 6),
+    "tcp_offset": ("VECTOR6D", lambda robot: robot.spec.tcp_offset),
 }
 
 

@@ -89,12 +89,15 @@ Play = Callable[..., socket.socket]
 def play(monkeypatch) -> Iterator[Play]:
     """Begin a controller: its end of the next connection, on which the answers and a sample have been sent."""
     ends: list[socket.socket] = []
+    connect = socket.create_connection
 
     def begin(
         types: tuple[bytes, ...] = (TOOL_TYPES,), started: bytes = b"\x01", inputs: bytes = b"\x01DOUBLE"
     ) -> socket.socket:
-        ends.extend(socket.socketpair())
-        *_, controller, client = ends
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            client = connect(server.getsockname())
+            controller, _ = server.accept()
+        ends.extend((controller, client))
         outputs = b"".join(package(b"O", b"\x01" + one) for one in types)
         answers = package(b"V", b"\x01") + outputs + package(b"I", inputs) + package(b"S", started)
         controller.sendall(answers + data(1, tool=types[-1] == TOOL_TYPES))
@@ -150,6 +153,22 @@ def test_deadline_is_written_to_its_register(play):
     receiver.close()
     receiver.write_deadline(1)
     assert not receiver.connected
+
+
+def test_controller_that_vanishes_is_lost_in_seconds(play):
+    """A pulled cable: nothing is acknowledged. Each deadline leaves at once."""
+    play()
+    receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
+    connection = receiver._connection
+    assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+    assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 3000
+    idle, interval, count = (
+        connection.getsockopt(socket.IPPROTO_TCP, option)
+        for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+    )
+    assert idle + interval * count <= 4
+    receiver.close()
 
 
 def test_controller_without_payload_and_tool_centre_point_is_accepted(play):

@@ -19,7 +19,12 @@ from shearloop.daemon.messaging.addresses import is_loopback_host
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.rig_memory import RigMemory, memory_path
-from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, FingertipPipeline, FingertipTask
+from shearloop.daemon.sensing.fingertip_task import (
+    CombinedFingertips,
+    FingertipPipeline,
+    FingertipStates,
+    FingertipTask,
+)
 from shearloop.daemon.sensing.frame_estimator import (
     COMBINED,
     FrameEstimator,
@@ -110,7 +115,6 @@ def patient(settings: UrSettings) -> UrSettings:
     """Return the settings of an emulated robot, with deadlines that fit a busy computer."""
     return replace(
         settings,
-        watchdog_hz=settings.watchdog_hz / EMULATED_PATIENCE,
         command_timeout_s=EMULATED_PATIENCE * settings.command_timeout_s,
         silence_timeout_s=EMULATED_PATIENCE * settings.silence_timeout_s,
         state_timeout_s=1.0,
@@ -229,10 +233,12 @@ def build_sensors(
         pairs = CombinedFingertips(pipeline(COMBINED, combined), period_s)
     tasks: dict[str, Task] = {}
     tareable: dict[str, Tareable] = {}
+    states = FingertipStates(clock, pairs)
     for name, estimator in estimators.items():
         own, tareable[name] = config.fingertips[name], (estimates := pipeline(name, estimator))
         board = EitKit(link(name, own.device), estimator.table.zero_slots, own.frame_period_s, inputs(name))
-        tasks[name] = FingertipTask(board, estimates, publisher, pairs, own.heatmap == "always")
+        states.add(board, estimates)
+        tasks[name] = FingertipTask(board, estimates, publisher, pairs, own.heatmap == "always", states)
     if pairs is not None:
         tareable[COMBINED] = pairs.pipeline
     if config.skin is not None:

@@ -37,6 +37,7 @@ class InputKind(Enum):
     TARE = "tare"  # a new zero was asked for, or found
     TOOL = "tool"  # the gripped tool changed
     ADAPT = "adapt"  # the gain was corrected by the torques in `data`
+    STATE = "state"  # the state of parser and estimator, in a recording that begins in the middle of a run
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +70,10 @@ class Parser(Protocol[ValueT_co]):
 
 class InputRecorder(Protocol):
     """Keeps the inputs of one source, so that a replay can repeat them."""
+
+    @property
+    def wants_state(self) -> bool:
+        """Whether what it keeps begins in the middle of a run, and has no state yet."""
 
     def record(self, event: RawEvent) -> None:
         """Keep the next input; never blocks."""
@@ -261,6 +266,8 @@ class SerialSensor(Generic[ValueT]):
         self._parser = parser
         self._inputs = inputs
         self._silence_s = BOOT_S
+        # Values of the last read that `readings` has not yielded yet: the parser is ahead of its reader by these.
+        self.unread = 0
         self._patience = 1
         self._prompt_values = 0
         self._value_ns = 0
@@ -269,7 +276,8 @@ class SerialSensor(Generic[ValueT]):
         """Yield the values of every line, in order and without end, as `batches` does."""
         async with contextlib.aclosing(self.batches()) as batches:
             async for values in batches:
-                for value in values:
+                for number, value in enumerate(values, 1):
+                    self.unread = len(values) - number
                     yield value
 
     async def batches(self) -> AsyncGenerator[Sequence[ValueT]]:
@@ -295,6 +303,17 @@ class SerialSensor(Generic[ValueT]):
                     continue
                 self._silence_s = self._patience * self._longest_silence_s
                 yield values
+
+    @property
+    def state_recorder(self) -> InputRecorder | None:
+        """The recorder, if it wants the state, and everything that was read has been yielded."""
+        wanted = self._inputs is not None and self._inputs.wants_state and not self.unread
+        return self._inputs if wanted else None
+
+    @property
+    def parser(self) -> Parser[ValueT]:
+        """What turns its bytes into values."""
+        return self._parser
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""

@@ -4,14 +4,16 @@ Nothing here reads a clock. A process that plays more of the rig gives the robot
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
-from shearloop.emulators.ur_arm import Arm, PathError, WristPlant
+from shearloop.emulators.ur_arm import Arm, PathError, WristPlant, frame_of_pose
 from shearloop.emulators.urscript import Program, ProgramEndedError, Registers
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 MODE_POWER_OFF, MODE_IDLE, MODE_RUNNING = 3, 5, 7
 SAFETY_NORMAL, SAFETY_PROTECTIVE_STOP, SAFETY_EMERGENCY_STOP = 1, 3, 7
+LOG_LINES = 100
 PROGRAM_END_DECELERATION, SAFETY_DECELERATION = 10.0, 20.0
 
 
@@ -22,9 +24,13 @@ class ControllerSpec:
     unlock_wait_s: float = 5.0
     power_on_s: float = 1.0
     version: tuple[int, int, int, int] = (5, 17, 3, 0)
-    # A gripper's; the arm's own pose is the flange's, so that the tool centre point is not moved.
+    # A gripper's.
     payload_kg: float = 1.0
     payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.06)
+    # From the flange to the tool centre point: position in m, rotation vector in rad.
+    tcp_offset: tuple[float, ...] = (0.0,) * 6
+    # Where the arm stands when it is switched on; None for a pose of its own.
+    joints_rad: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +48,7 @@ class Robot:
     def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None) -> None:
         """Be switched on, safe, at rest, without a program."""
         self.spec = spec or ControllerSpec()
-        self.arm = Arm(plant)
+        self.arm = Arm(plant, self.spec.joints_rad, frame_of_pose(self.spec.tcp_offset))
         self.robot_mode, self.safety_mode = MODE_RUNNING, SAFETY_NORMAL
         self._stopped_s, self._power_step_s = 0.0, math.inf
         self.registers = Registers()
@@ -52,6 +58,10 @@ class Robot:
         self.clock_s = 0.0
         self._events: list[RobotEvent] = []
         self._program: Program | None = None
+        # The last lines of the pendant's log.
+        self.log: deque[str] = deque(maxlen=LOG_LINES)
+        # Whether a program that ends by itself while the arm moves ends in a protective stop: reports differ.
+        self.protects_abrupt_ends = False
 
     def step(self, dt_s: float) -> None:
         """Run one control cycle."""
@@ -66,6 +76,8 @@ class Robot:
                     self._note(*event)
             except ProgramEndedError as ended:
                 self.end_program(str(ended))
+                if self.protects_abrupt_ends and self.arm.moving:
+                    self.protective_stop(f"the program ended while the arm moved: {ended}")
         self._move(dt_s)
         self.arm.feel(dt_s)
 
@@ -100,7 +112,7 @@ class Robot:
             return
         self.end_program("a new script arrived")
         try:
-            self._program = Program(text, self.registers, self.arm)
+            self._program = Program(text, self.registers, self.arm, self.log.append)
         except SyntaxError as error:
             self._note("script-refused", str(error))
             return
@@ -158,6 +170,7 @@ class Robot:
 
     def clear_faults(self) -> None:
         """Be safe and powered, without a program."""
+        self.protects_abrupt_ends, self.arm.speed_slider = False, 1.0
         self.end_program("the faults are cleared")
         self.robot_mode, self.safety_mode, self._power_step_s = MODE_RUNNING, SAFETY_NORMAL, math.inf
         self._note("faults-cleared")

@@ -31,7 +31,8 @@ MOST_LOOPS = 10_000
 _LASTING = ("sync", "speedj", "movel", "stopj", "stopl")
 _SAME_KEYWORDS = {"and", "or", "not", "if", "elif", "else", "while", "def", "return", "break", "continue", "global"}
 _SAME_KEYWORDS |= {"True", "False", "pass"}
-_RENAMED = re.compile(rf"\b({'|'.join(set(keyword.kwlist) - _SAME_KEYWORDS)})\b")
+# Strings stay as they are.
+_RENAMED = re.compile(rf"(\"[^\"\n]*\")|\b({'|'.join(set(keyword.kwlist) - _SAME_KEYWORDS)})\b")
 
 
 class ProgramEndedError(Exception):
@@ -80,7 +81,7 @@ def translate(text: str) -> tuple[CodeType, str]:
     # A statement may begin within a line and end within another: ur-rtde's first two do.
     text = re.sub(r"=[ \t]*\n\s*", "= ", text)
     text = re.sub(r"(?<=\S)[ \t]+(?=global\b)", "\n", text)
-    text = _RENAMED.sub(r"\1_", text)
+    text = _RENAMED.sub(lambda found: found[1] or f"{found[2]}_", text)
     declared = set(re.findall(r"\bglobal (\w+)", text))
     functions = re.findall(r"^\s*(?:def|thread) (\w+)\(", text, re.MULTILINE)
     if not functions:
@@ -122,9 +123,9 @@ def _opening(line: str, declared: set[str]) -> list[str]:
 class Program:
     """One run of a program, from its upload to its end."""
 
-    def __init__(self, text: str, registers: Registers, arm: Arm) -> None:
-        """Begin; SyntaxError where the text is no program."""
-        self._registers, self._arm = registers, arm
+    def __init__(self, text: str, registers: Registers, arm: Arm, log: Callable[[str], None]) -> None:
+        """Begin; SyntaxError where the text is no program. `log` gets the messages for the pendant's log."""
+        self._registers, self._arm, self._log = registers, arm, log
         self._step_s = 0.0
         self._events: list[Event] = []
         self._watchdogs: dict[str, float] = {}
@@ -155,8 +156,9 @@ class Program:
             "norm": lambda value: math.hypot(*value) if isinstance(value, list) else abs(value),
             "put": lambda values, index, value: [*values[:index], value, *values[index + 1 :]],
             "sqrt": math.sqrt,
-            # The pendant's log is not kept, and force mode is not played.
-            **dict.fromkeys(("textmsg", "force_mode_set_gain_scaling", "force_mode_set_damping"), lambda *_: None),
+            "textmsg": lambda *parts: self._log("".join(map(str, parts))),
+            # Force mode is not played.
+            **dict.fromkeys(("force_mode_set_gain_scaling", "force_mode_set_damping"), lambda *_: None),
             "__builtins__": {},
         }
 

@@ -158,6 +158,11 @@ class EstimatorSession:
         self._grip = _Grip()
 
     @property
+    def fixed(self) -> dict[str, object]:
+        """What follows from the configuration, and is no state."""
+        return {"calibration": self.calibration, "matcher": self._matcher}
+
+    @property
     def why_no_torque(self) -> str:
         """Why the held tool leaves no torque, though there may be a diameter; empty where it does not."""
         return "; ".join(self._tool_reasons)

@@ -12,7 +12,7 @@ import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from io import FileIO
@@ -122,6 +122,10 @@ class _SourceRecorder:
     recorder: "Recorder"
     source: str
 
+    @property
+    def wants_state(self) -> bool:
+        return self.recorder.wants_state(self.source)
+
     def record(self, event: RawEvent) -> None:
         self.recorder.record_input(self.source, event)
 
@@ -136,6 +140,23 @@ class _Counts:
     # Messages without a JSON form, and the latest error.
     unwritable: int = 0
     last_unwritable: str = ""
+
+
+@dataclass(slots=True)
+class _Carried:
+    """What a file that begins in the middle of the run needs from before it."""
+
+    sources: set[str] = field(default_factory=set)
+    # The sources that owe their state to the current file.
+    missing: set[str] = field(default_factory=set)
+    # The latest tool event of each source, and its query that has no reply yet.
+    tools: dict[str, RawEvent] = field(default_factory=dict)
+    asked: dict[str, RawEvent] = field(default_factory=dict)
+    # A further experiment begins a file.
+    experiment_began: bool = False
+
+    def want_states(self) -> None:
+        self.missing |= self.sources
 
 
 @dataclass(slots=True)
@@ -163,8 +184,7 @@ class Recorder:
         self._queue: deque[_Item] = deque()
         self._counts = _Counts()
         self._experiment_runs = False
-        # The latest tool event of each source.
-        self._tools: dict[str, RawEvent] = {}
+        self._carried = _Carried()
         # A flush may still run in its thread when the recorder is closed.
         self._lock = threading.Lock()
         self.failure = ""
@@ -188,10 +208,17 @@ class Recorder:
 
     def input_recorder(self, source: str) -> InputRecorder:
         """Return the recorder of one source's raw input."""
+        self._carried.sources.add(source)
         return _SourceRecorder(self, source)
+
+    def wants_state(self, source: str) -> bool:
+        """Return whether a file began in the middle of the run, and has no state of this source yet."""
+        return source in self._carried.missing
 
     def record_input(self, source: str, event: RawEvent) -> None:
         """Queue a raw input."""
+        if event.kind is InputKind.STATE:
+            self._carried.missing.discard(source)
         add = partial(self._add_input, source, event, self._clock.offset_ns)
         self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
 
@@ -202,6 +229,9 @@ class Recorder:
         t_unix_ns = self._clock.now_ns() + self._clock.offset_ns
         notes = {} if tool_mm is None else {schema.DIAMETER_NOTE: f"{tool_mm:g}"}
         add = partial(self._add_experiment, name, attached, notes, t_unix_ns)
+        if self._carried.experiment_began:
+            self._carried.want_states()
+        self._carried.experiment_began = True
         self._enqueue(_OVERHEAD_BYTES, add, begins_experiment=True)
 
     async def flushes(self) -> AsyncIterator[str]:
@@ -264,7 +294,9 @@ class Recorder:
         # Items that arrive meanwhile wait for the next flush.
         for _ in range(len(self._queue)):
             item = self._queue.popleft()
-            if self._current.experiment if item.begins_experiment else self._is_idle_too_long():
+            if item.begins_experiment and self._current.experiment:
+                self._change_file(item.dropped, states_follow=True)
+            elif not item.begins_experiment and self._is_idle_too_long():
                 self._change_file(item.dropped)
             try:
                 item.add()
@@ -284,8 +316,11 @@ class Recorder:
         age_s = (self._clock.now_ns() - self._current.began_ns) / 1e9
         return age_s > LONGEST_IDLE_FILE_S and not self._experiment_runs
 
-    def _change_file(self, dropped: int) -> None:
-        """Begin the next file; on failure continue with the current one. `dropped` counts the drops so far."""
+    def _change_file(self, dropped: int, *, states_follow: bool = False) -> None:
+        """Begin the next file; on failure continue with the current one. `dropped` counts the drops so far.
+
+        `states_follow`: the states of all sources were asked for when the next item was queued.
+        """
         if not self._flush():
             return
         previous, lost = self._current, dropped + self._counts.unwritable
@@ -294,8 +329,13 @@ class Recorder:
         except OSError as error:
             self.failure = f"{self._folder}: {error.strerror}"
             return
+        if not states_follow:
+            self._carried.want_states()
         self._finish_file(previous, lost)
-        for source, event in self._tools.items():
+        self._current.file.add_metadata(schema.CONTINUED_METADATA, {"sources": " ".join(sorted(self._carried.sources))})
+        for source, event in list(self._carried.asked.items()):
+            self._add_input(source, event, self._clock.offset_ns)
+        for source, event in self._carried.tools.items():
             # The tool is still held, and a replay of this file must know it.
             self._add_input(source, replace(event, t_ns=self._current.began_ns), self._clock.offset_ns)
 
@@ -353,8 +393,13 @@ class Recorder:
         self._current.file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
 
     def _add_input(self, source: str, event: RawEvent, offset_ns: int) -> None:
-        if event.kind is InputKind.TOOL:
-            self._tools[source] = event
+        match event.kind:
+            case InputKind.TOOL:
+                self._carried.tools[source] = event
+            case InputKind.ASKED:
+                self._carried.asked[source] = event
+            case InputKind.DATA:
+                self._carried.asked.pop(source, None)
         self._add_clock(event.t_ns, offset_ns)
         t_unix_ns = event.t_ns + offset_ns
         self._current.file.add(schema.input_topic(source), t_unix_ns, t_unix_ns, schema.input_json(event))

@@ -39,6 +39,8 @@ METADATA = "shearloop"
 # One metadata record for each experiment, and one at the end of a closed recording.
 EXPERIMENT_METADATA = "shearloop.experiment"
 END_METADATA = "shearloop.end"
+# In a recording that begins in the middle of a run: the sources whose state follows as an input.
+CONTINUED_METADATA = "shearloop.continued"
 CONFIGURATION = "configuration.json"
 # The numbers of k and sigma of a heatmap; other arrays have one dimension.
 SCORES_SHAPE = "scores_shape"
@@ -121,7 +123,7 @@ def schemas() -> Mapping[str, dict[str, Any]]:
     raw = {
         INPUT: {
             "t_mono_ns": _TIME,
-            "kind": {"type": "string", "description": "opened or started (board), asked, data, tare, tool or adapt"},
+            "kind": {"type": "string", "description": "opened, started, asked, data, tare, tool, adapt or state"},
             "data": {"type": "string", "description": "the bytes as Latin-1 text, or the argument of another input"},
         },
         CLOCK_TOPIC: {

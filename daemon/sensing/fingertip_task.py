@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 
@@ -21,6 +21,7 @@ from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.frame_estimator import FrameEstimator
+from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
@@ -202,6 +203,17 @@ class FingertipPipeline:
         self._record(InputKind.ADAPT, now_ns, torques_as_bytes(frames[0].seq, reference, torque_nm))
         self.publisher.publish(adapted_message(self.name, frames, reference, adaptation))
 
+    @property
+    def wants_state(self) -> bool:
+        """Whether a recording needs the state."""
+        return self.inputs is not None and self.inputs.wants_state
+
+    def record_state(self, others: Mapping[str, object], now_ns: int) -> None:
+        """Keep the state of the estimator, and of the others that belong to it."""
+        session = self.estimator.session
+        if self.inputs is not None:
+            record_state(self.inputs, {**others, "session": session}, session.fixed, now_ns)
+
     def _record(self, kind: InputKind, t_ns: int, data: bytes) -> None:
         if self.inputs is not None:
             self.inputs.record(RawEvent(kind, t_ns, data))
@@ -231,9 +243,58 @@ class CombinedFingertips:
             while self._pairs:
                 await self.pipeline.process(*self._pairs.popleft())
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether no pair waits for its estimate."""
+        return not self._pairs
+
+    def record_state(self, now_ns: int) -> None:
+        """Keep the state of the pairing and of the pairs' estimator."""
+        self.pipeline.record_state({"pairing": self._pairing}, now_ns)
+
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
         return {"expected_hz": 1.0 / self._period_s, "estimates": self.pipeline.count}
+
+
+class FingertipStates:
+    """Keeps the states of all fingertips for a recording that begins in the middle of a run.
+
+    They belong together, because a pair has frames of several boards. So they are taken between frames of all boards.
+    """
+
+    def __init__(self, clock: Clock, combined: CombinedFingertips | None = None) -> None:
+        """Begin without a fingertip; those of a pair are in `combined`."""
+        self._clock = clock
+        self._combined = combined
+        self._boards: list[tuple[EitKit, FingertipPipeline]] = []
+        self._busy = 0
+
+    def add(self, board: EitKit, pipeline: FingertipPipeline) -> None:
+        """Take a board and its estimates."""
+        self._boards.append((board, pipeline))
+
+    @contextlib.contextmanager
+    def processing(self) -> Iterator[None]:
+        """Hold the states back while the block processes a board's frames."""
+        self._busy += 1
+        try:
+            yield
+        finally:
+            self._busy -= 1
+        if not self._busy:
+            self._record()
+
+    def _record(self) -> None:
+        if not any(pipeline.wants_state for _, pipeline in self._boards):
+            return
+        if self._combined is not None and not self._combined.is_waiting:
+            return
+        now_ns = self._clock.now_ns()
+        for board, pipeline in self._boards:
+            pipeline.record_state({"parser": board.parser}, now_ns)
+        if self._combined is not None:
+            self._combined.record_state(now_ns)
 
 
 class DeadElectrodes:
@@ -255,23 +316,28 @@ class DeadElectrodes:
 
 @dataclass(frozen=True, slots=True)
 class FingertipTask:
-    """Reads one board, estimates from each frame, and publishes both; `combined` also needs the frames."""
+    """Reads one board, estimates from each frame, and publishes both; `combined` also needs the frames.
+
+    `states` keeps what a recording that begins later needs.
+    """
 
     board: EitKit
     pipeline: FingertipPipeline
     publisher: Publisher
     combined: CombinedFingertips | None = None
     always_heatmap: bool = False
+    states: FingertipStates | None = None
     dead_electrodes: DeadElectrodes = field(default_factory=DeadElectrodes)
 
     async def run(self) -> None:
         """Process every frame until cancelled."""
         async with contextlib.aclosing(self.board.batches()) as batches:
             async for frames in batches:
-                if self.combined is not None:
-                    self.combined.add(self.pipeline.name, frames)
-                for frame in frames:
-                    await self.process_frame(frame)
+                with self.states.processing() if self.states is not None else contextlib.nullcontext():
+                    if self.combined is not None:
+                        self.combined.add(self.pipeline.name, frames)
+                    for frame in frames:
+                        await self.process_frame(frame)
 
     async def process_frame(self, frame: Frame) -> None:
         """Estimate from a frame and from the pairs that wait; publish the estimates, then the frame."""

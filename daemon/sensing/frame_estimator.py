@@ -77,6 +77,10 @@ class FrameEstimator:
         """Whether it gives torques, and not only diameters or the bank match."""
         return self.calibration.torque is not None
 
+    def continue_from(self, session: EstimatorSession) -> None:
+        """Go on with the session of another estimator of the same configuration."""
+        self.session = session
+
     @property
     def grids(self) -> tuple[FloatArray, FloatArray] | None:
         """The k and the sigma of the bank's cells, None without a bank."""

@@ -11,6 +11,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 LOAD_CELL = "load_cell"
@@ -57,6 +58,8 @@ class LoadCellTask:
                     torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
                     self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, message.reason, sample.t_mid_ns, now_ns))
                 self._take_zero(sample)
+                if (inputs := self._board.state_recorder) is not None:
+                    record_state(inputs, {"parser": self._board.parser}, {}, self._clock.now_ns())
                 self._sampled.set()
                 self._sampled.clear()
 

@@ -172,6 +172,11 @@ class SkinEstimator:
         self.refused: str | None = None
 
     @property
+    def fixed(self) -> dict[str, object]:
+        """What follows from the configuration, and is no state."""
+        return {"calibration": self._calibration}
+
+    @property
     def drift_per_hour(self) -> float:
         """The assumed drift of a response: as configured, or more if two zeros have shown it."""
         return self._drift_per_s * 3600.0

@@ -14,6 +14,7 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
+from shearloop.daemon.sensing.snapshots import record_state, restored
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import (
@@ -105,6 +106,9 @@ class SkinTask:
                 self._publish(sample, reading)
                 self._sampled.set()
                 self._sampled.clear()
+                if self._inputs is not None and self._inputs.wants_state and self._skin.is_between_readings:
+                    state = {**self._skin.state, "estimator": self._estimator}
+                    record_state(self._inputs, state, self._estimator.fixed, self._clock.now_ns())
 
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""
@@ -169,6 +173,13 @@ class ReplayedSkin:
             ReplayedInstrument({SCAN: read_scan}) if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
         )
         self._latest: SourceReading | None = None
+
+    def restore(self, text: bytes) -> None:
+        """Continue from a recorded state; raises SnapshotError for one that does not fit."""
+        state = restored(text, self._estimator.fixed)
+        self._validator, self._averager = state["validator"], state["averager"]
+        self._latest, self._estimator = state["latest"], state["estimator"]
+        self._daq = state.get("parser", self._daq)
 
     def handle(self, source: str, event: RawEvent) -> list[SkinShear]:
         """Return the messages that a source's event leads to, without processing time."""

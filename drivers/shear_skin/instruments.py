@@ -102,6 +102,8 @@ class PolledInstrument(ABC, Generic[ReadingT]):
     inputs: InputRecorder | None = None
     # Its name in messages.
     instrument: ClassVar[str] = ""
+    # A reply is one reading: no reading waits behind another.
+    unread: ClassVar[int] = 0
     _lines: LineSplitter = field(default_factory=partial(LineSplitter, MAX_REPLY_BYTES), init=False)
     _count: int = field(default=0, init=False)
     _errors: Counter[str] = field(default_factory=Counter, init=False)

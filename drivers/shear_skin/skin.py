@@ -11,7 +11,7 @@ from statistics import fmean
 
 from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.serial_sensor import StepFilter
-from shearloop.drivers.shear_skin.instruments import Daq, Keithley6430, SourceReading, Voltages
+from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, SourceReading, Voltages
 
 # The resistance of the paper's gauges.
 GAUGE_OHM = 25.0
@@ -247,6 +247,17 @@ class ShearSkin:
                 sample = self._averager.add(self._validator.sample(voltages, self._latest))
                 if sample is not None:
                     yield sample
+
+    @property
+    def is_between_readings(self) -> bool:
+        """Whether everything that was read has become a sample, or a part of an average."""
+        return not self._daq.unread
+
+    @property
+    def state(self) -> dict[str, object]:
+        """The objects that the next samples depend on; only a converter board's parser has a past."""
+        parser = {"parser": self._daq.parser} if isinstance(self._daq, AdcBoard) else {}
+        return {**parser, "validator": self._validator, "averager": self._averager, "latest": self._latest}
 
     def restart_average(self) -> None:
         """Average only readings from now on, for a tare."""

@@ -259,7 +259,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         cause = ": it lost the controller" if -status in (signal.SIGSEGV, signal.SIGABRT) else ""
         return RobotLostError(
             "crashed",
-            f"The robot's process {end} while {self._activity}{cause}. The robot's watchdog ends the motion; the "
+            f"The robot's process {end} while {self._activity}{cause}. The script on the robot stops the arm; the "
             f"process is started again with motion disabled.{self._last_words()}",
         )
 
@@ -268,8 +268,8 @@ class WorkerConnection(asyncio.SubprocessProtocol):
             sentence = silent_sentence(self._settings.host, self._settings.connect_timeout_s, self._activity)
         else:
             sentence = (
-                f"The robot's process did not answer for {seconds:.1f} s and was ended. The robot's watchdog ends the "
-                "motion; the process is started again with motion disabled."
+                f"The robot's process did not answer for {seconds:.1f} s and was ended. The script on the robot stops "
+                "the arm; the process is started again with motion disabled."
             )
         return sentence + self._last_words()
 

@@ -23,8 +23,8 @@ FailureKind = Literal[
 ARRIVED: Final = "arrived"
 STOPPED_ON_COMMAND: Final = "stopped on command"
 
-# A joint slower than this is at rest: the noise of a real arm's speed signal is lower.
-REST_RAD_PER_S: Final = 2e-3
+# A joint slower than this is at rest: speeds of up to 0.003 rad/s were reported from arms that stand.
+REST_RAD_PER_S: Final = 0.01
 
 # The longest cycle during recovery: the dashboard client waits 2.5 s for a reply, the control client 3 s for a program.
 RECOVERY_HANG_S: Final = 6.0
@@ -167,10 +167,13 @@ class RtdeOutputs:
     robot_mode: int
     safety_mode: int
     runtime_state: int
-    speed_scaling: float
-    # Of the control script: 1 when ready, 2 when done with a command; and its own clock.
+    # Factors on every commanded speed: of the pendant's speed slider, and of the controller's own limits.
+    speed_slider: float
+    limiter_scaling: float
+    # Of the control script: 1 when ready, 2 when done with a command; its clock, and the time of one tick.
     script_state: int
-    script_s: float
+    script_ticks: int
+    script_step_s: float
     # What is set at the pendant, at the flange; NaN where the controller does not report it.
     payload_kg: float
     payload_cog_m: Three
@@ -211,6 +214,11 @@ class RtdeSample(RtdeOutputs):
     def runtime_name(self) -> str:
         """The state of the program in words."""
         return RUNTIME_STATES.get(self.runtime_state, f"unknown state {self.runtime_state}")
+
+    @property
+    def speed_scaling(self) -> float:
+        """The fraction of a commanded speed that the controller carries out."""
+        return self.speed_slider * self.limiter_scaling
 
     @property
     def protective_stop(self) -> bool:

@@ -1,21 +1,26 @@
 """The control script on the robot: ur-rtde's own, with a watchdog and limits that need no client.
 
 The client gives each motion a deadline, by the script's own clock, in an input register that ur-rtde leaves free, and
-extends it. The script turns the wrist no further than the deadline, its range and its largest force and torque allow. A
-linear move that its client does not stop ends with the program.
+extends it. The script turns the wrist no further than the deadline, its range and its largest force and torque allow.
+It stops a linear move that its client does not stop, and ends. The watchdog is slower: a program that ends while the
+arm moves may end in a protective stop.
 """
 
+import hashlib
 import re
 
 from shearloop.drivers.ur.settings import UrSettings
 
-# RTDE guide: other clients may use the double registers from 24 on; ur-rtde uses lower ones.
-DEADLINE_REGISTER, CLOCK_REGISTER = "input_double_register_24", "output_double_register_24"
+# RTDE guide: the registers from 24 on are for RTDE clients; ur-rtde uses the first ones of either half.
+_REGISTER = 47
+DEADLINE_REGISTER, CLOCK_REGISTER = f"input_int_register_{_REGISTER}", f"output_int_register_{_REGISTER}"
+# The time of one tick of the clock, in s.
+STEP_REGISTER = f"output_double_register_{_REGISTER}"
 # The clock starts at 0: with this deadline no motion begins or goes on.
-NO_MOTION_S = -1.0
+NO_MOTION_TICKS = -1
 # A deadline lies this much further ahead at most: a cycle of the slowest controller, for rounding.
 _SLACK_S = 0.008
-# The client has this time to stop a linear move after its deadline.
+# The client has this time to stop a linear move after its deadline; then the script does.
 _GRACE_S = 0.05
 
 # ur-rtde 1.6.5: the line before the main loop, and the thread that carries out speeds.
@@ -24,17 +29,54 @@ _BEFORE_LOOP = "        keep_running = True\n"
 _REGISTER_OFFSET = re.compile(r"(global reg_offset_\w+ =) #.*")
 _SPEED_THREAD = re.compile(r"^    thread speed_thread\(\):\n.*?^    end\n", re.MULTILINE | re.DOTALL)
 
+# SHA-256 of the scripts of ur-rtde 1.6.5, by the first version of PolyScope that gets it.
+KNOWN_SCRIPTS = {
+    "f34786f9fb2c6f80561f1a0713033706c953bf33a76049cd0e73270d2e863ae0",  # 3.3
+    "8e0616391131998ef6434384eeced7ba5b663692e6f73e2059ad6381a04899af",  # 3.5
+    "1f59fc1c18d3801517d78509bed2900254cb521130eeccc716916eebabaeac8e",  # 3.6
+    "1ddb08f05b8ac369189d7a87cfd2690f87fe2b5a56d4452be41e50d5a08c4a04",  # 3.8
+    "f642abf419f28a9c334e7bfcc1f88e35214fa0fdce280aa2dd883308fe776687",  # 3.15
+    "b68d3dacfa0af3fb04227c2c56040612bb3a231ddf4ea1969af7f42850c7dbb2",  # 5.0
+    "cb5cc0e11edf9b2f367e5adbb2ce6aac5db088f4bee13ccbe7a2c0049ce3c43b",  # 5.3
+    "1bd7982e32de4a2c51e5edd4db6269b80bb7f9f835ac8cf9ac4c6aacaa058b07",  # 5.4
+    "99d5988ea08987540e200b397d2dc1d89ec28303c0c6f9f7f41ca1f483d1257d",  # 5.9
+    "cee5df29e6ec0338b10f6564c9ecb4bc18ac530f4f49c29ae1c72418664dc7e7",  # 5.10
+    "e23e363bca4235f8431ef8f92e2cadd56b47aaf8a2278a1bef4b2845e122fd36",  # 5.23
+    "efc340698075a61465fd87a12c950a3742a99d8a1e2d8b38cb27c2fb1538825c",  # 5.26
+}
+
 # speedj returns after a cycle, so that each cycle checks. The clock starts at 0 in each program, and a deadline too far
-# ahead is an older program's. An overload stops the wrist until the client asks for rest.
+# ahead is an older program's. It counts cycles: a sum of times would drift, for URScript's numbers may have 32 bits. An
+# overload stops the wrist until the client asks for rest.
 _GUARD = """\
-    global guard_s = 0.0
+    global guard_ticks = 0
+
+    def guard_left_s():
+        return (read_input_integer_register({register}) - guard_ticks) * {step}
+    end
+
+    def guard_end_move():
+        # Two threads that move the arm are an error: the others end first.
+        enter_critical
+        kill move_thrd
+        move_thrd = 0
+        if stop_thrd != 0:
+            kill stop_thrd
+            stop_thrd = 0
+        end
+        exit_critical
+        textmsg("shearloop: the straight move was not renewed in time: the arm stops and the program ends")
+        stopj({hardest})
+        halt
+    end
 
     thread guard_clock():
+        write_output_float_register({register}, {step})
         while (True):
-            guard_s = guard_s + {step}
-            write_output_float_register(24, guard_s)
-            if move_thrd != 0 and guard_s > read_input_float_register(24) + {grace}:
-                halt
+            guard_ticks = guard_ticks + 1
+            write_output_integer_register({register}, guard_ticks)
+            if move_thrd != 0 and guard_left_s() < -{grace}:
+                guard_end_move()
             end
             sync()
         end
@@ -48,7 +90,7 @@ _GUARD = """\
     end
 
     def guard_largest_speed(asked):
-        left = read_input_float_register(24) - guard_s
+        left = guard_left_s()
         q = get_actual_joint_positions()
         room = ({upper}) - q[5]
         if asked < 0:
@@ -66,6 +108,7 @@ _GUARD = """\
 
     thread speed_thread():
         overloaded = False
+        late = False
         while (True):
             enter_critical
             asked = speed_target[5]
@@ -73,6 +116,11 @@ _GUARD = """\
             exit_critical
             overloaded = asked != 0 and (overloaded or guard_is_overloaded())
             largest = guard_largest_speed(asked)
+            was_late = late
+            late = asked != 0 and guard_left_s() < 0
+            if late and not was_late:
+                textmsg("shearloop: the wrist's speed was not renewed in time: the wrist stops")
+            end
             if overloaded:
                 largest = 0.0
             end
@@ -97,6 +145,11 @@ _START = """\
 """
 
 
+def hash_of(script: str) -> str:
+    """Return a script's SHA-256 in hexadecimal digits, as in `KNOWN_SCRIPTS`."""
+    return hashlib.sha256(script.encode()).hexdigest()
+
+
 def guard_script(script: str, settings: UrSettings) -> str:
     """Return ur-rtde's script as a program with its watchdog and its limits, or "" where it is of an unknown form.
 
@@ -108,8 +161,8 @@ def guard_script(script: str, settings: UrSettings) -> str:
     limits = settings.limits
     margin = limits.joints.margin_rad
     values = {
-        # CB3 controllers do not have the function; their cycle takes 8 ms.
-        "step": "get_steptime()" if "get_steptime()" in script else "0.008",
+        "register": _REGISTER,
+        "step": settings.facts.step,
         "watchdog_hz": settings.watchdog_hz,
         "grace": _GRACE_S,
         "longest": settings.command_timeout_s + _SLACK_S,

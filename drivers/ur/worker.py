@@ -2,7 +2,7 @@
 
 It runs 125 cycles a second and sends the state of each. ur-rtde may hang or crash at any time, so that the worker
 holds nothing worth saving. Before each stretch that may hang it sets an alarm, and the kernel ends it in time; the
-robot's watchdog then ends the motion. When stdin ends the daemon is gone: the worker stops the arm and exits.
+script on the robot then stops the arm. When stdin ends the daemon is gone: the worker stops the arm and exits.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import (
     REMOTE_CURE,
     ask_dashboard,
+    check_generation,
     check_ports,
     probe_controller,
     registers_in_use,
@@ -129,6 +130,7 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
         pipe.send(messages.WorkerPhase("greeting the controller"))
         check_ports(host, settings.connect_timeout_s / 8)
         version = probe_controller(host, settings.connect_timeout_s / 4)
+        check_generation(settings, version)
         # To a silent dashboard, ur-rtde says "Operation canceled".
         ask_dashboard(host, settings.connect_timeout_s / 4, ("PolyscopeVersion",))
         pipe.send(messages.WorkerPhase("connecting", untested_sentence(version)))

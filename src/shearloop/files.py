@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import BinaryIO
 
 _LONGEST_DETAIL = 300
+# What file systems answer that cannot flush a folder, and what a folder answers that may be written and not read.
+_NO_FLUSH = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 
 
 @contextmanager
 def replace_file(path: Path) -> Iterator[BinaryIO]:
     """Yield a file `PATH.tmp` that replaces `path` once it is on the disk, and is removed on failure.
 
-    Raises OSError where it cannot be written; `path` is then unchanged.
+    Raises OSError where it cannot be written; `path` is then unchanged, but for a folder that the disk cannot flush.
     """
     if path.exists() and not path.is_file():
         # A pipe or /dev/stdout is written to, not replaced; a folder raises OSError.
@@ -88,9 +90,17 @@ def read_file(path: Path, most_bytes: int) -> bytes:
 
 
 def sync_directory(directory: Path) -> None:
-    """Flush a directory's entries to the disk, so that a rename in it survives a loss of power."""
-    handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    """Flush a directory's entries to the disk, so that a rename in it survives a loss of power.
+
+    A folder that cannot be flushed, such as a network share's, is left as it is. Raises OSError for a failing disk.
+    """
     try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        if error.errno not in _NO_FLUSH:
+            detail = f"{error.strerror} for its folder: the file is written, and a loss of power may undo that"
+            raise OSError(error.errno, detail) from error

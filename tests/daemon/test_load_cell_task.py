@@ -25,6 +25,9 @@ class Board:
         # Later than all that a test asks for.
         self._seq = Clock().now_ns() + 10**9
 
+    # Nothing is recorded.
+    state_recorder = None
+
     async def readings(self) -> AsyncGenerator[LoadSample]:
         while True:
             yield await self.sent.get()

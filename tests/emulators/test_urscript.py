@@ -9,7 +9,7 @@ COUNTING = "global n = 0\nthread t():\nwhile n < 7:\nn = n + 1\nsync()\nend\nend
 
 
 def program(text: str, registers: Registers | None = None) -> Program:
-    return Program(f"def main():\n{text}\nend\n", Registers() if registers is None else registers, Arm())
+    return Program(f"def main():\n{text}\nend\n", Registers() if registers is None else registers, Arm(), print)
 
 
 def run(text: str, cycles: int = 20) -> tuple[list[float], str]:

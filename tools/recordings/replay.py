@@ -36,6 +36,7 @@ from shearloop.daemon.sensing.fingertip_task import (
 from shearloop.daemon.sensing.frame_estimator import COMBINED, FrameEstimator, open_combined, open_estimator
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
+from shearloop.daemon.sensing.snapshots import SnapshotError, restored
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
@@ -84,11 +85,19 @@ class RecordedRun:
             self.counts = recording.counts
             self.metadata = recording.identity
             self._attached = recording.attachments()
+            continued = recording.metadata.get(schema.CONTINUED_METADATA, {})
+        # Of a recording that begins in the middle of a run: the sources that continue from a state.
+        self.continued = frozenset(continued.get("sources", "").split())
+        self._own: DaemonConfig | None = None
 
     @property
     def has_inputs(self) -> bool:
         """Whether it holds raw input; an imported recording holds only lines."""
         return any(topic.startswith(schema.input_topic("")) and topic != schema.CLOCK_TOPIC for topic in self.counts)
+
+    def continues_with(self, config: DaemonConfig) -> bool:
+        """Whether its states fit: they are of the same code, and of the recorded configuration."""
+        return bool(self.continued) and config is self._own and self.metadata.get("code_sha256") == schema.code_digest()
 
     @contextmanager
     def configuration(self) -> Iterator[DaemonConfig]:
@@ -110,7 +119,8 @@ class RecordedRun:
             with reading(self.path):
                 content = json.loads(self._attached[schema.CONFIGURATION], object_hook=with_copies)
             where = f"{self.path}: its configuration does not fit this version"
-            yield validated(content, DaemonConfig, where, UserError, cure="; give one with --config CONFIG")
+            self._own = validated(content, DaemonConfig, where, UserError, cure="; give one with --config CONFIG")
+            yield self._own
 
     def events(self) -> Iterator[RecordedEvent]:
         """Yield the events in recorded order."""
@@ -177,6 +187,8 @@ class ReplayComparison:
     compared: Counter[str] = field(default_factory=Counter)
     different: Counter[str] = field(default_factory=Counter)
     examples: list[str] = field(default_factory=list)
+    # Sources that continue from a state which has not come yet: their messages are sent as they were recorded.
+    awaited: set[str] = field(default_factory=set)
     _foreign: int = 0
     _computed: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
 
@@ -189,6 +201,11 @@ class ReplayComparison:
         else:
             plain = json.loads(schema.message_json(topic, content, 0))
             self._computed.setdefault((topic, content["source"]), deque()).append(plain)
+
+    def restart(self, source: str) -> None:
+        """Forget the messages of a source so far: they were forwarded, and it is computed from here on."""
+        self.awaited.discard(source)
+        self._computed = {key: waiting for key, waiting in self._computed.items() if key[1] != source}
 
     def compare(self, event: RecordedEvent) -> None:
         """Compare a recorded message with the oldest computed one of its topic and source."""
@@ -247,12 +264,13 @@ class Replay:
         if config.load_cell is not None:
             self._load_parser = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
         self._skin = ReplayedSkin(config.skin) if config.skin is not None else None
+        self.comparison.awaited.update(run.continued.intersection(self._sources)) if run.continues_with(config) else ()
 
     @property
-    def _sources(self) -> tuple[str, ...]:
+    def _sources(self) -> set[str]:
         """The sources of the messages that are computed."""
         load_cell = (LOAD_CELL,) if self._load_parser is not None else ()
-        return (*self._estimators, *load_cell, *((SKIN,) if self._skin is not None else ()))
+        return {*self._estimators, *load_cell, *((SKIN,) if self._skin is not None else ())}
 
     async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> None:
         """Replay all events `speed` times as fast as they happened; math.inf does not wait at all."""
@@ -277,14 +295,28 @@ class Replay:
         elif event.raw is not None:
             self._clock.set(event.t_mono_ns)
             await self._process_input(event.source, event.raw)
-        elif self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in self._sources:
+        elif (
+            self._run.has_inputs
+            and event.topic in COMPUTED_TOPICS
+            and event.source in self._sources - self.comparison.awaited
+        ):
             self.comparison.compare(event)
         elif event.topic != messages.EitHeatmap.topic:
             self._publisher.forward(event.topic, messages.with_packed_arrays(event.content))
 
+    def _is_compared(self, event: RecordedEvent) -> bool:
+        computed = self._sources - self.comparison.awaited
+        return self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in computed
+
     async def _process_input(self, source: str, event: RawEvent) -> None:
         """Publish the messages that follow from a raw input; an input of another source is ignored."""
-        if source in self._frame_parsers:
+        if event.kind is InputKind.STATE:
+            if source in self.comparison.awaited:
+                self._restore(source, event.data)
+        elif source in self.comparison.awaited:
+            # Its state, which comes soon, includes what follows from this.
+            return
+        elif source in self._frame_parsers:
             for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
@@ -295,8 +327,30 @@ class Replay:
             for sample in self._load_parser.handle(event):
                 self._publisher.publish(load_message(sample))
         elif self._skin is not None and source in self._skin.sources:
+            # A query before the state may have its reply after it.
             for message in self._skin.handle(source, event):
-                self._publisher.publish(self._continued(message))
+                if SKIN not in self.comparison.awaited:
+                    self._publisher.publish(self._continued(message))
+
+    def _restore(self, source: str, text: bytes) -> None:
+        """Continue a source from its recorded state; raises UserError for one that does not fit."""
+        try:
+            if source in self._estimators:
+                session = self._estimators[source].session
+                state = restored(text, session.fixed)
+                self._estimators[source].continue_from(state["session"])
+                if source in self._frame_parsers:
+                    self._frame_parsers[source] = state["parser"]
+                else:
+                    self._pairing = state["pairing"]
+            elif source == LOAD_CELL:
+                self._load_parser = restored(text, {})["parser"]
+            elif self._skin is not None:
+                self._skin.restore(text)
+        except (SnapshotError, KeyError) as error:
+            raise UserError(f"{self._run.path}: the state of {source} cannot be used: {error}") from error
+        self.comparison.restart(source)
+        self._number_offset[source] = 0
 
     def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:
         """Return frames with their recorded numbers: a later file of a run continues to count."""

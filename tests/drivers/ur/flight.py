@@ -36,9 +36,11 @@ AT_REST = messages.RtdeSample(
     robot_mode=7,
     safety_mode=1,
     runtime_state=2,
-    speed_scaling=1.0,
+    speed_slider=1.0,
+    limiter_scaling=1.0,
     script_state=1,
-    script_s=0.0,
+    script_ticks=0,
+    script_step_s=0.002,
     payload_kg=1.0,
     payload_cog_m=(0.0, 0.0, 0.06),
     tcp_offset=(0.0,) * 6,
@@ -49,11 +51,15 @@ POSE = (-0.5, -0.1, 0.45, 0.0, math.pi, 0.0)
 
 
 def received(
-    timestamp_s: float, runtime_state: int = 2, script_state: int = 1, script_s: float = 0.0
+    timestamp_s: float, runtime_state: int = 2, script_state: int = 1, script_ticks: int = 0
 ) -> messages.RtdeOutputs:
     """Return a sample as the controller sends it."""
     sample = dataclasses.replace(
-        AT_REST, timestamp_s=timestamp_s, runtime_state=runtime_state, script_state=script_state, script_s=script_s
+        AT_REST,
+        timestamp_s=timestamp_s,
+        runtime_state=runtime_state,
+        script_state=script_state,
+        script_ticks=script_ticks,
     )
     return messages.RtdeOutputs(*(getattr(sample, field.name) for field in dataclasses.fields(messages.RtdeOutputs)))
 

@@ -10,8 +10,9 @@ from typing import ClassVar
 
 import pytest
 
+from shearloop.drivers.ur import settings as ur
 from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeOutputs, WristSpeed
-from shearloop.drivers.ur.script import NO_MOTION_S
+from shearloop.drivers.ur.script import NO_MOTION_TICKS
 from tests.drivers.ur.flight import SETTINGS, received
 
 SIX = (0.0,) * 6
@@ -41,15 +42,15 @@ class Receiver:
 
     def __init__(self, *_: object) -> None:
         self.connected = True
-        self.deadlines: list[float] = []
+        self.deadlines: list[int] = []
         # Of a program that ended during a command.
         self.sample = received(1.0, runtime_state=1, script_state=2)
 
     def latest(self) -> RtdeOutputs:
         return self.sample
 
-    def write_deadline(self, script_s: float) -> None:
-        self.deadlines.append(script_s)
+    def write_deadline(self, script_ticks: int) -> None:
+        self.deadlines.append(script_ticks)
 
 
 @pytest.fixture
@@ -64,6 +65,7 @@ def arm(monkeypatch) -> Iterator[ModuleType]:
     monkeypatch.delitem(sys.modules, "shearloop.drivers.ur.arm", raising=False)
     arm = importlib.import_module("shearloop.drivers.ur.arm")
     monkeypatch.setattr(arm, "RtdeReceiver", Receiver)
+    monkeypatch.setattr(arm, "KNOWN_SCRIPTS", {arm.hash_of(SCRIPT), arm.hash_of("of another form\n")})
     yield arm
     del sys.modules["shearloop.drivers.ur.arm"]
 
@@ -83,8 +85,8 @@ def test_refused_timer_slack_does_not_prevent_connecting(arm, monkeypatch, capsy
     assert "wake more often than needed" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("watchdog_hz", "slack_ms"), [(2.0, 16), (10.0, 16), (40.0, 4)])
-def test_timer_slack_is_a_fraction_of_the_watchdog_time(arm, monkeypatch, watchdog_hz, slack_ms):
+@pytest.mark.parametrize(("rate_hz", "command_timeout_s", "slack_ms"), [(125.0, 0.3, 16), (500.0, 0.01, 3)])
+def test_timer_slack_is_a_fraction_of_the_watchdog_time(arm, monkeypatch, rate_hz, command_timeout_s, slack_ms):
     asked: list[int] = []
 
     def prctl(_option: int, slack: ctypes.c_ulong, *_: int) -> int:
@@ -92,7 +94,10 @@ def test_timer_slack_is_a_fraction_of_the_watchdog_time(arm, monkeypatch, watchd
         return 0
 
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=prctl))
-    arm.UrArm(dataclasses.replace(SETTINGS, watchdog_hz=watchdog_hz), VERSION)
+    bound = ur.WristSpeedBound(0.01, 0.02)
+    limits = dataclasses.replace(SETTINGS.limits, wrist_speed_rad_per_s=bound)
+    timeouts = {"command_timeout_s": command_timeout_s, "silence_timeout_s": command_timeout_s}
+    arm.UrArm(dataclasses.replace(SETTINGS, limits=limits, rate_hz=rate_hz, **timeouts), VERSION)
     # 0 is the default again, for what this thread starts later.
     assert asked == [slack_ms, 0]
 
@@ -138,7 +143,8 @@ def test_sent_script_arms_its_watchdog(arm, monkeypatch):
     sent: list[str] = []
     monkeypatch.setattr(arm.ScriptPort, "send", lambda _, program: sent.append(program))
     arm.UrArm(SETTINGS, VERSION).upload()
-    assert 'rtde_set_watchdog("input_int_register_0", 10, "stop")' in sent[0]
+    armed = f'rtde_set_watchdog("input_int_register_0", {SETTINGS.watchdog_hz:g}, "stop")'
+    assert armed in sent[0]
 
 
 def test_unknown_script_is_refused(arm):
@@ -148,12 +154,32 @@ def test_unknown_script_is_refused(arm):
         arm.UrArm(SETTINGS, VERSION)
 
 
+def test_script_with_another_hash_is_refused_by_it(arm):
+    """Also where its form is known: it may answer other commands."""
+    changed = f"{SCRIPT}# changed\n"
+    Client.answers["getScript"] = changed
+    with pytest.raises(RobotLostError, match=arm.hash_of(changed)) as lost:
+        arm.UrArm(SETTINGS, VERSION)
+    assert lost.value.kind == "version"
+
+
+def test_wrench_of_a_cb3_is_zeroed_without_its_controller(arm):
+    """`zero_ftsensor` would end its program."""
+    limits = dataclasses.replace(SETTINGS.limits, torque_nm=ur.TorqueBound(8.0, 12.0))
+    one = arm.UrArm(dataclasses.replace(SETTINGS, limits=limits, generation="cb3"), "3.15.8.0")
+    one._receiver.sample = dataclasses.replace(received(1.0), wrench=(1.0, 2.0, 3.0, 0.0, 0.0, 1.0))
+    assert one.zero_wrench()
+    one._receiver.sample = dataclasses.replace(received(1.1), wrench=(1.0, 2.5, 3.0, 0.0, 0.0, 3.0))
+    assert one.read().wrench == (0.0, 0.5, 0.0, 0.0, 0.0, 2.0)
+    assert "zeroFtSensor" not in one._control.calls
+
+
 def test_deadline_counts_from_the_latest_sample(arm):
     one = arm.UrArm(SETTINGS, VERSION)
-    one._receiver.sample = received(1.0, script_s=20.0)
+    one._receiver.sample = received(1.0, script_ticks=10_000)
     assert one.wrist(WristSpeed(0.1, 1.0), 0.07)
     one.withdraw_deadline()
-    assert one._receiver.deadlines == [pytest.approx(20.07), NO_MOTION_S]
+    assert one._receiver.deadlines == [10_035, NO_MOTION_TICKS]
 
 
 def test_script_port_is_read_until_the_program_plays(arm, monkeypatch):

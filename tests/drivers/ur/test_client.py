@@ -24,8 +24,8 @@ pytestmark = pytest.mark.real_time
 
 pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
 
-# The promise for a twist whose client dies: the robot has stopped.
-STOPPED_WITHIN_S = 0.2
+# A twist whose client dies: its deadline in these tests, and the time to brake.
+STOPPED_WITHIN_S = settings_for("a-robot").standstill_s
 
 
 async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5) -> None:
@@ -274,6 +274,18 @@ async def test_another_payload_than_the_configured_one_refuses_motion(controller
         assert "payload_kg" in (await robot.send(Enable())).refusal
         await controller.fault("payload 1.0")
         await until(robot, lambda state: state.payload_kg == 1.0)
+        assert (await robot.send(Enable())).accepted
+
+
+async def test_speed_slider_that_is_moved_stops_the_wrist_and_is_named(controller):
+    async with turning(controller) as robot:
+        moved_ns = await controller.fault("slider 0.5")
+        await stops(controller, moved_ns)
+        state = await until(robot, lambda state: state.motion == "idle")
+        assert (state.speed_slider, state.speed_scaling) == (0.5, 0.5)
+        assert "speed slider is at 50 %" in (await robot.send(Enable())).refusal
+        await controller.fault("slider 1")
+        await until(robot, lambda state: state.speed_slider == 1.0)
         assert (await robot.send(Enable())).accepted
 
 

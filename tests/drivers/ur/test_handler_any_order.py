@@ -90,7 +90,8 @@ class AnyFlight(RuleBasedStateMachine):
         assert abs(arm.target) <= LIMITS.wrist_speed_rad_per_s.inner
         assert abs(arm.reading.wrist_rad) <= 1.9 + 1e-6
         if self.flight.now_ns > self.allowed_until_ns:
-            assert arm.reading.qd_rad_per_s[5] == 0, "it moves without a command"
+            # The emulated arm's speeds are sums, which end at 0 but for rounding.
+            assert abs(arm.reading.qd_rad_per_s[5]) < 1e-12, "it moves without a command"
 
 
 AnyFlight.TestCase.settings = hypothesis_settings(max_examples=60, stateful_step_count=25, deadline=None)

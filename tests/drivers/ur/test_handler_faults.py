@@ -39,6 +39,23 @@ def test_linear_move_that_rejects_its_stop_is_left_to_the_watchdog():
     assert "silent" in flight.state.end_reason
 
 
+def test_noise_of_a_standing_arm_is_rest_and_one_slow_sample_is_not():
+    flight = turning()
+    assert flight.ask(Stop(4.0)).accepted
+    flight.fly_until(lambda state: abs(state.qd_rad_per_s[5]) < 0.2)
+    turning_on = flight.wrist_speed
+    flight.arm.be(qd_rad_per_s=(0.0,) * 6)
+    flight.handler.tick(flight.arm.reading, flight.now_ns)
+    assert flight.state.motion == "stopping", "one sample decides nothing"
+    flight.arm.be(qd_rad_per_s=(0.0, 0.0, 0.0, 0.0, 0.0, turning_on))
+    flight.fly_until(lambda state: state.rests)
+    # As a real arm reports it at rest.
+    for joint in (0.003, -0.003) * 3:
+        flight.arm.be(qd_rad_per_s=(joint,) * 6)
+        flight.handler.tick(flight.arm.reading, flight.now_ns)
+    assert flight.state.motion == "idle"
+
+
 def test_arm_that_moves_without_a_command_is_left_to_the_watchdog():
     flight = flying()
     flight.arm.target = 0.1
@@ -123,6 +140,29 @@ def test_hard_limit_stops_until_enabled_again():
     flight.arm.be(wrench=(0.0,) * 6)
     flight.fly(50)
     assert "Torque is 6.50 N m" in flight.ask(WristSpeed(0.1, 1.0)).refusal
+    assert flight.ask(Enable()).accepted
+    assert flight.ask(WristSpeed(0.1, 1.0)).accepted
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"speed_slider": 0.5}, "The speed slider is at 50 %"),
+        ({"limiter_scaling": 0.8}, "The controller slows every motion to 80 %"),
+    ],
+)
+def test_factor_on_speeds_prevents_and_ends_motion(changes, said):
+    """It is a factor on the control loop's gain."""
+    flight = turning()
+    flight.arm.be(**changes)
+    flight.fly(1)
+    assert flight.state.motion == "stopping"
+    assert said in flight.state.end_reason
+    flight.fly_until(lambda state: state.motion == "idle")
+    assert said in flight.ask(Enable()).refusal
+    flight.arm.be(speed_slider=1.0, limiter_scaling=1.0)
+    flight.fly(1)
+    assert said in flight.ask(WristSpeed(0.1, 1.0)).refusal, "a stop stays a stop"
     assert flight.ask(Enable()).accepted
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 

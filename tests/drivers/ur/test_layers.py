@@ -6,7 +6,7 @@ import itertools
 import pytest
 
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
-from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, NO_MOTION_S
+from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, NO_MOTION_TICKS, STEP_REGISTER
 from shearloop.emulators.ur_robot import PLAYING, Robot
 from tests.drivers.ur import robots
 from tests.drivers.ur.flight import AT_REST, CYCLE_NS, FakeArm, Flight, flying
@@ -46,11 +46,11 @@ class ScriptedArm(FakeArm):
         return True
 
     def _write_deadline(self, left_s: float) -> None:
-        until_s = self.robot.registers[CLOCK_REGISTER] + left_s
-        self.robot.registers.write(DEADLINE_REGISTER, until_s, self.robot.time_s)
+        until = self.robot.registers[CLOCK_REGISTER] + int(left_s / robots.STEP_S)
+        self.robot.registers.write(DEADLINE_REGISTER, until, self.robot.time_s)
 
     def withdraw_deadline(self) -> None:
-        self.robot.registers.write(DEADLINE_REGISTER, NO_MOTION_S, self.robot.time_s)
+        self.robot.registers.write(DEADLINE_REGISTER, NO_MOTION_TICKS, self.robot.time_s)
 
     def wrist(self, command: WristSpeed, left_s: float) -> bool:
         self._write_deadline(left_s)
@@ -180,14 +180,32 @@ def test_script_alone_ends_a_linear_move_in_time(guarded):
     assert flight.arm.reading.program_running != guarded
 
 
-def test_killed_worker_ends_a_linear_move_before_its_watchdog_would():
-    """So a busy computer, which delivers its last words late, does not break the promise."""
-    flight = moving_at_full_speed(control_script(DELIVERED))
-    for _ in range(int(1.0 / DELIVERED.watchdog_hz * 1e9 / CYCLE_NS)):
+def ends(flight: Flight) -> list[str]:
+    """Write nothing for a second, and return how the robot's programs have ended, and its stops."""
+    told = ("motion-stopped", "program-ended", "protective-stop")
+    flight.arm.robot.take_events()
+    for _ in range(125):
         flight.arm.cycle()
-    assert not flight.arm.reading.program_running
-    for _ in range(3):
-        flight.arm.cycle()
+    return [event.name for event in flight.arm.robot.take_events() if event.name in told]
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_stop_by_the_robot_itself_is_gentle(straight):
+    """A killed worker causes no protective stop, also where a program that ends while the arm moves would."""
+    script = control_script(DELIVERED)
+    flight = moving_at_full_speed(script) if straight else at_full_speed(script)[0]
+    flight.arm.robot.protects_abrupt_ends = True
+    assert ends(flight) == ["motion-stopped", "program-ended"]
+    assert "not renewed in time" in flight.arm.robot.log[-1]
+
+
+@pytest.mark.parametrize("protects", [True, False])
+def test_watchdog_alone_is_the_last_resort(protects):
+    """A program without our deadlines has nothing else; what then happens differs between controllers."""
+    flight, _ = at_full_speed(control_script())
+    flight.arm.robot.protects_abrupt_ends = protects
+    found = ends(flight)
+    assert ("protective-stop" in found) == protects
     assert flight.arm.reading.rests
 
 
@@ -200,11 +218,14 @@ def test_linear_move_of_a_living_daemon_arrives(guarded):
 
 
 def test_killed_worker_stops_the_wrist_in_time():
-    """Nothing is written: the deadline and the watchdog."""
+    """Nothing is written: the deadline, and later the watchdog."""
     flight, _ = at_full_speed(control_script(DELIVERED))
     for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
         flight.arm.cycle()
     assert flight.arm.reading.rests
+    assert flight.arm.reading.program_running
+    for _ in range(round(1e9 / DELIVERED.watchdog_hz / CYCLE_NS)):
+        flight.arm.cycle()
     assert not flight.arm.reading.program_running
 
 
@@ -241,11 +262,11 @@ def test_gentle_stop_of_the_worker_stays_gentle():
 def test_decision_that_comes_late_does_not_turn_the_wrist(delay_s):
     """The deadline counts from the sample before the decision, so that a slow network does not prolong it."""
     arm = guarded_arm()
-    until_s = arm.robot.registers[CLOCK_REGISTER] + TIMEOUT_S
+    until = arm.robot.registers[CLOCK_REGISTER] + int(TIMEOUT_S / robots.STEP_S)
     for _ in range(round(delay_s / robots.STEP_S / STEPS)):
         arm.send_heartbeat()
         arm.cycle()
-    arm.robot.registers.write(DEADLINE_REGISTER, until_s, arm.robot.time_s)
+    arm.robot.registers.write(DEADLINE_REGISTER, until, arm.robot.time_s)
     arm.repeat(WristSpeed(FASTEST, HARDEST))
     arm.cycle()
     assert arm.reading.rests == (delay_s > TIMEOUT_S)
@@ -253,7 +274,7 @@ def test_decision_that_comes_late_does_not_turn_the_wrist(delay_s):
 
 def test_deadline_of_an_earlier_program_does_not_count():
     arm = guarded_arm()
-    arm.robot.registers.write(DEADLINE_REGISTER, 3600.0, arm.robot.time_s)
+    arm.robot.registers.write(DEADLINE_REGISTER, 1_800_000, arm.robot.time_s)
     arm.repeat(WristSpeed(FASTEST, HARDEST))
     arm.cycle()
     assert arm.reading.rests
@@ -307,7 +328,8 @@ def test_each_version_of_the_script_can_be_guarded(version):
         robot.step(0.008)
     assert robot.program_running
     # A thread starts in the cycle after the one that starts it.
-    assert robot.registers[CLOCK_REGISTER] == pytest.approx(0.072)
+    assert robot.registers[CLOCK_REGISTER] == 9
+    assert robot.registers[STEP_REGISTER] == 0.008
 
 
 def test_deadline_counts_during_a_gentle_ramp():

@@ -3,6 +3,7 @@ import contextlib
 import json
 import math
 import os
+import re
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -285,3 +286,30 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     for one in after:
         assert [estimates[one["frame"]][key] for key in said] == [one[key] for key in said]
     assert estimates[zeroed]["reason"].startswith("taking the idle frame, 1 of")
+
+
+async def record_run(config: Path, per_experiment: int) -> None:
+    """Run a daemon through three experiments, with a tare, lost bytes and a board that is gone for a moment."""
+    async with recording_daemon(config) as (daemon, board, published, until):
+        recorder = daemon.recorder
+        for number in range(3):
+            recorder.record_experiment(f"run {number}")
+            begin = number * per_experiment
+            await until(begin + per_experiment // 3)
+            if number == 0:
+                board.stdin.write(b"wrong-count\nunplug 0.3\n")
+            elif number == 1:
+                assert (await ask(daemon, "tare"))["ok"]
+            await until(begin + per_experiment - 2)
+            assert published
+
+
+def test_each_of_a_daemons_recordings_replays_bit_for_bit(config, tmp_path, ran):
+    asyncio.run(record_run(config(recording={"folder": "recordings"}), 18))
+    paths = list((tmp_path / "recordings").iterdir())
+    assert {path.stem.rpartition("_")[2] for path in paths} == {"run-0", "run-1", "run-2"}
+    for path in paths:
+        said = ran("replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
+        frames, estimates = (re.search(rf"{topic}: (\d+) of \1 equal", said) for topic in ("eit.frame", "eit.estimate"))
+        assert int(frames[1]) > 8, path
+        assert int(estimates[1]) > 8, path

@@ -83,3 +83,15 @@ def test_a_skin_replay_gives_equal_forces(tmp_path, socket, average_s, ran):
     said = ran("replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
     count = comparison.compared["skin.shear"]
     assert f"skin.shear: {count} of {count} equal the recorded ones" in said
+
+
+@pytest.mark.parametrize(("socket", "average_s"), [(False, 0.02), (True, 0.0)])
+def test_each_of_a_daemons_recordings_gives_equal_forces(tmp_path, socket, average_s):
+    asyncio.run(recorded(tmp_path, socket=socket, average_s=average_s, experiments=("first", "second", "third")))
+    paths = list((tmp_path / "recordings").iterdir())
+    assert {path.stem.rpartition("_")[2] for path in paths} == {"first", "second", "third"}
+    for path in paths:
+        _, comparison = asyncio.run(replayed(path, math.inf))
+        assert comparison.different == Counter(), (path, comparison.examples)
+        # The others last until the next valid force.
+        assert comparison.compared["skin.shear"] > 20 or "third" not in path.stem

@@ -143,14 +143,14 @@ def _leave_out(args: argparse.Namespace) -> int:
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
 
-    args.recordings = [args.calibration, *args.recordings]
-    check_recipe(args)
+    paths = [args.calibration, *args.recordings]
+    check_recipe(args, paths)
     if args.plot or args.out is not None:
         raise UserError("--plot and --out draw one calibration; leave them out with --leave-out")
     if args.estimates is not None:
         check_overwrite(args.estimates, "a table")
     read = read_parts(
-        args.recordings, time_range=args.time_range, sides=args.sides, load_cell_delay_s=args.load_cell_delay_s,
+        paths, time_range=args.time_range, sides=args.sides, load_cell_delay_s=args.load_cell_delay_s,
         tool_mm=args.tool_mm,
     )  # fmt: skip
     bank, mesh = (None if path is None else path.resolve() for path in (args.bank, args.mesh))

@@ -120,9 +120,9 @@ def _sides(text: str) -> tuple[str, ...]:
     return sides
 
 
-def check_recipe(args: argparse.Namespace) -> None:
+def check_recipe(args: argparse.Namespace, recordings: Sequence[Path]) -> None:
     """Raise UserError for an option that has no effect on these recordings or folders of slices."""
-    folders = [path.is_dir() for path in args.recordings]
+    folders = [path.is_dir() for path in recordings]
     if args.assume_full_range and not all(folders):
         raise UserError("--assume-full-range is for slices; leave it out for recordings")
     for option, given, why in (

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.estimation.calibration import ARCHIVE_MAGIC
     from shearloop.tools.calibrate import calibrate
 
-    check_recipe(args)
+    check_recipe(args, args.recordings)
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from shearloop.daemon.messaging.addresses import needs_keys
 from shearloop.errors import UserError
-from shearloop.tools.outputs import check_overwrite
 
 if TYPE_CHECKING:
     from shearloop.bank.fingertip import Fingertip
@@ -69,7 +68,7 @@ def add_option(
     parser: argparse._ActionsContainer,
     name: str,
     kind: Callable[[str], Any],
-    metavar: str | tuple[str, str],
+    metavar: str | tuple[str, ...],
     text: str,
     **more: Any,
 ) -> None:
@@ -160,6 +159,8 @@ def check_calibration_file(out: Path) -> None:
     """Raise UserError, before anything is measured, unless `out` can become a calibration file."""
     if not out.parent.is_dir():
         raise UserError(f"--out {out} cannot be written: the folder {out.parent} does not exist")
+    from shearloop.tools.outputs import check_overwrite
+
     check_overwrite(out, "a calibration file")
 
 

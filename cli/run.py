@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from shearloop.daemon.messaging.publisher import Listener
 
 
+EMULATED = "EMULATED"
+HEADING = f"{EMULATED}: every device was emulated on this computer."
+
+
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `run`."""
     add_option(parser, "config", Path, "CONFIG", "a YAML file such as config/demo.yaml")
@@ -28,6 +32,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     text = "log JSON lines (the default under systemd)"
     parser.add_argument("--json-log", action="store_true", default=None, help=text)
     add_option(parser, "--recording", Path, "FILE", "let the configuration's EIT emulators play this .mat recording")
+    text = "rehearse: emulate every device of this configuration, and run its experiment; no real device is opened"
+    parser.add_argument("--emulate", action="store_true", help=text)
     add_option(parser, "--record", Path, "DIR", "record everything into files in this folder")
     parser.epilog = (
         "Ends at Ctrl-C, SIGTERM, a closed terminal, `shearloop command stop`, or with the experiment if the "
@@ -59,6 +65,27 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[[], None], *, terminal: bool) -> int:
+    with ExitStack() as rehearsing:
+        config = _config(args)
+        if args.emulate:
+            from shearloop.cli.rehearsal import rehearsal
+
+            rehearsed = rehearsing.enter_context(rehearsal(config, args.config))
+            config = rehearsed.config
+            out.write("".join(f"{EMULATED}: {sentence}\n" for sentence in rehearsed.sentences))
+        return _run_config(config, args, out, on_ready, terminal=terminal)
+
+
+def _run_config(
+    config: "DaemonConfig",
+    args: argparse.Namespace,
+    out: "NonBlockingWriter",
+    on_ready: Callable[[], None],
+    *,
+    terminal: bool,
+) -> int:
+    import structlog
+
     from shearloop.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.cli.emulator_processes import EmulatedDevices
     from shearloop.cli.terminal import StatusLine, print_estimate
@@ -68,7 +95,6 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
     from shearloop.daemon.process import lock_memory, raise_descriptor_limit, raise_priority
     from shearloop.daemon.run_summary import RunSummary
 
-    config = _config(args)
     raise_descriptor_limit()
     if config.lock_memory:
         lock_memory()
@@ -78,15 +104,20 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
     if config.emulators:
         # A second daemon is refused before its emulators find their ports taken.
         StopSocket(config.commands, {}, Refusals()).close()
+    label = f"{EMULATED} " if config.emulated else ""
     with ExitStack() as stack:
+        if config.emulated:
+            stack.enter_context(structlog.contextvars.bound_contextvars(rig=EMULATED))
         emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.recording))
         listeners: list[Listener] = [emulated]
         if args.show:
-            listeners.append(stack.enter_context(StatusLine(out)) if terminal else partial(print_estimate, out))
-        shown = out if args.show or config.recording is not None else None
+            listeners.append(
+                stack.enter_context(StatusLine(out, label)) if terminal else partial(print_estimate, out, label=label)
+            )
+        shown = out if args.show or args.emulate or config.recording is not None else None
         # If the daemon ends with its experiment, the summary comes after all that it logs.
         at_end = shown if config.stop_when_done else None
-        summary = RunSummary(None if at_end else shown, emulated)
+        summary = RunSummary(None if at_end else shown, emulated, heading=HEADING if config.emulated else "")
         try:
             finished = asyncio.run(run_daemon(config, tuple(listeners), on_ready, summary))
         finally:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from shearloop.errors import UserError
 from shearloop.printable import printable
-from shearloop.tools.task_row import task_row
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
@@ -31,18 +30,21 @@ def print_result(result: object, sentences: Iterable[str], *, as_json: bool) -> 
     return 0
 
 
-def print_estimate(out: "TextIO | NonBlockingWriter", topic: str, content: Mapping[str, Any]) -> None:
-    """Print a message that is an estimate."""
+def print_estimate(
+    out: "TextIO | NonBlockingWriter", topic: str, content: Mapping[str, Any], *, label: str = ""
+) -> None:
+    """Print a message that is an estimate, behind a label."""
     if topic in ("eit.estimate", "skin.shear"):
-        out.write(printable(message_line(topic, content)) + "\n")
+        out.write(printable(label + message_line(topic, content)) + "\n")
         out.flush()
 
 
 class StatusLine:
     """Shows a daemon's state on one line of a terminal, as a context that leaves an empty line."""
 
-    def __init__(self, out: "TextIO | NonBlockingWriter") -> None:
+    def __init__(self, out: "TextIO | NonBlockingWriter", label: str = "") -> None:
         self._out = out
+        self._label = label
         self._state = self._torque = ""
         # None until a control loop reports; a daemon without a robot has no loop.
         self._driving: str | None = None
@@ -74,6 +76,7 @@ class StatusLine:
         from shearloop.daemon.logs import CLEAR_LINE
 
         # A longer line would wrap, and could not be cleared.
+        text = f"{self._label}{text}" if text else ""
         text, end = (printable(part).replace("\n", " ") for part in (text, end))
         width = shutil.get_terminal_size().columns - 1 - len(end)
         self._out.write(f"{CLEAR_LINE}{text if len(text) <= width else text[: width - 1] + '…'}{end}")
@@ -216,6 +219,8 @@ def loop_line(content: Mapping[str, Any]) -> str:
 
 
 def _health(content: Mapping[str, Any]) -> str:
+    from shearloop.tools.task_row import task_row
+
     rows = [task_row(name, facts) for name, facts in content["tasks"].items()]
     tasks = (f"{name} {', '.join(filter(None, cells))}" for name, *cells in rows)
     return f"{content['memory_mb']:.0f} MB  {content['cpu_percent']:.1f} % CPU  " + "; ".join(tasks)

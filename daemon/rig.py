@@ -115,7 +115,6 @@ def patient(settings: UrSettings) -> UrSettings:
     """Return the settings of an emulated robot, with deadlines that fit a busy computer."""
     return replace(
         settings,
-        watchdog_hz=settings.watchdog_hz / EMULATED_PATIENCE,
         command_timeout_s=EMULATED_PATIENCE * settings.command_timeout_s,
         silence_timeout_s=EMULATED_PATIENCE * settings.silence_timeout_s,
         state_timeout_s=1.0,

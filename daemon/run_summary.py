@@ -103,8 +103,15 @@ class _Run:
 class RunSummary:
     """Collects every message of a daemon; `text` is the summary of the last experiment that ended, or empty."""
 
-    def __init__(self, out: "TextIO | NonBlockingWriter | None" = None, emulated: EmulatedTruth | None = None) -> None:
-        """Take the output for each summary, if any, and an emulated rig, which adds its true torque."""
+    def __init__(
+        self,
+        out: "TextIO | NonBlockingWriter | None" = None,
+        emulated: EmulatedTruth | None = None,
+        *,
+        heading: str = "",
+    ) -> None:
+        """Take the output for each summary, if any, an emulated rig, which adds its true torque, and a first line."""
+        self._heading = heading
         self.text = ""
         self._out = out
         self._emulated = emulated
@@ -132,6 +139,8 @@ class RunSummary:
             lines = list(_lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent))
             if rig is not None and phase != "done" and _LATE_FAULTS.intersection(_codes(content)):
                 lines.insert(0, _TOO_BUSY)
+            if self._heading:
+                lines.insert(0, self._heading)
             self.text = ""
             self._add("\n".join(lines))
 
@@ -171,8 +180,7 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
     if run.last["phase"] == "held":
         run.held_s += _elapsed_s(run.last, content)
     if content["response"] == "hold" and run.last["response"] != "hold":
-        # The reason without its numbers.
-        run.hold_reasons[content["reasons"].split(":")[0].rstrip(".")] += 1
+        run.hold_reasons[FaultCode.of_text(_codes(content)[0]).value.kind] += 1
     run.last = content
     if run.steps:
         run.steps[-1].to_ns = now_ns

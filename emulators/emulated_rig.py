@@ -5,20 +5,23 @@ controller's cycle makes time pass, so that all devices see the same moment.
 """
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
 
-from shearloop.drivers.defaults import FRAME_PERIOD_S, URCAP_PORT
+from shearloop.drivers.defaults import FRAME_PERIOD_S, LOAD_CELL_RATE_HZ, URCAP_PORT
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel
 from shearloop.emulators import number_between
-from shearloop.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch, format_line
-from shearloop.emulators.gripper import Gripper, GripperPlayer, ModbusSlave, UrcapSession
+from shearloop.emulators.boards import EitKitBoard, Hx711Board, Sketch, format_line
+from shearloop.emulators.gripper import Fingers, Gripper, GripperPlayer, ModbusSlave, UrcapSession
 from shearloop.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.emulators.scene import FloatArray, Joint, Scene, TwinSettings
 from shearloop.emulators.ur_controller import FAULTS, Controller
 from shearloop.emulators.ur_robot import ControllerSpec, Robot
 
 NOISE_NM = 0.0005
+# Holds more than any limit on the torque, 6 N·m, allows.
+CLAMP_N = 600.0
 JOINTS = {joint.value: joint for joint in Joint}
 # The pads face each other: a shear on the right has the opposite sign on the left.
 SIDES = {"right": 1.0, "left": -1.0}
@@ -47,11 +50,14 @@ class EmulatedRig:
 
     def __init__(
         self,
-        synthesiser: FrameSynthesiser,
+        synthesisers: Mapping[str, FrameSynthesiser],
         run_dir: Path,
         *,
         host: str = "127.0.0.1",
-        gripper_on: Literal["socket", "modbus"] = "socket",
+        gripper_on: Literal["socket", "modbus", "none"] = "socket",
+        model: GripperModel = MODELS[DEFAULT_MODEL],
+        load_cell: bool = True,
+        load_rate_hz: float = LOAD_CELL_RATE_HZ,
         twin: TwinSettings | None = None,
         diameter_mm: float = 20.0,
         speed: float = 1.0,
@@ -60,35 +66,45 @@ class EmulatedRig:
         sketch: Sketch | None = None,
         seed: int = 0,
     ) -> None:
-        """Gel, fingers and boards are `speed` times as fast as arm, answers and watchdog, which stay in real time."""
-        gripper = Gripper(object_mm=diameter_mm)
-        self.scene = Scene(gripper, twin, speed)
+        """Gel, fingers and boards are `speed` times as fast as arm, answers and watchdog, which stay in real time.
+
+        `synthesisers` are by the fingertips' names. Without a gripper the tool is clamped to the wrist.
+        """
+        gripper = Gripper(object_mm=diameter_mm, fingers=Fingers(model))
+        self.scene = Scene(gripper, twin, speed, clamp_n=CLAMP_N if gripper_on == "none" else 0.0)
         self.controller = Controller(Robot(make, self.scene), host=host, rate_hz=rate_hz)
-        player = GripperPlayer(
-            gripper,
-            PtyServer(ModbusSlave(gripper), run_dir / "gripper")
-            if gripper_on == "modbus"
-            else SocketServer(UrcapSession(gripper), host, URCAP_PORT),
-        )
         boards: dict[str, EitKitBoard | Hx711Board] = {
             side: EitKitBoard(
-                self._frames(synthesiser, sign),
+                self._frames(synthesiser, SIDES.get(side, (-1.0) ** number)),
                 period_s=FRAME_PERIOD_S / speed,
                 link=run_dir / f"eit-{side}",
                 seed=seed + number,
             )
-            for number, (side, sign) in enumerate(SIDES.items())
+            for number, (side, synthesiser) in enumerate(synthesisers.items())
         }
-        boards["load"] = Hx711Board(
-            (sketch or Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm)).lines(self._torques_nm(), seed),
-            period_s=LOAD_PERIOD_S / speed,
-            link=run_dir / "load-cell",
-            seed=seed,
-        )
-        self._played: list[EitKitBoard | Hx711Board | Server] = [*boards.values(), player.server]
-        self._commanded: dict[str, Device] = {**boards, "gripper": player, "robot": self.controller}
+        if load_cell:
+            boards["load"] = Hx711Board(
+                (sketch or Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm)).lines(
+                    self._torques_nm(1 / load_rate_hz), seed
+                ),
+                period_s=1 / load_rate_hz / speed,
+                link=run_dir / "load-cell",
+                seed=seed,
+            )
+        self._played: list[EitKitBoard | Hx711Board | Server] = [*boards.values()]
+        self._commanded: dict[str, Device] = {**boards}
         self.ports = {name: board.port.appearances for name, board in boards.items()}
-        self.ports["gripper"] = player.server.appearances
+        if gripper_on != "none":
+            player = GripperPlayer(
+                gripper,
+                PtyServer(ModbusSlave(gripper), run_dir / "gripper")
+                if gripper_on == "modbus"
+                else SocketServer(UrcapSession(gripper), host, URCAP_PORT),
+            )
+            self._played.append(player.server)
+            self._commanded["gripper"] = player
+            self.ports["gripper"] = player.server.appearances
+        self._commanded["robot"] = self.controller
 
     async def run(self) -> None:
         """Play all but the robot until cancelled; OSError, in a group, if an address or port is not available."""
@@ -106,7 +122,7 @@ class EmulatedRig:
             case ["joint", name] if name in JOINTS:
                 self.scene.put_on(JOINTS[name])
             case ["object", *_]:
-                self._commanded["gripper"].command(text)
+                self._device("gripper").command(text)
             case ["normal"]:
                 for commanded in self._commanded.values():
                     commanded.command("normal")
@@ -131,9 +147,9 @@ class EmulatedRig:
             grip, shear_nm, width_mm = self.scene.frame(FRAME_PERIOD_S)
             yield format_line(synthesiser.line(grip, sign * shear_nm, width_mm))
 
-    def _torques_nm(self) -> Iterator[float]:
+    def _torques_nm(self, period_s: float) -> Iterator[float]:
         while True:
-            yield self.scene.conversion_nm(LOAD_PERIOD_S)
+            yield self.scene.conversion_nm(period_s)
 
 
 def _torque(text: str) -> float:

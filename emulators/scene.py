@@ -166,8 +166,12 @@ class Scene:
     A wrist turned in its positive direction puts a positive torque into the tool.
     """
 
-    def __init__(self, gripper: Gripper, settings: TwinSettings | None = None, speed: float = 1.0) -> None:
+    def __init__(
+        self, gripper: Gripper, settings: TwinSettings | None = None, speed: float = 1.0, clamp_n: float = 0.0
+    ) -> None:
+        """Take the gripper; `clamp_n` is the force of a clamp that holds the tool without one."""
         self.gripper = gripper
+        self._clamp_n = clamp_n
         self.twin = Twin(settings or TwinSettings())
         self.time_s = 0.0
         self._speed = speed
@@ -181,7 +185,7 @@ class Scene:
         self.time_s += dt_s
         self._wrist_rad = wrist_rad
         self.gripper.step(dt_s)
-        force_n = self.gripper.grip_force_n
+        force_n = max(self.gripper.grip_force_n, self._clamp_n)
         if force_n <= 0.0:
             # A kick does not act on the next grip.
             self.twin.kick_nm = 0.0

@@ -11,6 +11,7 @@ from pathlib import Path
 from random import Random
 from typing import Protocol, TypeAlias
 
+from shearloop.drivers.defaults import DAQ_RATE_HZ
 from shearloop.emulators import number_between
 from shearloop.emulators.boards import EmulatedBoard
 from shearloop.emulators.ports import PtyServer, SocketServer
@@ -21,7 +22,6 @@ LEAD_OHM = 0.4
 GAUGES = ("1", "2")
 # Two conversions of one mains period each, and the reply's transfer.
 ANSWER_S = 0.04
-DAQ_PERIOD_S = 0.1
 # The paper's noise floor, 1.6 mN, as a voltage on each of two gauges of 25 Ω at 5 mA, 0.088 /N.
 NOISE_V = 0.0016 * 0.088 / 2**0.5 * 0.125
 
@@ -293,7 +293,14 @@ class SkinInstruments:
     """
 
     def __init__(
-        self, gauges: Gauges, source_at: Address | None, daq_at: Address | None, *, speed: float = 1.0, seed: int = 0
+        self,
+        gauges: Gauges,
+        source_at: Address | None,
+        daq_at: Address | None,
+        *,
+        speed: float = 1.0,
+        daq_rate_hz: float = DAQ_RATE_HZ,
+        seed: int = 0,
     ) -> None:
         self.circuit = Circuit(gauges)
         source, answer_s = EmulatedKeithley6430(self.circuit, seed), ANSWER_S / speed
@@ -309,7 +316,7 @@ class SkinInstruments:
             self.daq_port = self._daq.appearances
         else:
             lines = adc_lines(self.circuit, seed + 1)
-            self._daq = EmulatedAdcBoard(lines, period_s=DAQ_PERIOD_S / speed, link=daq_at, seed=seed + 1)
+            self._daq = EmulatedAdcBoard(lines, period_s=1 / daq_rate_hz / speed, link=daq_at, seed=seed + 1)
             self.daq_port = self._daq.port.appearances
 
     async def run(self) -> None:

@@ -5,11 +5,13 @@ Poses are UR's: position and rotation vector of the flange.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 Vector = NDArray[np.float64]
@@ -18,6 +20,8 @@ Matrix = NDArray[np.float64]
 A_M = (0.0, -0.425, -0.3922, 0.0, 0.0, 0.0)
 D_M = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)
 ALPHA_RAD = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
+# Elbow up, the tool pointing straight down.
+HOME_RAD = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
 # Data sheet of the UR5e: 180 degrees per second. A linear move that needs more, near a singularity, ends in a
 # protective stop.
 JOINT_SPEED_LIMIT_RAD_PER_S = math.pi
@@ -33,6 +37,45 @@ def link_frames(q_rad: Vector) -> list[Matrix]:
         )
         frames.append(frames[-1] @ link)
     return frames
+
+
+def tool_frames(q_rad: Vector, tool: Matrix) -> list[Matrix]:
+    """Return the frames of `link_frames`, with the tool centre point's in the place of the flange's."""
+    frames = link_frames(q_rad)
+    frames[-1] = frames[-1] @ tool
+    return frames
+
+
+def frame_of_pose(pose: Sequence[float] | Vector) -> Matrix:
+    """Return the frame (4, 4) of a pose (6,): position and rotation vector."""
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = Rotation.from_rotvec(np.asarray(pose[3:])).as_matrix(), pose[:3]
+    return frame
+
+
+def joints_within(
+    lower_rad: Sequence[float],
+    upper_rad: Sequence[float],
+    lower_m: Sequence[float],
+    upper_m: Sequence[float],
+    tcp_offset: Sequence[float],
+) -> Vector | None:
+    """Return joints (6,) near HOME_RAD whose tool centre point lies inside a box; None if the arm reaches none.
+
+    The tool keeps its direction. The point keeps a quarter of the box from each face, or as far as HOME_RAD is.
+    """
+    tool = frame_of_pose(tcp_offset)
+    box, home = np.array([lower_m, upper_m]), tool_frames(HOME_RAD, tool)[-1]
+    quarter = (box[1] - box[0]) / 4
+    target = np.clip(home[:3, 3], box[0] + quarter, box[1] - quarter)
+
+    def error(q_rad: Vector) -> Vector:
+        frame = tool_frames(q_rad, tool)[-1]
+        return np.concatenate([frame[:3, 3] - target, frame[:3, 2] - home[:3, 2]])
+
+    low, high = np.asarray(lower_rad), np.asarray(upper_rad)
+    found = least_squares(error, np.clip(HOME_RAD, low, high), bounds=(low, high)).x
+    return np.asarray(found) if float(np.abs(error(found)).max()) < 1e-3 else None
 
 
 def jacobian(frames: list[Matrix]) -> Matrix:
@@ -73,6 +116,8 @@ class LinearMove:
     target: Matrix
     speed: float
     acceleration: float
+    # From the flange to the tool centre point.
+    tool: Matrix = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
         """Compute the length; a move that only turns is measured in radians."""
@@ -89,7 +134,7 @@ class LinearMove:
     def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:  # noqa: ARG002 - on its own rails
         """Return the arm one cycle later; `PathError` where the joints cannot follow within their limits."""
         share = self._advance_trapezoid(dt_s)
-        frames = link_frames(q_rad)
+        frames = tool_frames(q_rad, self.tool)
         here = frames[-1]
         where = self.start[:3, 3] + share * (self.target[:3, 3] - self.start[:3, 3])
         turned = self.start[:3, :3] @ Rotation.from_rotvec(share * self._turn).as_matrix()
@@ -126,12 +171,17 @@ class WristPlant(Protocol):
 class Arm:
     """The arm's joints, what moves them, and the wrench at the tool (6,) in base coordinates."""
 
-    def __init__(self, plant: WristPlant | None = None) -> None:
-        # Elbow up, the tool pointing straight down.
-        self.q_rad: Vector = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
+    def __init__(
+        self, plant: WristPlant | None = None, joints_rad: Sequence[float] | None = None, tool: Matrix | None = None
+    ) -> None:
+        """Stand at these joints, or at HOME_RAD, with this frame from the flange to the tool centre point."""
+        self.q_rad: Vector = HOME_RAD.copy() if joints_rad is None else np.array(joints_rad)
+        self._tool = np.eye(4) if tool is None else tool
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Speed | LinearMove | None = None
-        self._framed_q_rad, self._last_frame = self.q_rad, link_frames(self.q_rad)[-1]
+        # The pendant's speed slider, a factor on commanded speeds.
+        self.speed_slider = 1.0
+        self._framed_q_rad, self._last_frame = self.q_rad, tool_frames(self.q_rad, self._tool)[-1]
         self._plant = plant
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)
@@ -140,7 +190,7 @@ class Arm:
     def _frame(self) -> Matrix:
         # Only where it is needed: it takes longer than all else in a cycle. A motion makes new angles.
         if self._framed_q_rad is not self.q_rad:
-            self._framed_q_rad, self._last_frame = self.q_rad, link_frames(self.q_rad)[-1]
+            self._framed_q_rad, self._last_frame = self.q_rad, tool_frames(self.q_rad, self._tool)[-1]
         return self._last_frame
 
     @property
@@ -156,7 +206,7 @@ class Arm:
     @property
     def speed(self) -> Vector:
         """The tool's linear and angular velocity (6,) in base coordinates."""
-        return np.asarray(jacobian(link_frames(self.q_rad)) @ self.qd_rad_per_s)
+        return np.asarray(jacobian(tool_frames(self.q_rad, self._tool)) @ self.qd_rad_per_s)
 
     @property
     def wrench(self) -> Vector:
@@ -165,13 +215,12 @@ class Arm:
 
     def turn(self, target_rad_per_s: Vector, acceleration: float) -> None:
         """Turn towards these joint speeds from now on."""
-        self.motion = Speed(target_rad_per_s, acceleration)
+        self.motion = Speed(self.speed_slider * target_rad_per_s, acceleration)
 
     def move_to(self, pose: Vector, speed: float, acceleration: float) -> None:
         """Begin a linear move."""
-        goal = np.eye(4)
-        goal[:3, :3], goal[:3, 3] = Rotation.from_rotvec(pose[3:]).as_matrix(), pose[:3]
-        self.motion = LinearMove(self._frame, goal, speed, acceleration)
+        speed *= self.speed_slider
+        self.motion = LinearMove(self._frame, frame_of_pose(pose), speed, acceleration, self._tool)
 
     def halt(self, deceleration: float) -> None:
         """Slow every joint down to rest."""
@@ -194,7 +243,8 @@ class Arm:
         """Let the wrist turn its plant for one cycle, and feel its torque about the tool's axis."""
         if self._plant is not None:
             torque_nm = self._plant.step(dt_s, float(self.q_rad[5]))
-            self._wrench = np.concatenate([np.zeros(3), torque_nm * self._frame[:3, 2]])
+            flange_axis = self._frame[:3, :3] @ self._tool[2, :3]
+            self._wrench = np.concatenate([np.zeros(3), torque_nm * flange_axis])
 
     def zero_wrench(self) -> None:
         """Make the present wrench zero."""

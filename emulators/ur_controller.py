@@ -34,16 +34,8 @@ _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
     *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "protect-abrupt-ends"),
-    *(
-        "registers-in-use",
-        "local-control",
-        "refuse-protocol",
-        "mute-dashboard",
-        "drop-scripts",
-        "version",
-        "payload",
-        "normal",
-    ),
+    *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "drop-scripts"),
+    *("version", "payload", "slider", "normal"),
 )
 
 
@@ -131,6 +123,9 @@ class Controller:
             case ["payload", mass_kg]:
                 payload_kg = number_between(mass_kg, 0.0, 100.0, "not a mass in kg from 0 to 100")
                 self.robot.change(replace(self.robot.spec, payload_kg=payload_kg))
+            case ["slider", fraction]:
+                slider = number_between(fraction, 0.01, 1.0, "not a fraction from 0.01 to 1")
+                self.robot.arm.speed_slider = slider
             case ["normal"]:
                 self.robot.clear_faults()
                 self.robot.change(self._first_spec)

@@ -7,7 +7,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from shearloop.emulators.ur_arm import Arm, PathError, WristPlant
+from shearloop.emulators.ur_arm import Arm, PathError, WristPlant, frame_of_pose
 from shearloop.emulators.urscript import Program, ProgramEndedError, Registers
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4
@@ -24,9 +24,13 @@ class ControllerSpec:
     unlock_wait_s: float = 5.0
     power_on_s: float = 1.0
     version: tuple[int, int, int, int] = (5, 17, 3, 0)
-    # A gripper's; the arm's own pose is the flange's, so that the tool centre point is not moved.
+    # A gripper's.
     payload_kg: float = 1.0
     payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.06)
+    # From the flange to the tool centre point: position in m, rotation vector in rad.
+    tcp_offset: tuple[float, ...] = (0.0,) * 6
+    # Where the arm stands when it is switched on; None for a pose of its own.
+    joints_rad: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +48,7 @@ class Robot:
     def __init__(self, spec: ControllerSpec | None = None, plant: WristPlant | None = None) -> None:
         """Be switched on, safe, at rest, without a program."""
         self.spec = spec or ControllerSpec()
-        self.arm = Arm(plant)
+        self.arm = Arm(plant, self.spec.joints_rad, frame_of_pose(self.spec.tcp_offset))
         self.robot_mode, self.safety_mode = MODE_RUNNING, SAFETY_NORMAL
         self._stopped_s, self._power_step_s = 0.0, math.inf
         self.registers = Registers()
@@ -166,7 +170,7 @@ class Robot:
 
     def clear_faults(self) -> None:
         """Be safe and powered, without a program."""
-        self.protects_abrupt_ends = False
+        self.protects_abrupt_ends, self.arm.speed_slider = False, 1.0
         self.end_program("the faults are cleared")
         self.robot_mode, self.safety_mode, self._power_step_s = MODE_RUNNING, SAFETY_NORMAL, math.inf
         self._note("faults-cleared")

@@ -41,11 +41,12 @@ _VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
     "safety_status_bits": ("UINT32", lambda robot: _SAFETY_BITS[robot.safety_mode]),
     "runtime_state": ("UINT32", lambda robot: robot.runtime_state),
     "robot_status_bits": ("UINT32", lambda robot: int(robot.robot_mode == MODE_RUNNING) | robot.program_running << 1),
+    "target_speed_fraction": ("DOUBLE", lambda robot: robot.arm.speed_slider),
     "speed_scaling": ("DOUBLE", lambda _: 1.0),
     "external_force_torque": ("VECTOR6D", lambda _: (0.0,) * 6),
     "payload": ("DOUBLE", lambda robot: robot.spec.payload_kg),
     "payload_cog": ("VECTOR3D", lambda robot: robot.spec.payload_cog_m),
-    "tcp_offset": ("VECTOR6D", lambda _: (0.0,) * 6),
+    "tcp_offset": ("VECTOR6D", lambda robot: robot.spec.tcp_offset),
 }
 
 

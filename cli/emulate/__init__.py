@@ -48,10 +48,11 @@ def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> ar
     DEVICES[device].configure(parser)
     parser.set_defaults(device=device)
     args = parser.parse_args(arguments)
-    bank = getattr(args, "bank", None)
-    if bank is not None and not (folder / bank).exists():
-        from shearloop.bank.bank_file import how_to_build
+    named = [bank for _, bank in getattr(args, "fingertip", ())]
+    for bank in filter(None, (getattr(args, "bank", None), *named)):
+        if not (folder / bank).exists():
+            from shearloop.bank.bank_file import how_to_build
 
-        cure = how_to_build(Path(os.path.normpath(folder / bank)))
-        raise UserError(f"--bank {bank}: there is no such file; {cure}")
+            cure = how_to_build(Path(os.path.normpath(folder / bank)))
+            raise UserError(f"--bank {bank}: there is no such file; {cure}")
     return args

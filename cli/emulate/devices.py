@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.emulate import console
 from shearloop.cli.options import PORT, add_option, number, positive
-from shearloop.drivers.defaults import URCAP_PORT
+from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ, URCAP_PORT
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
 from shearloop.emulators import number_between
 from shearloop.errors import UserError
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from shearloop.emulators.boards import Sketch
     from shearloop.emulators.ur_controller import Controller
     from shearloop.emulators.ur_robot import ControllerSpec
 
@@ -35,6 +36,9 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   local-control           leave remote control
   refuse-protocol         refuse the RTDE protocol version
   mute-dashboard          accept connections to the dashboard, and send nothing on them
+  drop-scripts            take programs, and play none
+  protect-abrupt-ends     end in a protective stop when a program ends while the arm moves
+  slider FRACTION         move the pendant's speed slider, 1 at its right end
   version A.B.C.D         report this version of PolyScope to later connections
   payload KG              have another payload set at the pendant
   normal                  end all of them
@@ -91,6 +95,25 @@ def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[n
     return (frames.line(np.array([grip]), np.array([torque_nm]), DIAMETER_MM) for grip, torque_nm in moments)
 
 
+def add_load_cell(parser: argparse.ArgumentParser) -> None:
+    """Add the calibration and the rate of a load cell's board."""
+    text = "send counts that this calibration of `shearloop calibrate load` turns into the torque"
+    add_option(parser, "--load-calibration", Path, "FILE", text)
+    text = "its lines per second (default: %(default)s)"
+    add_option(parser, "--load-rate-hz", positive(high=1000.0), "HZ", text, default=LOAD_CELL_RATE_HZ)
+
+
+def load_cell_sketch(calibration: Path, noise_nm: float) -> "Sketch":
+    """Return the board whose counts a calibration file turns into the torque."""
+    from shearloop.drivers.calibration_files import load_device_calibration
+    from shearloop.drivers.load_cell import LoadCalibration
+    from shearloop.emulators.boards import Sketch
+
+    given = load_device_calibration(calibration, LoadCalibration)
+    counts_per_nm = 1.0 / given.nm_per_count
+    return Sketch(counts_per_nm, given.tare_counts, abs(noise_nm * counts_per_nm), decimals=12)
+
+
 def _configure_hx711(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
@@ -100,17 +123,20 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
     )
     add_option(parser, "--torque-nm", number(-1000.0, 1000.0), "NM", "the torque (default: %(default)s)", default=0.0)
     parser.add_argument("--paper-sketch", action="store_true", help="send N·m, as the paper's board did, not counts")
-    console.add_seed_and_speed(parser, "the board's 10.9 lines per second")
+    add_load_cell(parser)
+    console.add_seed_and_speed(parser, "the pace of its lines")
     console.add_link(parser)
 
 
 def _play_hx711(args: argparse.Namespace) -> Playing:
     from shearloop.drivers.load_cell import LEVER_ARM_M
     from shearloop.drivers.load_cell_calibration import STANDARD_GRAVITY
-    from shearloop.emulators.boards import LOAD_PERIOD_S, PAPER_SKETCH, Hx711Board, Sketch
+    from shearloop.emulators.boards import PAPER_SKETCH, Hx711Board, Sketch
 
-    held_nm = args.torque_nm
-    sketch, period_s = PAPER_SKETCH if args.paper_sketch else Sketch(), LOAD_PERIOD_S / args.speed
+    held_nm, period_s = args.torque_nm, 1.0 / (args.load_rate_hz * args.speed)
+    sketch = PAPER_SKETCH if args.paper_sketch else Sketch()
+    if args.load_calibration is not None:
+        sketch = load_cell_sketch(args.load_calibration, sketch.noise_counts / sketch.counts_per_nm)
     link = console.checked_link(args.link)
     lines = sketch.lines((held_nm for _ in repeat(None)), args.seed)
     board = Hx711Board(lines, period_s=period_s, link=link, seed=args.seed)
@@ -129,18 +155,34 @@ def _play_hx711(args: argparse.Namespace) -> Playing:
     return console.play(board.run(), on_command, port=board.port.appearances)
 
 
-def add_robot(parser: argparse.ArgumentParser) -> None:
+def add_robot(parser: argparse._ActionsContainer) -> None:
     """Add the arguments of every emulated controller."""
     add_option(parser, "--rate-hz", RATE_HZ, "HZ", "control cycles per second (default: %(default)s)", default=500.0)
     parser.add_argument("--unlock-wait-s", type=float, default=5.0, help="time in which a stop is not unlocked (5)")
     parser.add_argument("--power-on-s", type=float, default=1.0, help="time of each power-on step (default: 1)")
+    text = "joints where the arm stands at first"
+    add_option(parser, "--joints-rad", float, ("Q1", "Q2", "Q3", "Q4", "Q5", "Q6"), text, nargs=6)
+    text = "payload set at the pendant (default: %(default)s)"
+    add_option(parser, "--payload-kg", number(0.0, 100.0), "KG", text, default=1.0)
+    text = "its centre of gravity from the flange (default: 0 0 0.06)"
+    add_option(parser, "--payload-cog-m", float, ("X", "Y", "Z"), text, nargs=3, default=(0.0, 0.0, 0.06))
+    text = "tool centre point set at the pendant, from the flange (default: at the flange)"
+    axes = ("X", "Y", "Z", "RX", "RY", "RZ")
+    add_option(parser, "--tcp-offset", float, axes, text, nargs=6, default=(0.0,) * 6)
 
 
 def robot_make(args: argparse.Namespace) -> "ControllerSpec":
     """Return the controller's make."""
     from shearloop.emulators.ur_robot import ControllerSpec
 
-    return ControllerSpec(unlock_wait_s=args.unlock_wait_s, power_on_s=args.power_on_s)
+    return ControllerSpec(
+        unlock_wait_s=args.unlock_wait_s,
+        power_on_s=args.power_on_s,
+        payload_kg=args.payload_kg,
+        payload_cog_m=tuple(args.payload_cog_m),
+        tcp_offset=tuple(args.tcp_offset),
+        joints_rad=None if args.joints_rad is None else tuple(args.joints_rad),
+    )
 
 
 async def play_robot(controller: "Controller", *others: Callable[[], Playing]) -> None:

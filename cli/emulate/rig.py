@@ -11,14 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.cli.emulate import console
-from shearloop.cli.emulate.devices import RATE_HZ, Playing, add_robot, play_robot, robot_make
-from shearloop.cli.options import PORT, TOOL_MM, add_option, positive
+from shearloop.cli.emulate.devices import Playing, add_load_cell, add_robot, load_cell_sketch, play_robot, robot_make
+from shearloop.cli.options import PORT, TOOL_MM, add_option, number, positive
+from shearloop.drivers.defaults import DAQ_RATE_HZ
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
 from shearloop.emulators import number_between
+from shearloop.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.emulators.emulated_rig import EmulatedRig
     from shearloop.emulators.scene import Truth
     from shearloop.emulators.skin import Address
+    from shearloop.emulators.synthetic_frames import RigFrames
     from shearloop.emulators.synthetic_skin import SyntheticSkin
 
 TRUTH_PERIOD_S = 0.1
@@ -79,12 +83,18 @@ class PushedSkin:
 def _configure_rig(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = RIG_EPILOG
-    add_option(parser, "--bank", Path, "FILE", "synthesise frames from its signals", required=True)
+    add_option(parser, "--bank", Path, "FILE", "synthesise frames of a right and a left fingertip from its signals")
+    text = "a fingertip of this name with frames from this bank; may be given several times"
+    add_option(parser, "--fingertip", str, ("NAME", "FILE"), text, nargs=2, action="append", default=[])
     text = "folder for the ports eit-right, eit-left and load-cell"
     add_option(parser, "--run-dir", Path, "DIR", text, required=True)
     parser.add_argument("--host", default="127.0.0.1", help="address of robot and gripper (default: %(default)s)")
-    text = "its interface (default: %(default)s)"
-    parser.add_argument("--gripper", choices=("socket", "modbus"), default="socket", help=text)
+    text = "the gripper's interface, or none: the tool is clamped to the wrist (default: %(default)s)"
+    parser.add_argument("--gripper", choices=("socket", "modbus", "none"), default="socket", help=text)
+    text = f"{', '.join(MODELS)} (default: %(default)s)"
+    parser.add_argument("--model", choices=tuple(MODELS), metavar="MODEL", default=DEFAULT_MODEL, help=text)
+    parser.add_argument("--no-load-cell", action="store_true", help="play no load cell")
+    add_load_cell(parser)
     add_option(parser, "--diameter-mm", TOOL_MM, "MM", "of the tool (default: 20)", default=20.0)
     add_option(parser, "--gel-stiffness", positive(), "NM_PER_RAD", "of both pads (default: %(default)s)", default=0.8)
     console.add_seed_and_speed(parser, "the pace of gel, fingers and boards")
@@ -99,27 +109,45 @@ def _play_rig(args: argparse.Namespace) -> Playing:
     from shearloop.emulators.boards import PAPER_SKETCH
     from shearloop.emulators.emulated_rig import NOISE_NM, EmulatedRig
     from shearloop.emulators.scene import TwinSettings
-    from shearloop.emulators.synthetic_frames import RigFrames
 
     make = robot_make(args)
     args.run_dir.mkdir(parents=True, exist_ok=True)
+    sketch = replace(PAPER_SKETCH, noise_counts=NOISE_NM) if args.paper_sketch else None
+    if args.load_calibration is not None:
+        sketch = load_cell_sketch(args.load_calibration, NOISE_NM)
     rig = EmulatedRig(
-        RigFrames(args.bank, args.seed, args.sigma),
+        _fingertips(args),
         args.run_dir,
         host=args.host,
         gripper_on=args.gripper,
+        model=MODELS[args.model],
+        load_cell=not args.no_load_cell,
+        load_rate_hz=args.load_rate_hz,
         twin=TwinSettings(gel_stiffness_nm_per_rad=args.gel_stiffness),
         diameter_mm=args.diameter_mm,
         speed=args.speed,
         rate_hz=args.rate_hz,
         make=make,
-        sketch=replace(PAPER_SKETCH, noise_counts=NOISE_NM) if args.paper_sketch else None,
+        sketch=sketch,
         seed=args.seed,
     )
     others: list[Callable[[], Playing]] = [rig.run, partial(_print_ready, rig, args.host)]
     if args.truth is not None:
         others.append(partial(_write_truths, rig, args.truth, TRUTH_PERIOD_S / args.speed))
     return console.play(play_robot(rig.controller, *others), partial(_obey, rig))
+
+
+def _fingertips(args: argparse.Namespace) -> "dict[str, RigFrames]":
+    """Return what makes the frames of each fingertip; raises UserError for a name that another device has."""
+    from shearloop.emulators.synthetic_frames import RigFrames
+
+    if args.bank is not None:
+        both = RigFrames(args.bank, args.seed, args.sigma)
+        return {"right": both, "left": both}
+    for name, _ in args.fingertip:
+        if name in ("load", "gripper", "robot"):
+            raise UserError(f"--fingertip {name}: another device of the emulated rig has this name; choose another")
+    return {name: RigFrames(Path(bank), args.seed + n, args.sigma) for n, (name, bank) in enumerate(args.fingertip)}
 
 
 async def _print_ready(rig: "EmulatedRig", host: str) -> None:
@@ -162,7 +190,12 @@ def _configure_skin(parser: argparse.ArgumentParser) -> None:
     console.add_seed_and_speed(parser, "the instruments' own pace")
     robot = parser.add_argument_group("a robot whose wrist turns a tool on the skin")
     robot.add_argument("--robot", metavar="HOST", help="play a UR controller on this address of this machine")
-    add_option(robot, "--rate-hz", RATE_HZ, "HZ", "control cycles per second (default: %(default)s)", default=500.0)
+    add_robot(robot)
+    add_option(parser, "--normal-n", number(0.0, 100.0), "N", "force on the skin (default: %(default)s)", default=1.0)
+    text = "from the wrist's axis to the skin (default: %(default)s)"
+    add_option(parser, "--radius-mm", positive(high=200.0), "MM", text, default=15.0)
+    text = "readings of a converter board per second (default: %(default)s)"
+    add_option(parser, "--daq-rate-hz", positive(high=1000.0), "HZ", text, default=DAQ_RATE_HZ)
 
 
 def _play_skin(args: argparse.Namespace) -> Playing:
@@ -171,12 +204,15 @@ def _play_skin(args: argparse.Namespace) -> Playing:
     from shearloop.emulators.ur_controller import Controller
     from shearloop.emulators.ur_robot import Robot
 
-    pushed = PushedSkin(SyntheticSkin(seed=args.seed))
+    skin = SyntheticSkin(radius_mm=args.radius_mm, normal_n=args.normal_n, seed=args.seed)
+    pushed = PushedSkin(skin)
     source_at, daq_at = (_address(args, name) for name in ("source", "daq"))
-    instruments = SkinInstruments(pushed, source_at, daq_at, speed=args.speed, seed=args.seed)
+    instruments = SkinInstruments(
+        pushed, source_at, daq_at, speed=args.speed, daq_rate_hz=args.daq_rate_hz, seed=args.seed
+    )
     controller = None
     if args.robot is not None:
-        controller = Controller(Robot(plant=pushed), host=args.robot, rate_hz=args.rate_hz)
+        controller = Controller(Robot(robot_make(args), pushed), host=args.robot, rate_hz=args.rate_hz)
 
     def on_command(line: str) -> None:
         match line.split():

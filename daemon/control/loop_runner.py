@@ -754,7 +754,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         speed_sent_rad_per_s=sent_rad_per_s,
         response=status.decision.response.name.lower().replace("_", " "),
         cause=next(iter(status.decision.reasons), ""),
-        faults=", ".join(fault.code.text for fault in status.decision.reported),
+        faults=status.decision.codes,
         reasons=" ".join((*status.decision.reasons, *status.velocity.reasons)),
     )
 

@@ -35,6 +35,11 @@ class Rule:
     is_past: bool = False
     explains: bool = False
 
+    @property
+    def kind(self) -> str:
+        """What every fault of this row has in common: the sentence without its detail."""
+        return self.sentence.split("{detail}")[0].rstrip(": ")
+
 
 # A hold's timer runs down at this rate while its fault is absent: a fault that is present for more than a third of the
 # time becomes a stop.
@@ -193,8 +198,13 @@ class FaultCode(Enum):
 
     @property
     def text(self) -> str:
-        """The name in words."""
+        """The name in words: the code in messages."""
         return self.name.lower().replace("_", " ")
+
+    @classmethod
+    def of_text(cls, text: str) -> "FaultCode":
+        """Return the fault of a message's code; raises KeyError for an unknown one."""
+        return cls[text.upper().replace(" ", "_")]
 
 
 TABLE: Mapping[FaultCode, Rule] = {code: code.value for code in FaultCode}
@@ -235,6 +245,11 @@ class SafetyDecision:
     def reported(self) -> tuple[Fault, ...]:
         """The faults without consequences, the cause first."""
         return tuple(fault for fault in self.faults if not fault.is_consequence)
+
+    @property
+    def codes(self) -> str:
+        """The codes of the reported faults, separated by commas, as messages have them."""
+        return ", ".join(fault.code.text for fault in self.reported)
 
     @property
     def reasons(self) -> tuple[str, ...]:

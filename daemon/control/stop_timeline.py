@@ -44,6 +44,7 @@ class StopTimeline:
             t_mono_ns=cause_ns,
             experiment=experiment,
             cause=reason,
+            faults=decision.codes,
             response=decision.response.name.lower().replace("_", " "),
             decided_after_s=(now_ns - cause_ns) / 1e9,
             sent_after_s=None,

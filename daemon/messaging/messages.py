@@ -171,7 +171,7 @@ class RobotStateMessage(Message):
     wrist_torque_nm: float = column("N·m", "torque about the tool's axis, from the wrench")
     robot_mode: int = column("", "the controller's robot mode, 7 when running")
     safety_mode: int = column("", "the controller's safety mode, 1 when normal")
-    speed_scaling: float = column("", "share of the commanded speed that the controller allows")
+    speed_scaling: float = column("", "fraction of commanded speeds that is carried out: slider times own scaling")
     payload_kg: float = column("kg", "payload that is set at the pendant; NaN before PolyScope 3.12 and 5.5.1")
     payload_cog_m: tuple[float, ...] = column("m", "its centre of gravity from the flange")
     tcp_offset: tuple[float, ...] = column("m, rad", "tool centre point that is set, from the flange")
@@ -237,6 +237,7 @@ class LoopStop(Message):
 
     experiment: str = column("", "name of the experiment")
     cause: str = column("", "why it stopped, in sentences")
+    faults: str = column("", "codes of the faults that stopped it, separated by commas, the cause's first")
     response: str = column("", "the safety response")
     decided_after_s: float = column("s", "from the measurement or request that caused it to the decision")
     sent_after_s: float | None = column("s", "until the robot's process had sent the stop; nil if it did not answer")

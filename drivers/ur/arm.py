@@ -9,13 +9,14 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from operator import sub
 
 import rtde_control
 import script_client
 
 from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge, ScriptReadiness, command_dashboard
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, MoveLinear, RobotLostError, RtdeSample, WristSpeed
-from shearloop.drivers.ur.script import NO_MOTION_TICKS, guard_script
+from shearloop.drivers.ur.script import KNOWN_SCRIPTS, NO_MOTION_TICKS, guard_script, hash_of
 from shearloop.drivers.ur.script_port import ScriptPort
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -39,12 +40,14 @@ class UrArm:
         """
         self._settings = settings
         major, minor = map(int, version.split(".")[:2])
-        self._script = guard_script(script_client.ScriptClient("", major, minor).getScript(), settings)
+        own = script_client.ScriptClient("", major, minor).getScript()
+        known = hash_of(own) in KNOWN_SCRIPTS
+        self._script = guard_script(own, settings) if known else ""
         if not self._script:
             raise RobotLostError(
                 "version",
-                "The control script of the installed ur-rtde is unknown, so that its limits cannot be added: install "
-                "ur-rtde 1.6.5.",
+                f"The installed ur-rtde has a control script for PolyScope {version} that is unknown, so that its "
+                f"limits cannot be added (SHA-256 {hash_of(own)}): install ur-rtde 1.6.5.",
             )
         self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
         kind = rtde_control.RTDEControlInterface
@@ -57,6 +60,8 @@ class UrArm:
         # A linear move was begun, and the wrist has not turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
+        # In the base's frame, while the controller cannot zero its wrench.
+        self._wrench_zero = (0.0,) * 6
         self._script_readiness = ScriptReadiness(self._receiver, settings.command_timeout_s)
 
     def read(self) -> RtdeSample:
@@ -68,7 +73,7 @@ class UrArm:
         if sample.runtime_state == RUNTIME_PLAYING:
             self._script_port.close()
         return RtdeSample(
-            **vars(sample),
+            **vars(sample) | {"wrench": tuple(map(sub, sample.wrench, self._wrench_zero))},
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._receiver.connected and self._control.isConnected(),
@@ -120,8 +125,11 @@ class UrArm:
         return True
 
     def zero_wrench(self) -> bool:
-        """Make the present wrench zero."""
-        return self._send_once(self._control.zeroFtSensor)
+        """Make the present wrench zero: in the controller, or in this process where the controller cannot."""
+        if self._settings.facts.zeroes_wrench:
+            return self._send_once(self._control.zeroFtSensor)
+        self._wrench_zero = self._receiver.latest().wrench
+        return True
 
     def upload(self) -> None:
         """Send the control script; the program starts by itself, and ends when it receives nothing.

@@ -18,6 +18,7 @@ from typing import Final
 from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, STEP_REGISTER
+from shearloop.drivers.ur.settings import GENERATIONS, UrSettings
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # The services behind the ports, as PolyScope's menu names them.
@@ -47,6 +48,8 @@ _PROTOCOL, _CONTROLLER_VERSION, _OUTPUTS, _INPUTS, _START, _DATA = b"VvOISU"
 OLDEST: Final = {3: (3, 10), 5: (5, 4)}
 NEWEST_TESTED: Final = {3: (3, 15, 8), 5: (5, 17, 3)}
 _OTHER_PACKAGES = 20
+# A peer that acknowledges nothing for so long is gone.
+_PEER_GONE_S = 3
 _LONGEST_LINE = 1024
 # The command registers of ur-rtde's control script, and ours.
 _REGISTERS = ("input_int_register_0", "input_double_register_0", DEADLINE_REGISTER)
@@ -61,6 +64,7 @@ _TYPES: Final = {
     "robot_mode": "INT32",
     "safety_mode": "INT32",
     "runtime_state": "UINT32",
+    "target_speed_fraction": "DOUBLE",
     "speed_scaling": "DOUBLE",
     "output_int_register_0": "INT32",
     CLOCK_REGISTER: "INT32",
@@ -69,7 +73,7 @@ _TYPES: Final = {
 # Outputs that controllers have from PolyScope 3.12 and 5.5.1 on.
 _TOOL_TYPES: Final = {"payload": "DOUBLE", "payload_cog": "VECTOR3D", "tcp_offset": "VECTOR6D"}
 # The same outputs, after the header and the recipe's number.
-_VALUES: Final = struct.Struct(">d30d2iId2id")
+_VALUES: Final = struct.Struct(">d30d2iI2d2id")
 _TOOL_VALUES: Final = struct.Struct(">d3d6d")
 _PACKAGE_BYTES: Final = HEADER.size + 1 + _VALUES.size
 _PACKAGE_SIZES: Final = (_PACKAGE_BYTES, _PACKAGE_BYTES + _TOOL_VALUES.size)
@@ -118,6 +122,19 @@ def probe_controller(host: str, timeout_s: float) -> str:
             "tries again.",
         )
     return version
+
+
+def check_generation(settings: UrSettings, version: str) -> None:
+    """Raise RobotLostError where a controller of this version is not of the generation in the settings."""
+    major = int(version.split(".", maxsplit=1)[0])
+    if major != settings.facts.major:
+        found = next((key for key, facts in GENERATIONS.items() if facts.major == major), "unknown")
+        raise RobotLostError(
+            "version",
+            f"The UR controller at {settings.host} has PolyScope {version}, and the robot's settings are for "
+            f"{settings.facts.name}: write `generation: {found}` into them, check their limits of force and torque, "
+            "and restart the daemon.",
+        )
 
 
 def untested_sentence(version: str) -> str:
@@ -280,7 +297,8 @@ def registers_in_use(host: str) -> RobotLostError:
     return RobotLostError(
         "registers-in-use",
         f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
-        "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus.",
+        "PROFINET, or a URCap: end the other program, disable the adapter under Installation → Fieldbus, or uninstall "
+        "the URCap. A program whose cable was pulled keeps its registers for some minutes.",
     )
 
 
@@ -291,6 +309,19 @@ def silent_sentence(host: str, seconds: float, activity: str) -> str:
         "something else listens on its ports. Look at the teach pendant, and restart the controller "
         "if it hangs."
     )
+
+
+def lose_dead_peers(connection: socket.socket) -> None:
+    """Send each package at once, and end the connection some seconds after its peer has vanished."""
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (
+        (socket.TCP_KEEPIDLE, 1),
+        (socket.TCP_KEEPINTVL, 1),
+        (socket.TCP_KEEPCNT, _PEER_GONE_S),
+        (socket.TCP_USER_TIMEOUT, 1000 * _PEER_GONE_S),
+    ):
+        connection.setsockopt(socket.IPPROTO_TCP, option, value)
 
 
 def _agree_on_protocol(connection: socket.socket) -> bool:
@@ -349,7 +380,8 @@ class SampleParser:
         v = _VALUES.unpack_from(data, start)
         tool = _NO_TOOL if size == _PACKAGE_BYTES else _TOOL_VALUES.unpack_from(data, start + _VALUES.size)
         motion = v[0], v[1:7], v[7:13], v[13:19], v[19:25], v[25:31]
-        return RtdeOutputs(*motion, v[31], v[32], v[33], v[34], v[35], v[36], v[37], tool[0], tool[1:4], tool[4:])
+        modes, scalings, script = (v[31], v[32], v[33]), (v[34], v[35]), (v[36], v[37], v[38])
+        return RtdeOutputs(*motion, *modes, *scalings, *script, tool[0], tool[1:4], tool[4:])
 
 
 class RtdeReceiver:
@@ -370,6 +402,7 @@ class RtdeReceiver:
         self.connected = True
         with explain_failure(host, timeout_s, "asking for its state"):
             self._connection = socket.create_connection((host, RTDE_PORT), timeout=timeout_s)
+            lose_dead_peers(self._connection)
             try:
                 self._sample = self._first_sample(rate_hz)
             except BaseException:

@@ -167,7 +167,9 @@ class RtdeOutputs:
     robot_mode: int
     safety_mode: int
     runtime_state: int
-    speed_scaling: float
+    # Factors on every commanded speed: of the pendant's speed slider, and of the controller's own limits.
+    speed_slider: float
+    limiter_scaling: float
     # Of the control script: 1 when ready, 2 when done with a command; its clock, and the time of one tick.
     script_state: int
     script_ticks: int
@@ -212,6 +214,11 @@ class RtdeSample(RtdeOutputs):
     def runtime_name(self) -> str:
         """The state of the program in words."""
         return RUNTIME_STATES.get(self.runtime_state, f"unknown state {self.runtime_state}")
+
+    @property
+    def speed_scaling(self) -> float:
+        """The fraction of a commanded speed that the controller carries out."""
+        return self.speed_slider * self.limiter_scaling
 
     @property
     def protective_stop(self) -> bool:

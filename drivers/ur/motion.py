@@ -44,7 +44,9 @@ PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
 LEASE_SHARE = 0.3
 # The time allowed for a motion to end: nominal time × factor + constant.
 MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
-# The pendant's speed slider slows everything; below this a motion would have no end.
+# The controller rounds its factors on speeds; the slider's steps are 1 %.
+SCALING_TOLERANCE = 0.005
+# A slider that is moved slows a motion that is ending; below this it would have no end.
 SLOWEST_SCALING = 0.05
 
 NOT_OURS = (
@@ -478,7 +480,23 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
     for one in (*speeds, tool, *_loads(sample, limits)):
         if beyond := _beyond(*one):
             return beyond
-    return tool_difference(sample, settings.tool)
+    return slowed_sentence(sample) or tool_difference(sample, settings.tool)
+
+
+def slowed_sentence(sample: RtdeSample) -> str:
+    """Return why the arm turns slower than commanded, or the empty string: a factor on speeds is a gain of the loop."""
+    if abs(sample.speed_slider - 1.0) > SCALING_TOLERANCE:
+        return (
+            f"The speed slider is at {100 * sample.speed_slider:.0f} %, which slows every motion and changes the "
+            "control loop's gain: set it to 100 % at the bottom of the teach pendant's screen (on a CB3, of its tabs "
+            "Run and Move)."
+        )
+    if abs(sample.limiter_scaling - 1.0) > SCALING_TOLERANCE:
+        return (
+            f"The controller slows every motion to {100 * sample.limiter_scaling:.0f} % by itself, which changes the "
+            "control loop's gain: look at the teach pendant for its limits of speed and power."
+        )
+    return ""
 
 
 def tool_difference(sample: RtdeSample, tool: InstalledTool) -> str:

@@ -6,6 +6,7 @@ It stops a linear move that its client does not stop, and ends. The watchdog is 
 arm moves may end in a protective stop.
 """
 
+import hashlib
 import re
 
 from shearloop.drivers.ur.settings import UrSettings
@@ -27,6 +28,22 @@ _BEFORE_LOOP = "        keep_running = True\n"
 # ur-rtde writes the number of its first register where it has a comment.
 _REGISTER_OFFSET = re.compile(r"(global reg_offset_\w+ =) #.*")
 _SPEED_THREAD = re.compile(r"^    thread speed_thread\(\):\n.*?^    end\n", re.MULTILINE | re.DOTALL)
+
+# SHA-256 of the scripts of ur-rtde 1.6.5, by the first version of PolyScope that gets it.
+KNOWN_SCRIPTS = {
+    "f34786f9fb2c6f80561f1a0713033706c953bf33a76049cd0e73270d2e863ae0",  # 3.3
+    "8e0616391131998ef6434384eeced7ba5b663692e6f73e2059ad6381a04899af",  # 3.5
+    "1f59fc1c18d3801517d78509bed2900254cb521130eeccc716916eebabaeac8e",  # 3.6
+    "1ddb08f05b8ac369189d7a87cfd2690f87fe2b5a56d4452be41e50d5a08c4a04",  # 3.8
+    "f642abf419f28a9c334e7bfcc1f88e35214fa0fdce280aa2dd883308fe776687",  # 3.15
+    "b68d3dacfa0af3fb04227c2c56040612bb3a231ddf4ea1969af7f42850c7dbb2",  # 5.0
+    "cb5cc0e11edf9b2f367e5adbb2ce6aac5db088f4bee13ccbe7a2c0049ce3c43b",  # 5.3
+    "1bd7982e32de4a2c51e5edd4db6269b80bb7f9f835ac8cf9ac4c6aacaa058b07",  # 5.4
+    "99d5988ea08987540e200b397d2dc1d89ec28303c0c6f9f7f41ca1f483d1257d",  # 5.9
+    "cee5df29e6ec0338b10f6564c9ecb4bc18ac530f4f49c29ae1c72418664dc7e7",  # 5.10
+    "e23e363bca4235f8431ef8f92e2cadd56b47aaf8a2278a1bef4b2845e122fd36",  # 5.23
+    "efc340698075a61465fd87a12c950a3742a99d8a1e2d8b38cb27c2fb1538825c",  # 5.26
+}
 
 # speedj returns after a cycle, so that each cycle checks. The clock starts at 0 in each program, and a deadline too far
 # ahead is an older program's. It counts cycles: a sum of times would drift, for URScript's numbers may have 32 bits. An
@@ -128,6 +145,11 @@ _START = """\
 """
 
 
+def hash_of(script: str) -> str:
+    """Return a script's SHA-256 in hexadecimal digits, as in `KNOWN_SCRIPTS`."""
+    return hashlib.sha256(script.encode()).hexdigest()
+
+
 def guard_script(script: str, settings: UrSettings) -> str:
     """Return ur-rtde's script as a program with its watchdog and its limits, or "" where it is of an unknown form.
 
@@ -139,9 +161,8 @@ def guard_script(script: str, settings: UrSettings) -> str:
     limits = settings.limits
     margin = limits.joints.margin_rad
     values = {
-        # CB3 controllers do not have the function; their cycle takes 8 ms.
         "register": _REGISTER,
-        "step": "get_steptime()" if "get_steptime()" in script else "0.008",
+        "step": settings.facts.step,
         "watchdog_hz": settings.watchdog_hz,
         "grace": _GRACE_S,
         "longest": settings.command_timeout_s + _SLACK_S,

@@ -6,7 +6,7 @@ limit, so that no command reaches the hard one.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Final, Literal
 
 from pydantic import Field
 
@@ -23,6 +23,31 @@ _Deadline = Annotated[float, Field(gt=0, le=1)]
 _PROMISED_S = 0.2
 # The watchdog is slower than a stop by this factor.
 _WATCHDOG_FACTOR = 1.5
+
+
+Generation = Literal["e-series", "cb3"]
+
+
+@dataclass(frozen=True, slots=True)
+class GenerationFacts:
+    """What differs between UR's generations of controllers."""
+
+    name: str
+    # PolyScope's major version.
+    major: int
+    # The time of a cycle, in URScript.
+    step: str
+    # Whether the controller can zero its wrench: `zero_ftsensor` ends a CB3's program.
+    zeroes_wrench: bool
+    # The noise of the wrench: a CB3 estimates it from the joints' currents.
+    noise_n: float
+    noise_nm: float
+
+
+GENERATIONS: Final[dict[Generation, GenerationFacts]] = {
+    "e-series": GenerationFacts("an e-Series", 5, "get_steptime()", zeroes_wrench=True, noise_n=3.5, noise_nm=0.2),
+    "cb3": GenerationFacts("a CB3", 3, "0.008", zeroes_wrench=False, noise_n=10.0, noise_nm=5.0),
+}
 
 
 class _Checked:
@@ -193,6 +218,8 @@ class UrSettings(_Checked):
     """The robot's name or address."""
     limits: UrLimits
     """Limits on commands and on measured states."""
+    generation: Generation = "e-series"
+    """The controller's generation."""
     tool: InstalledTool = InstalledTool()
     """What the pendant must have for motion."""
     rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
@@ -216,6 +243,21 @@ class UrSettings(_Checked):
         """Refuse a host that is none."""
         if reason := why_no_host(self.host):
             raise ValueError(f"host {reason}; give the robot's address")
+        facts = self.facts
+        for key, inner, noise, unit in (
+            ("force_n", self.limits.force_n.inner, facts.noise_n, "N"),
+            ("torque_nm", self.limits.torque_nm.inner, facts.noise_nm, "N·m"),
+        ):
+            if inner <= noise:
+                raise ValueError(
+                    f"limits.{key}: inner ({inner:g} {unit}) is within the noise of the wrench of {facts.name}, "
+                    f"± {noise:g} {unit}, so that it would stop the arm at random: give more"
+                )
+
+    @property
+    def facts(self) -> GenerationFacts:
+        """What is particular to the controller's generation."""
+        return GENERATIONS[self.generation]
 
     @property
     def standstill_s(self) -> float:

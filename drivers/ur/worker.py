@@ -20,6 +20,7 @@ from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import (
     REMOTE_CURE,
     ask_dashboard,
+    check_generation,
     check_ports,
     probe_controller,
     registers_in_use,
@@ -129,6 +130,7 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
         pipe.send(messages.WorkerPhase("greeting the controller"))
         check_ports(host, settings.connect_timeout_s / 8)
         version = probe_controller(host, settings.connect_timeout_s / 4)
+        check_generation(settings, version)
         # To a silent dashboard, ur-rtde says "Operation canceled".
         ask_dashboard(host, settings.connect_timeout_s / 4, ("PolyscopeVersion",))
         pipe.send(messages.WorkerPhase("connecting", untested_sentence(version)))

@@ -14,6 +14,7 @@ import yaml
 
 from shearloop.bank.bank_file import Bank
 from shearloop.daemon.app import Daemon
+from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.run_summary import RunSummary
 from tests.emulator_process import own_address
 from tests.fixtures.daemons import ask, robot_at, running_daemon, shearloop
@@ -122,7 +123,9 @@ async def running_rig(
 async def started(command: Callable[..., Any], path: str) -> None:
     """Start an experiment as soon as robot and gripper are ready for it: on a busy machine they may be late."""
     reply = await command("start", experiment=path)
-    while not reply["ok"] and ("being made ready" in reply["reason"] or "out of date" in reply["reason"]):
+    while not reply["ok"] and (
+        "being made ready" in reply["reason"] or FaultCode.STATE_STALE.value.kind in reply["reason"]
+    ):
         reply = await command("start", experiment=path)
     assert reply["ok"], reply
 
@@ -206,7 +209,7 @@ async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig
         await daemon._end.wait()
     assert not daemon.finished
     states = watcher.seen["gripper.state"]
-    assert "the torque is beyond its limit" in watcher.seen["loop.state"][-1]["reasons"]
+    assert FaultCode.TORQUE_LIMIT.text in watcher.seen["loop.state"][-1]["faults"]
     held_mm = [state["diameter_mm"] for state in states if state["diameter_mm"] is not None][-1]
     assert states[-1]["width_mm"] > held_mm + 5.0
 
@@ -216,7 +219,7 @@ async def test_a_board_that_is_unplugged_holds_the_wrist(rig_config, tiny_bank, 
         await started(command, experiment(tmp_path, SLOW_TWIST))
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
         fault("unplug load")
-        state = await watcher.until("loop.state", lambda state: "no new torque has arrived" in state["reasons"])
+        state = await watcher.until("loop.state", lambda state: FaultCode.ESTIMATE_STALE.text in state["faults"])
         assert state["phase"] in ("held", "stopped")
         assert state["speed_command_rad_per_s"] == 0.0
 
@@ -238,8 +241,8 @@ async def test_nothing_moves_after_a_restart_a_reconnection_and_an_acknowledgeme
             again, ask_again = Watcher(daemon), partial(ask, daemon)
             still = await again.until("robot.state", lambda state: abs(state["wrist_speed_rad_per_s"]) < 1e-3)
             tool = await again.until("gripper.state", lambda state: state["diameter_mm"] is not None)
-            state = await again.until("loop.state", lambda state: "still holds something" in state["reasons"])
-            assert "the daemon ended" in state["reasons"]
+            state = await again.until("loop.state", lambda state: FaultCode.TOOL_GRIPPED.text in state["faults"])
+            assert FaultCode.DAEMON_ENDED.text in state["faults"]
             assert not (await ask_again("start"))["ok"]
             fault("unplug gripper 0.5")
             await again.until("loop.state", lambda state: "gripper" in state["reasons"])

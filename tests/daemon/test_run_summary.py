@@ -113,16 +113,17 @@ def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others, judge)
 
 
 def test_holds_are_counted_by_their_kind():
-    reason = "no new torque has arrived: the last came 1.5 s ago. Look at the cable."
+    stale = FaultCode.ESTIMATE_STALE
+    faults = f"{stale.text}, {FaultCode.STATE_STALE.text}"
     text = summary_of_hold(
         None,
         [],
-        loop_state(20, phase="held", response="hold", reasons=reason),
+        loop_state(20, phase="held", response="hold", faults=faults),
         loop_state(21.5),
-        loop_state(23, phase="held", response="hold", reasons=reason.replace("1.5", "1.7")),
+        loop_state(23, phase="held", response="hold", faults=stale.text),
         loop_state(24),
     )
-    assert "held for 2.5 s in all: twice no new torque has arrived" in text
+    assert f"held for 2.5 s in all: twice {stale.value.kind}\n" in text
 
 
 def test_an_experiment_that_was_stopped_says_why():

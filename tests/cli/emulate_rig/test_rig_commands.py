@@ -27,7 +27,7 @@ class Blank:
     ],
 )
 def test_what_is_no_command_is_said_to_be_none(line, sentence, tmp_path):
-    rig = EmulatedRig(Blank(), tmp_path)
+    rig = EmulatedRig(dict.fromkeys(("right", "left"), Blank()), tmp_path)
     with pytest.raises(ValueError, match=sentence):
         rig.command(line)
 
@@ -55,7 +55,7 @@ class Commanded:
     ],
 )
 def test_a_command_reaches_its_device_and_normal_all(line, device, passed, tmp_path):
-    rig = EmulatedRig(Blank(), tmp_path)
+    rig = EmulatedRig(dict.fromkeys(("right", "left"), Blank()), tmp_path)
     devices = rig._commanded = {name: Commanded() for name in rig._commanded}
     rig.command(line)
     assert {name: one.lines for name, one in devices.items() if one.lines} == {device: [passed]}
@@ -64,7 +64,7 @@ def test_a_command_reaches_its_device_and_normal_all(line, device, passed, tmp_p
 
 
 def test_the_tool_and_the_robot_obey_the_rig(tmp_path):
-    rig = EmulatedRig(Blank(), tmp_path)
+    rig = EmulatedRig(dict.fromkeys(("right", "left"), Blank()), tmp_path)
     rig.command("joint seized")
     rig.command("protective-stop")
     assert (rig.scene.truth().joint, rig.controller.robot.safety_mode) == ("seized", 3)

@@ -172,7 +172,15 @@ class Published:
 
     @property
     def reasons(self) -> str:
-        return next(one.reasons for one in reversed(self.messages) if one.topic == "loop.state")
+        return str(self._loop_state.reasons)
+
+    @property
+    def faults(self) -> list[str]:
+        return list(filter(None, self._loop_state.faults.split(", ")))
+
+    @property
+    def _loop_state(self) -> Any:
+        return next(one for one in reversed(self.messages) if one.topic == "loop.state")
 
 
 def experiment(*steps: Mapping[str, Any], **keys: Any) -> ExperimentFile:

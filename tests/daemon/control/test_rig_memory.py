@@ -38,7 +38,7 @@ def test_after_a_crash_nothing_moves_and_the_state_tells_of_the_tool(tmp_path):
     assert after.speed == 0.0
     assert "while 'test' was under way" in refusal(after)
     reasons = " ".join(after.control_loop.status.decision.reasons)
-    assert "the gripper still holds something: its fingers hold something 30.0 mm wide, with at most 60 N" in reasons
+    assert f"{FaultCode.TOOL_GRIPPED.value.kind}: its fingers hold something 30.0 mm wide, with at most 60 N" in reasons
     after.control_loop.acknowledge()
     after.run(1)
     assert (after.begun, after.speed) == ([], 0.0), "an acknowledgement moves nothing"
@@ -55,7 +55,7 @@ def test_a_stop_is_remembered_until_it_is_acknowledged(kind, tmp_path):
         rig.control_loop.on_fault(FaultCode.PROTECTIVE_STOP, "it met something")
     rig.run(0.1)
     after = after_restart(rig, path)
-    assert ("the operator stopped it" if kind == "operator" else "in a protective stop") in refusal(after)
+    assert (FaultCode.OPERATOR_STOP if kind == "operator" else FaultCode.PROTECTIVE_STOP).value.kind in refusal(after)
     after.control_loop.acknowledge()
     again = after_restart(after, path)
     assert refusal(again) == ""

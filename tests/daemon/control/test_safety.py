@@ -78,9 +78,8 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
     stopped = taking_turns(*((event, each_s) for event in events))
     stopped_s, gate = stopped
     assert stopped_s == pytest.approx(HELD_AT_MOST_S, abs=2 * TICK_S)
-    (reason,) = (one for one in gate.report([]).reasons if "held for too long" in one)
-    assert "held for too long" in reason
-    assert all(f"{event.text} for " in reason for event in events[:4])
+    (last,) = (one for one in gate.report([]).faults if one.code is FaultCode.HELD_TOO_LONG)
+    assert all(f"{event.text} for " in last.detail for event in events[:4])
 
 
 def test_one_cause_alone_is_told_alone():
@@ -156,12 +155,18 @@ def test_a_hold_begins_anew_with_the_next_experiment_and_after_the_operators_wor
         assert gate.judge([trouble(FaultCode.STATE_STALE)], 3603 * SECOND).response is Response.STOP_AND_KEEP_GRIP
 
 
+@pytest.mark.parametrize("code", FaultCode)
+def test_a_code_in_a_message_names_its_row(code):
+    assert FaultCode.of_text(code.text) is code
+    assert trouble(code).sentence.startswith(f"{code.value.kind}: ")
+
+
 def test_a_stop_outlives_its_cause_until_it_is_acknowledged():
     gate = SafetyMonitor()
     gate.judge([trouble(FaultCode.PROTECTIVE_STOP)], 0)
     later = gate.judge([], 100 * SECOND)
     assert later.response is Response.STOP_AND_KEEP_GRIP
-    assert "protective stop: on the bench" in later.reasons[0]
+    assert later.faults[0] == trouble(FaultCode.PROTECTIVE_STOP)
     gate.acknowledge()
     assert gate.judge([trouble(FaultCode.PROTECTIVE_STOP)], 101 * SECOND).response is Response.STOP_AND_KEEP_GRIP
     gate.acknowledge()

@@ -14,6 +14,7 @@ from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, first_motion
 from shearloop.daemon.control.loop_inputs import LoopConfig, TorqueSample
 from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
+from shearloop.daemon.control.safety import FaultCode
 from shearloop.drivers.errors import DriverError
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
 from tests.daemon.control.loop_rig import GRIP, LOAD, Rig, new_loop, phase, started, stop
@@ -148,7 +149,7 @@ def test_the_angle_since_the_grip_belongs_to_the_grip():
     turned = f"turned by {rig.wrist_rad - gripped_rad:+.3f} rad since the grip, the limit is 0.3 rad"
     assert turned in rig.control_loop.experiment.stop_reason
     rig.step()
-    assert rig.control_loop.status.decision.reasons[-1].startswith("the gripper still holds something: its fingers")
+    assert rig.control_loop.status.decision.reasons[-1].startswith(f"{FaultCode.TOOL_GRIPPED.value.kind}: its fingers")
 
 
 def test_a_new_grip_has_an_angle_of_its_own():

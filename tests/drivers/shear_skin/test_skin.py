@@ -9,15 +9,16 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.connection import Link, LinkMonitor, SerialLink, TcpLink
+from shearloop.drivers.defaults import DAQ_RATE_HZ
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from shearloop.emulators.ports import SocketServer
-from shearloop.emulators.skin import DAQ_PERIOD_S, Circuit, EmulatedKeithley6430, EmulatedScanner, SkinInstruments
+from shearloop.emulators.skin import Circuit, EmulatedKeithley6430, EmulatedScanner, SkinInstruments
 from tests.running import DEADLINE_S, LinkEvents, pass_on, running
 
 R1, R2 = 24.6, 25.3
 SPEED = 50.0
-RATE_HZ = SPEED / DAQ_PERIOD_S
+RATE_HZ = SPEED * DAQ_RATE_HZ
 ANY_PORT = ("127.0.0.1", 0)
 
 

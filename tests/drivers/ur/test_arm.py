@@ -65,6 +65,7 @@ def arm(monkeypatch) -> Iterator[ModuleType]:
     monkeypatch.delitem(sys.modules, "shearloop.drivers.ur.arm", raising=False)
     arm = importlib.import_module("shearloop.drivers.ur.arm")
     monkeypatch.setattr(arm, "RtdeReceiver", Receiver)
+    monkeypatch.setattr(arm, "KNOWN_SCRIPTS", {arm.hash_of(SCRIPT), arm.hash_of("of another form\n")})
     yield arm
     del sys.modules["shearloop.drivers.ur.arm"]
 
@@ -151,6 +152,26 @@ def test_unknown_script_is_refused(arm):
     Client.answers["getScript"] = "of another form\n"
     with pytest.raises(RobotLostError, match="unknown, so that its limits"):
         arm.UrArm(SETTINGS, VERSION)
+
+
+def test_script_with_another_hash_is_refused_by_it(arm):
+    """Also where its form is known: it may answer other commands."""
+    changed = f"{SCRIPT}# changed\n"
+    Client.answers["getScript"] = changed
+    with pytest.raises(RobotLostError, match=arm.hash_of(changed)) as lost:
+        arm.UrArm(SETTINGS, VERSION)
+    assert lost.value.kind == "version"
+
+
+def test_wrench_of_a_cb3_is_zeroed_without_its_controller(arm):
+    """`zero_ftsensor` would end its program."""
+    limits = dataclasses.replace(SETTINGS.limits, torque_nm=ur.TorqueBound(8.0, 12.0))
+    one = arm.UrArm(dataclasses.replace(SETTINGS, limits=limits, generation="cb3"), "3.15.8.0")
+    one._receiver.sample = dataclasses.replace(received(1.0), wrench=(1.0, 2.0, 3.0, 0.0, 0.0, 1.0))
+    assert one.zero_wrench()
+    one._receiver.sample = dataclasses.replace(received(1.1), wrench=(1.0, 2.5, 3.0, 0.0, 0.0, 3.0))
+    assert one.read().wrench == (0.0, 0.5, 0.0, 0.0, 0.0, 2.0)
+    assert "zeroFtSensor" not in one._control.calls
 
 
 def test_deadline_counts_from_the_latest_sample(arm):

@@ -277,6 +277,18 @@ async def test_another_payload_than_the_configured_one_refuses_motion(controller
         assert (await robot.send(Enable())).accepted
 
 
+async def test_speed_slider_that_is_moved_stops_the_wrist_and_is_named(controller):
+    async with turning(controller) as robot:
+        moved_ns = await controller.fault("slider 0.5")
+        await stops(controller, moved_ns)
+        state = await until(robot, lambda state: state.motion == "idle")
+        assert (state.speed_slider, state.speed_scaling) == (0.5, 0.5)
+        assert "speed slider is at 50 %" in (await robot.send(Enable())).refusal
+        await controller.fault("slider 1")
+        await until(robot, lambda state: state.speed_slider == 1.0)
+        assert (await robot.send(Enable())).accepted
+
+
 async def test_leaving_stops_the_arm_and_ends_the_program(controller):
     """Also when a terminal or service manager signals every process."""
     async with turning(controller) as robot:

@@ -13,6 +13,7 @@ import pytest
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.control_box import (
     SERVICES,
+    check_generation,
     check_ports,
     closed_ports_sentence,
     command_dashboard,
@@ -22,9 +23,10 @@ from shearloop.drivers.ur.control_box import (
 )
 from shearloop.drivers.ur.messages import ROBOT_MODES, RUNTIME_STATES, SAFETY_MODES, RobotLostError, Unlock
 from shearloop.drivers.ur.motion import why_unfit
+from shearloop.drivers.ur.settings import TorqueBound, UrSettings
 from shearloop.emulators.ur_controller import Controller
 from shearloop.emulators.ur_robot import Robot
-from tests.drivers.ur.flight import AT_REST, SETTINGS, flying
+from tests.drivers.ur.flight import AT_REST, LIMITS, SETTINGS, flying
 from tests.emulator_process import own_address
 
 HOST = own_address(7)
@@ -78,6 +80,19 @@ async def test_a_controller_that_serves_all_or_none_of_its_ports():
     await asyncio.to_thread(check_ports, HOST, TIMEOUT_S)
     with pytest.raises(RobotLostError, match=f"switched on.*{MENU}"):
         await asyncio.to_thread(probe_controller, HOST, TIMEOUT_S)
+
+
+@pytest.mark.parametrize(
+    ("generation", "version", "cure"),
+    [("e-series", "3.15.8.0", "generation: cb3"), ("cb3", "5.17.3.0", "generation: e-series")],
+)
+def test_controller_of_the_other_generation_is_named(generation, version, cure):
+    limits = replace(LIMITS, torque_nm=TorqueBound(8.0, 12.0))
+    with pytest.raises(RobotLostError, match=f"PolyScope {version}.*{cure}") as lost:
+        check_generation(UrSettings("10.0.0.1", limits, generation=generation), version)
+    assert lost.value.kind == "version"
+    own = "3.15.8.0" if generation == "cb3" else "5.17.3.0"
+    check_generation(UrSettings("10.0.0.1", limits, generation=generation), own)
 
 
 def test_several_closed_ports_are_told_together():

@@ -127,6 +127,29 @@ def test_hard_limit_stops_until_enabled_again():
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"speed_slider": 0.5}, "The speed slider is at 50 %"),
+        ({"limiter_scaling": 0.8}, "The controller slows every motion to 80 %"),
+    ],
+)
+def test_factor_on_speeds_prevents_and_ends_motion(changes, said):
+    """It is a factor on the control loop's gain."""
+    flight = turning()
+    flight.arm.be(**changes)
+    flight.fly(1)
+    assert flight.state.motion == "stopping"
+    assert said in flight.state.end_reason
+    flight.fly_until(lambda state: state.motion == "idle")
+    assert said in flight.ask(Enable()).refusal
+    flight.arm.be(speed_slider=1.0, limiter_scaling=1.0)
+    flight.fly(1)
+    assert said in flight.ask(WristSpeed(0.1, 1.0)).refusal, "a stop stays a stop"
+    assert flight.ask(Enable()).accepted
+    assert flight.ask(WristSpeed(0.1, 1.0)).accepted
+
+
 def test_protective_stop_is_unlocked_only_by_the_operator():
     flight = turning()
     flight.arm.be(safety_mode=3, runtime_state=4)

@@ -15,7 +15,7 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur.control_box import RtdeReceiver, SampleParser
 from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
 
-TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32,INT32,DOUBLE"
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,DOUBLE,INT32,INT32,DOUBLE"
 TOOL_TYPES = TYPES + b",DOUBLE,VECTOR3D,VECTOR6D"
 # The answer of a controller before PolyScope 5.5.1.
 WITHOUT_TOOL = TYPES + b",NOT_FOUND,NOT_FOUND,NOT_FOUND"
@@ -29,7 +29,7 @@ def package(kind: bytes, payload: bytes) -> bytes:
 def data(number: int, *, tool: bool = True) -> bytes:
     """Return the package of a sample with this timestamp."""
     values = [round(number + 0.01 * index, 2) for index in range(30)]
-    content = struct.pack(">d30diiIdiid", number, *values, 7, -1, 2, 0.5, 1, 4750, 0.002)
+    content = struct.pack(">d30diiIddiid", number, *values, 7, -1, 2, 0.75, 0.5, 1, 4750, 0.002)
     return package(b"U", b"\x01" + content + (struct.pack(">10d", *TOOL) if tool else b""))
 
 
@@ -49,7 +49,8 @@ def test_sample_has_the_values_in_their_order():
         robot_mode=7,
         safety_mode=-1,
         runtime_state=2,
-        speed_scaling=0.5,
+        speed_slider=0.75,
+        limiter_scaling=0.5,
         payload_kg=1.5,
         payload_cog_m=(0.1, 0.2, 0.3),
         tcp_offset=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
@@ -88,12 +89,15 @@ Play = Callable[..., socket.socket]
 def play(monkeypatch) -> Iterator[Play]:
     """Begin a controller: its end of the next connection, on which the answers and a sample have been sent."""
     ends: list[socket.socket] = []
+    connect = socket.create_connection
 
     def begin(
         types: tuple[bytes, ...] = (TOOL_TYPES,), started: bytes = b"\x01", inputs: bytes = b"\x01DOUBLE"
     ) -> socket.socket:
-        ends.extend(socket.socketpair())
-        *_, controller, client = ends
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            client = connect(server.getsockname())
+            controller, _ = server.accept()
+        ends.extend((controller, client))
         outputs = b"".join(package(b"O", b"\x01" + one) for one in types)
         answers = package(b"V", b"\x01") + outputs + package(b"I", inputs) + package(b"S", started)
         controller.sendall(answers + data(1, tool=types[-1] == TOOL_TYPES))
@@ -149,6 +153,22 @@ def test_deadline_is_written_to_its_register(play):
     receiver.close()
     receiver.write_deadline(1)
     assert not receiver.connected
+
+
+def test_controller_that_vanishes_is_lost_in_seconds(play):
+    """A pulled cable: nothing is acknowledged. Each deadline leaves at once."""
+    play()
+    receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
+    connection = receiver._connection
+    assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+    assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 3000
+    idle, interval, count = (
+        connection.getsockopt(socket.IPPROTO_TCP, option)
+        for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+    )
+    assert idle + interval * count <= 4
+    receiver.close()
 
 
 def test_controller_without_payload_and_tool_centre_point_is_accepted(play):

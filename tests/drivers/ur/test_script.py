@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from shearloop.drivers.ur.script import guard_script
-from tests.drivers.ur.robots import DELIVERED, ROOT, control_script
+from shearloop.drivers.ur.script import KNOWN_SCRIPTS, guard_script, hash_of
+from tests.drivers.ur.robots import DELIVERED, ROOT, VERSIONS, control_script
 
 # Uploads the script, and is gone before the watchdog is armed by a command.
 DIES_TOO_SOON = """
@@ -37,6 +37,12 @@ def test_script_differs_in_its_speed_thread_and_before_its_loop():
     assert guarded[here].strip() == armed
     # What comes before it in the program itself, beside functions, reads nothing.
     assert not any("read_input" in line for line in own[own.index("# HEADER_END") : begin])
+
+
+@pytest.mark.parametrize("version", [version for version in VERSIONS if version[0] != 10])
+def test_scripts_of_the_installed_client_are_known(version):
+    script_client = pytest.importorskip("script_client", reason="ur-rtde has wheels for CPython up to 3.12 only")
+    assert hash_of(script_client.ScriptClient("", *version).getScript()) in KNOWN_SCRIPTS
 
 
 def test_unknown_script_is_not_guarded():

@@ -53,6 +53,7 @@ def test_all_mistakes_are_reported_together(tmp_path):
         ("margin_m: 0.02", "margin_m: 0.45", "no room"),
         ("{inner: 4.0, hard: 8.0}", "{inner: 4.0, hard: 50.0}", "hard: 50.0 is too large; allowed: above 0 to 40"),
         ("margin_m: 0.02", "margin_m: 0", "limits.workspace.margin_m: 0 is too small; allowed: above 0"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\ngeneration: cb3", "wrench of a CB3, ± 5 N·m"),
         ("host: 192.168.1.10\n", "", r"ur.yaml:\d+: host: is missing"),
         ("host: 192.168.1.10", "host: ' '", r"ur.yaml:1: host is empty; give the robot's address"),
         ("host: 192.168.1.10", "host: 192.168.1.10\nhots: 1", "hots: is not a known key; did you mean host"),

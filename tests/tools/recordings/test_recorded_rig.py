@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from shearloop.daemon.control.safety import FaultCode
 from shearloop.tools.recordings.reader import summarise
 from tests.daemon.test_closed_loop import experiment, rig_config, running_rig, started
 
@@ -54,7 +55,7 @@ async def test_a_full_disk_refuses_only_the_next_experiment(recorded_rig, tiny_b
         # What runs goes on. (A busy computer may hold the wrist for a moment meanwhile, as it must.)
         await watcher.until(
             "loop.state",
-            lambda state: "the recording cannot be written" in state["reasons"] and state["phase"] == "running",
+            lambda state: FaultCode.RECORDING_FAILED.text in state["faults"] and state["phase"] == "running",
         )
         seq = watcher.seen["robot.state"][-1]["seq"]
         await watcher.until(
@@ -63,10 +64,11 @@ async def test_a_full_disk_refuses_only_the_next_experiment(recorded_rig, tiny_b
         assert (await command("stop"))["stopped"] == "test"
         refused = await command("start", experiment=path)
         assert not refused["ok"]
-        assert "the recording cannot be written" in refused["reason"]
+        assert FaultCode.RECORDING_FAILED.value.kind in refused["reason"]
         assert "No space left on device" in refused["reason"]
         filler.unlink()
-        while "the recording cannot be written" in (reply := await command("start", experiment=path)).get("reason", ""):
+        unwritten = FaultCode.RECORDING_FAILED.value.kind
+        while unwritten in (reply := await command("start", experiment=path)).get("reason", ""):
             # It is tried again three times a second.
             heard = len(watcher.seen["health"])
             await watcher.until("health", lambda health, heard=heard: health["seq"] >= heard)

@@ -1,0 +1,260 @@
+"""A rehearsal: a configuration of real devices, with an emulated one in the place of each."""
+
+import contextlib
+import socket
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shearloop.errors import UserError
+
+if TYPE_CHECKING:
+    from shearloop.daemon.config import DaemonConfig, FingertipConfig
+    from shearloop.drivers.ur.settings import UrSettings
+
+# The first of these addresses of this computer whose ports of robot and gripper are free plays them.
+LOOPBACKS = tuple(f"127.0.0.{number}" for number in range(1, 255))
+# Control cycles per second: twice the states that the daemon asks for, and gentle to this computer.
+EMULATED_RATE_HZ = "250"
+ROBOT_PORTS = (29999, 30003, 30004)
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """The configuration to run, and the sentences that say what stands in for which device."""
+
+    config: "DaemonConfig"
+    sentences: tuple[str, ...]
+
+
+@contextlib.contextmanager
+def rehearsal(config: "DaemonConfig", path: Path) -> Iterator[Rehearsal]:
+    """Give the configuration whose devices are emulated; its ports and settings are in a temporary folder.
+
+    Every port, address and serial number of the configuration is replaced: none of the real devices is opened.
+
+    Raises:
+        UserError: the configuration is emulated already, or a device cannot be played; DriverError: wrong settings.
+    """
+    if config.emulated or config.emulators:
+        raise UserError(f"{path} is emulated already: run it without --emulate")
+    with tempfile.TemporaryDirectory(prefix="shearloop-") as folder:
+        yield _Stage(config, path, Path(folder)).rehearsal()
+
+
+class _Stage:
+    """Replaces one device after the other."""
+
+    def __init__(self, config: "DaemonConfig", path: Path, folder: Path) -> None:
+        self._config = config
+        self._path = path
+        self._folder = folder
+        # As a file has it, to be checked again once every device is replaced.
+        self._content: dict[str, Any] = config.model_dump()
+        self._emulators: list[dict[str, Any]] = []
+        self._sentences = ["every device is played on this computer; none of the real ones is opened"]
+        self._host = _free_loopback() if config.robot is not None else LOOPBACKS[0]
+
+    def rehearsal(self) -> Rehearsal:
+        """Replace all devices."""
+        from shearloop.daemon.config import DaemonConfig
+
+        config = self._config
+        robot = self._robot() if config.robot is not None else None
+        # Without another sensor on the tool, the robot turns it on the skin.
+        on_skin = config.skin is not None and config.gripper is None and not config.fingertips
+        if config.skin is not None:
+            self._skin(robot if on_skin and config.load_cell is None else None)
+        if robot is not None and not (on_skin and config.load_cell is None):
+            self._rig(robot)
+        elif robot is None:
+            self._boards()
+        if config.experiment is not None:
+            self._content |= {"autostart": True, "stop_when_done": True}
+            self._sentences.append(f"{config.experiment} starts by itself, and ends the rehearsal")
+        elif config.robot is not None:
+            self._sentences.append("no `experiment` is configured: start one with `shearloop command start`")
+        if config.recording is not None:
+            folder = config.recording.folder / "emulated"
+            self._content["recording"] = {"folder": folder}
+            self._sentences.append(f"recordings go into {folder}")
+        self._content |= {"emulated": True, "emulators": self._emulators}
+        return Rehearsal(DaemonConfig.model_validate(self._content), tuple(self._sentences))
+
+    def _robot(self) -> "UrSettings":
+        """Write the robot's settings with a loopback address, and return them."""
+        import yaml
+
+        from shearloop.daemon.rig import robot_settings
+        from shearloop.yaml_files import read_yaml
+
+        source = self._config.robot
+        assert source is not None  # noqa: S101 - for the type checker; the caller has checked it
+        settings = robot_settings(source)
+        copy = self._folder / "ur.yaml"
+        copy.write_text(yaml.safe_dump({**read_yaml(source, UserError), "host": self._host}), encoding="utf-8")
+        self._content["robot"] = copy
+        self._sentences.append(
+            f"the robot at {settings.host} is played at {self._host}; its limits are those of {source}"
+        )
+        return replace(settings, host=self._host)
+
+    def _rig(self, robot: "UrSettings") -> None:
+        """Play robot, gripper, load cell and fingertips over one physics."""
+        from shearloop.daemon.experiment_files import read_document
+
+        config = self._config
+        arguments = ["--host", self._host, "--run-dir", str(self._folder), *_robot_arguments(robot)]
+        for name, fingertip in config.fingertips.items():
+            arguments += ["--fingertip", name, _bank(name, fingertip, self._path)]
+            self._replace_port("fingertips", name, link=self._folder / f"eit-{name}")
+        if config.load_cell is not None:
+            arguments += self._load_cell()
+        else:
+            arguments.append("--no-load-cell")
+        arguments += self._gripper()
+        if config.experiment is not None:
+            tool_mm = read_document(config.experiment).content.get("tool_mm")
+            arguments += [] if tool_mm is None else ["--diameter-mm", str(tool_mm)]
+        self._emulators.append({"device": "rig", "arguments": arguments})
+
+    def _boards(self) -> None:
+        """Play boards that no robot turns: each repeats a programme of twists, or rests."""
+        for name, fingertip in self._config.fingertips.items():
+            link = self._folder / f"eit-{name}"
+            self._replace_port("fingertips", name, link=link)
+            source = ["--bank", _bank(name, fingertip, self._path)]
+            self._emulators.append({"device": "eit-kit", "arguments": ["--link", str(link)], "synthetic": source})
+        if self._config.load_cell is not None:
+            arguments = ["--link", str(self._folder / "load-cell"), *self._load_cell()]
+            self._emulators.append({"device": "hx711", "arguments": arguments})
+
+    def _load_cell(self) -> list[str]:
+        cell = self._config.load_cell
+        assert cell is not None  # noqa: S101 - for the type checker; the callers have checked it
+        self._replace_port("load_cell", link=self._folder / "load-cell")
+        calibration = ["--paper-sketch"] if cell.calibration is None else ["--load-calibration", str(cell.calibration)]
+        return [*calibration, "--load-rate-hz", str(cell.rate_hz)]
+
+    def _gripper(self) -> list[str]:
+        from shearloop.drivers.defaults import URCAP_PORT
+
+        gripper = self._config.gripper
+        if gripper is None:
+            self._sentences.append("no gripper is configured: the tool is clamped to the wrist")
+            return ["--gripper", "none"]
+        section = self._content["gripper"]
+        if gripper.socket is not None:
+            section["socket"] = {"host": self._host, "port": URCAP_PORT}
+            where, interface = f"{self._host}:{URCAP_PORT}", "socket"
+        else:
+            section["modbus"] = {"path": self._folder / "gripper"}
+            where, interface = str(self._folder / "gripper"), "modbus"
+        self._sentences.append(f"the gripper, a {gripper.model}, is played at {where}")
+        return ["--gripper", interface, "--model", gripper.model]
+
+    def _skin(self, robot: "UrSettings | None") -> None:
+        """Play the skin's instruments, and the robot that turns a tool on it, if one is given."""
+        skin = self._config.skin
+        assert skin is not None  # noqa: S101 - for the type checker; the caller has checked it
+        arguments = ["--bind", LOOPBACKS[0], "--normal-n", str(skin.normal_n)]
+        if skin.tool_radius_mm is not None:
+            arguments += ["--radius-mm", str(skin.tool_radius_mm)]
+        section = self._content["skin"]
+        arguments += self._instrument(section["source"], "source", "socket", "serial")
+        if skin.daq.scanner is not None:
+            arguments += self._instrument(section["daq"]["scanner"], "daq", "socket", "")
+        else:
+            arguments += self._instrument(section["daq"]["adc"], "daq", "", "device")
+            arguments += ["--daq-rate-hz", str(skin.daq.rate_hz)]
+        if robot is not None:
+            arguments += ["--robot", self._host, *_robot_arguments(robot)]
+        elif self._config.robot is not None:
+            self._sentences.append(
+                "the skin is played untouched: the emulated robot turns the tool of the other sensors"
+            )
+        self._emulators.append({"device": "skin", "arguments": arguments})
+
+    def _instrument(self, section: dict[str, Any], name: str, by_socket: str, by_serial: str) -> list[str]:
+        """Replace the address of an instrument, and return the emulator's arguments for the new one."""
+        if by_socket and section.get(by_socket) is not None:
+            was, port = section[by_socket], _free_port()
+            self._sentences.append(
+                f"the skin's {name} at {was['host']}:{was['port']} is played at {LOOPBACKS[0]}:{port}"
+            )
+            section[by_socket] = {"host": LOOPBACKS[0], "port": port}
+            return [f"--{name}-port", str(port)]
+        link = self._folder / f"skin-{name}"
+        self._sentences.append(f"the skin's {name} is played at {link}")
+        section[by_serial] = {"path": link}
+        return [f"--{name}-link", str(link)]
+
+    def _replace_port(self, *keys: str, link: Path) -> None:
+        """Replace the serial port of a board."""
+        section = self._content
+        for key in keys:
+            section = section[key]
+        was = section["device"]
+        section["device"] = {"path": link}
+        self._sentences.append(f"`{'.'.join(keys)}`, {was['serial_number'] or was['path']}, is played at {link}")
+
+
+def _robot_arguments(robot: "UrSettings") -> list[str]:
+    """Return the emulator's arguments for the pose, the payload and the tool centre point that the settings allow."""
+    from shearloop.emulators.ur_arm import joints_within
+
+    limits, tool = robot.limits, robot.tool
+    offset = tool.tcp_offset or (0.0,) * 6
+    margin_rad = limits.joints.margin_rad
+    joints_rad = joints_within(
+        [low + margin_rad for low in limits.joints.lower_rad],
+        [high - margin_rad for high in limits.joints.upper_rad],
+        limits.workspace.lower_m,
+        limits.workspace.upper_m,
+        offset,
+    )
+    if joints_rad is None:
+        box = asdict(limits.workspace)
+        raise UserError(
+            f"the emulated arm reaches no point in the middle of the workspace with its tool downwards: {box}; "
+            "check `limits.workspace` and `limits.joints` of the robot's settings"
+        )
+    arguments = ["--rate-hz", EMULATED_RATE_HZ, "--joints-rad", *(f"{angle:.6f}" for angle in joints_rad)]
+    arguments += ["--tcp-offset", *map(str, offset)]
+    if tool.payload_kg is not None:
+        arguments += ["--payload-kg", str(tool.payload_kg)]
+    if tool.payload_cog_m is not None:
+        arguments += ["--payload-cog-m", *map(str, tool.payload_cog_m)]
+    return arguments
+
+
+def _bank(name: str, fingertip: "FingertipConfig", path: Path) -> str:
+    if fingertip.bank is None:
+        raise UserError(
+            f"{path}: `fingertips.{name}` has no `bank`, whose signals make the emulated frames; give one, "
+            "built with `shearloop bank build`"
+        )
+    return str(fingertip.bank)
+
+
+def _free_loopback() -> str:
+    """Return an address of this computer whose ports of robot and gripper are free."""
+    from shearloop.drivers.defaults import URCAP_PORT
+
+    for host in LOOPBACKS:
+        with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
+            for port in (*ROBOT_PORTS, URCAP_PORT):
+                bound = stack.enter_context(socket.socket())
+                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                bound.bind((host, port))
+            return host
+    raise UserError("every loopback address plays a robot already: end one of the other rigs")
+
+
+def _free_port() -> int:
+    with socket.socket() as bound:
+        bound.bind((LOOPBACKS[0], 0))
+        port: int = bound.getsockname()[1]
+    return port

@@ -1,0 +1,72 @@
+"""What `shearloop run` loads of the package, and what the benchmark counts."""
+
+import pytest
+
+from benchmarks.call_counts import Trace, WayTrace, counts, loaded_by_run
+from shearloop import units
+
+NOT_ON_THE_ROBOTS_PC = ("emulators", "tools", "studies")
+# An upper bound that only falls: the aim is 15 000.
+MOST_LINES = 22_800
+
+
+def test_the_daemon_loads_nothing_but_what_runs_on_the_robots_pc():
+    loaded = loaded_by_run()
+    strangers = [name for name in loaded.modules if name.split(".")[1:2] and name.split(".")[1] in NOT_ON_THE_ROBOTS_PC]
+    assert strangers == []
+    assert "shearloop.daemon.control.control_loop" in loaded.modules
+    assert loaded.lines <= MOST_LINES
+
+
+@pytest.fixture
+def installed():
+    """Install one trace at a time."""
+    traces = []
+
+    def install(trace):
+        traces.append(trace)
+        trace.recording = True
+        trace.install()
+        return trace
+
+    yield install
+    for trace in traces:
+        trace.remove()
+
+
+def test_each_function_of_the_package_counts_once(installed):
+    trace = installed(Trace())
+    for key in ("torque_nm", "angle_rad"):
+        units.unit_of(key)
+    sorted([2, 1], key=lambda number: -number)
+    trace.remove()
+    way = trace.take()
+    assert way == (("shearloop/units.py", "unit_of"),)
+    assert counts(way) == {"functions": 1, "modules": 1}
+    assert trace.take() == ()
+
+
+def test_a_way_continues_in_other_functions_until_its_end(installed):
+    def begin():
+        units.unit_of("torque_nm")
+
+    def aside():
+        units.unit_hint(1.0, "mm", 0.0, 2.0)
+
+    def go_on():
+        end()
+        aside()
+
+    def end():
+        units.unit_hint(1.0, "rad", 0.0, 2.0)
+
+    trace = WayTrace(lambda frame: frame.f_code is begin.__code__, [go_on.__code__], lambda code: code is end.__code__)
+    installed(trace)
+    go_on()
+    begin()
+    aside()
+    go_on()
+    trace.remove()
+    (way,) = trace.ways
+    assert way[0] == ("shearloop/units.py", "unit_of")
+    assert ("shearloop/units.py", "unit_hint") in way

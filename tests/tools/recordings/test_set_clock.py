@@ -1,23 +1,30 @@
 """A wall clock that is set during a recording, or a suspended computer, changes nothing that is read from it."""
 
+import asyncio
 import io
 import json
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 from mcap.reader import make_reader
+from structlog.testing import capture_logs
 
 from shearloop.bank.channels import PAPER_TABLE
+from shearloop.daemon import supervisor
 from shearloop.daemon.clock import Clock, ClockReading
 from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, LoadTorque, Message, wire_map
+from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recorder.writer import McapFile
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.tools.frame_series import read_series
 from shearloop.tools.recordings.reader import read_messages, read_recording, repair, summarise
+from tests.running import running
 from tests.sample_messages import sample
 
 MS = 1_000_000
@@ -237,3 +244,18 @@ def test_the_real_clock_measures_both_offsets():
     assert clock.synchronise() is None
     assert clock.reading.offset_ns > 10**18
     assert clock.reading.suspended_ns >= 0
+
+
+async def test_the_daemon_logs_a_step_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(supervisor, "HEALTH_PERIOD_S", 0.0)
+    clock = SetClock(-5.0)
+    clock.t_ns = STEP_AT_MS * MS
+    published: asyncio.Queue[str] = asyncio.Queue()
+    with zmq.Context() as context, closing(Publisher(context, f"ipc://{tmp_path}/publish", clock)) as publisher:
+        publisher.add_listener(lambda topic, _: published.put_nowait(topic))
+        with capture_logs() as logs:
+            async with running(supervisor.HealthReporter(publisher, supervisor.Supervisor(), clock).run()):
+                for _ in range(3):
+                    assert await published.get() == "health"
+    said = [one["event"] for one in logs]
+    assert said == ["the wall clock was set back by 5.0 s; the control loop and recordings do not follow it"]

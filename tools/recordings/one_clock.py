@@ -50,15 +50,18 @@ def is_one_clock(identity: Mapping[str, str]) -> bool:
     return schema.CLOCK_OFFSET in identity
 
 
-def by_one_clock(in_file_order: Callable[[], Messages]) -> Messages:
-    """Yield corrected messages by time; reads the file twice, and holds only the messages that are out of order."""
+def by_one_clock(first: tuple[Channel, Message], in_file_order: Callable[[], Messages]) -> Messages:
+    """Yield corrected messages by time; `first` is the file's first with a monotonic stamp, whatever is selected.
+
+    Reads the file twice, and holds only the messages that are out of order.
+    """
     clock = OneClock()
+    clock.time_ns(*first)
     times = array("q", (clock.time_ns(channel, message) for channel, message in in_file_order()))
     # The earliest time from each message on.
     earliest = array("q", times)
     for i in range(len(times) - 2, -1, -1):
         earliest[i] = min(earliest[i], earliest[i + 1])
-    clock = OneClock()
     waiting: list[tuple[int, int, Channel, Message]] = []
     for number, (channel, message) in enumerate(in_file_order()):
         while waiting and waiting[0][0] <= earliest[number]:

@@ -130,14 +130,14 @@ class OpenRecording:
         By time, log times are those of the monotonic stamps, so that a wall clock that was set changes nothing.
         """
         wanted = None if topics is None else [*topics]
+        if by_time and self.counts.get(schema.CLOCK_TOPIC) and not is_one_clock(self.identity):
+            first = next(self._found([schema.CLOCK_TOPIC], by_log_time=False))
+            return by_one_clock(first, lambda: self._found(wanted, by_log_time=False))
+        return self._found(wanted, by_log_time=by_time)
 
-        def found(*, by_log_time: bool) -> Messages:
-            messages = self._reader.iter_messages(wanted, log_time_order=by_log_time)
-            return ((channel, message) for _, channel, message in messages)
-
-        if by_time and schema.CLOCK_TOPIC in self.counts and not is_one_clock(self.identity):
-            return by_one_clock(lambda: found(by_log_time=False))
-        return found(by_log_time=by_time)
+    def _found(self, topics: list[str] | None, *, by_log_time: bool) -> Messages:
+        messages = self._reader.iter_messages(topics, log_time_order=by_log_time)
+        return ((channel, message) for _, channel, message in messages)
 
     def content(self, channel: Channel, message: Message) -> dict[str, Any]:
         """Return a message's content by the names of its topic; raises ContentError and UnknownTopicError."""

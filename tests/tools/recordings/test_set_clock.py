@@ -16,7 +16,14 @@ from structlog.testing import capture_logs
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.daemon import supervisor
 from shearloop.daemon.clock import Clock, ClockReading
-from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, LoadTorque, Message, wire_map
+from shearloop.daemon.messaging.messages import (
+    EitEstimate,
+    EitFrame,
+    GripperStateMessage,
+    LoadTorque,
+    Message,
+    wire_map,
+)
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
@@ -31,6 +38,7 @@ MS = 1_000_000
 LENGTH_MS, STEP_AT_MS = 40_000, 20_250
 UNIX_NS = 1_795_000_000 * 10**9
 DAYS_S = 2 * 86400.0
+LATE_TOPIC = "gripper.state"
 STEPS = {"back by 5 s": -5.0, "back by 30 s": -30.0, "forward by two days": DAYS_S}
 IDENTITY = Identity(schema.basic_identity("a test"), (AttachedFile(schema.CONFIGURATION, "application/json", b"{}"),))
 
@@ -69,6 +77,8 @@ def recorded(folder: Path, clock: SetClock) -> Path:
             clock.synchronise()
         if t_ms % 90 == 0:
             publish(sample(LoadTorque, source="load_cell", t_mono_ns=clock.t_ns, torque_nm=np.sin(t_ms / 3000)))
+        if t_ms > 30_000 and t_ms % 1000 == 0:
+            publish(sample(GripperStateMessage, source="gripper", t_mono_ns=clock.t_ns))
         if t_ms % 540 == 530:
             recorder.input_recorder("right").record(RawEvent(InputKind.DATA, clock.t_ns, b"0.1"))
             middle_ns = clock.t_ns - 270 * MS
@@ -175,6 +185,13 @@ def test_info_has_the_same_rates_and_reports_the_step(plain, stepped, ran):
     words = f"{step.after_s:.1f} s after the first message: the wall clock was set {way} by {abs(step.set_s):.1f} s;"
     assert words in printed
     assert "damaged" not in printed
+
+
+def test_a_topic_that_begins_after_the_step_has_the_same_offset(plain, stepped):
+    """What is read does not depend on which topics are read with it."""
+    truth, found = ([one for _, one, _ in read_messages(path, [LATE_TOPIC])] for path in (plain, stepped))
+    assert found[0]["timestamp"] > (UNIX_NS + STEP_AT_MS * MS) / 1e9
+    assert found == truth
 
 
 def test_a_repaired_copy_has_the_same_times(plain, stepped, tmp_path):

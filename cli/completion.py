@@ -30,8 +30,8 @@ def full_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="shearloop")
     parser.add_argument("--version", action="store_true", help="show the version and exit")
     commands = parser.add_subparsers(dest="command")
-    for name, (_, summary) in COMMANDS.items():
-        subparser = commands.add_parser(name, help=summary)
+    for name, command in COMMANDS.items():
+        subparser = commands.add_parser(name, help=command.summary)
         command_module(name).configure(subparser)
         _mark_files(subparser)
     return parser
@@ -39,9 +39,9 @@ def full_parser() -> argparse.ArgumentParser:
 
 def _mark_files(parser: argparse.ArgumentParser) -> None:
     """Let the shell complete file names where an argument is a path."""
-    from pathlib import Path
-
     import shtab
+
+    from shearloop.cli.options import path_of
 
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -51,5 +51,5 @@ def _mark_files(parser: argparse.ArgumentParser) -> None:
         if isinstance(action.choices, dict):
             # shtab would take a dictionary of choices for sub-commands.
             action.choices = list(action.choices)
-        if action.type is Path:
+        if action.type is path_of:
             action.complete = shtab.DIR if action.metavar == "DIR" else shtab.FILE  # type: ignore[attr-defined]

@@ -7,15 +7,18 @@ import os
 from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from shearloop.daemon.messaging.addresses import needs_keys
+from shearloop.daemon.messaging import addresses
 from shearloop.errors import UserError
+from shearloop.files import expanded_path
 
 if TYPE_CHECKING:
     from shearloop.bank.fingertip import Fingertip
     from shearloop.daemon.messaging.keys import ClientKeys
     from shearloop.estimation import Calibration, FrameSeries
+
+Expanded = TypeVar("Expanded", str, Path)
 
 PAPERS_RECORDINGS = (
     "The paper's recordings: https://github.com/DhruvTrehan03/Soft-Tactile-Sensing-For-Robotic-Manipulation "
@@ -47,6 +50,22 @@ def _number(kind: Callable[[str], float], accepts: Callable[[float], bool], wher
     return value_of
 
 
+def path_of(text: str) -> Path:
+    """Return the path of an option: shells leave `~` in `--out=~/a` as it is, and service files `$HOME`."""
+    return _expanded(expanded_path, text)
+
+
+def _daemon(text: str) -> str:
+    return _expanded(addresses.expanded, text)
+
+
+def _expanded(expand: Callable[[str], Expanded], text: str) -> Expanded:
+    try:
+        return expand(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text} {error}") from error
+
+
 def time_range(text: str) -> tuple[float, float]:
     """Return the shares of FROM:TO, as the type of an option."""
     with contextlib.suppress(ValueError):
@@ -72,8 +91,8 @@ def add_option(
     text: str,
     **more: Any,
 ) -> None:
-    """Add an option with a value, or a positional argument, to a parser or a group."""
-    parser.add_argument(name, type=kind, metavar=metavar, help=text, **more)
+    """Add an option with a value, or a positional argument, to a parser or a group; a Path is read as `path_of`."""
+    parser.add_argument(name, type=path_of if kind is Path else kind, metavar=metavar, help=text, **more)
 
 
 def add_action(
@@ -110,7 +129,7 @@ def _address(text: str) -> str:
 
 def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) -> None:
     """Add `--connect`, `--key` and `--server-key`; `purpose` describes the address."""
-    parser.add_argument("--connect", default=default, metavar="ADDRESS", help=f"{purpose} (default: %(default)s)")
+    add_option(parser, "--connect", _daemon, "ADDRESS", f"{purpose} (default: %(default)s)", default=default)
     add_option(parser, "--key", Path, "FILE", "your .key_secret, for a daemon on the network (default: in ~/.config)")
     add_option(parser, "--server-key", Path, "FILE", "that daemon's .key (default: in ~/.config)")
 
@@ -137,7 +156,7 @@ def user_key_folder() -> Path:
 
 def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
     """Return the keys for the address, None for an address on this machine; raises UserError for missing keys."""
-    if args.key is None and args.server_key is None and not needs_keys(args.connect):
+    if args.key is None and args.server_key is None and not addresses.needs_keys(args.connect):
         return None
     from shearloop.daemon.messaging.keys import ClientKeys
 

@@ -1,14 +1,15 @@
 """The base of configuration models, and the loader of their files."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
 from shearloop.errors import UserError
-from shearloop.yaml_files import load_model
+from shearloop.files import expanded_path
+from shearloop.yaml_files import Document
 
 # No length of a tool, a grip or a lever is smaller.
 LEAST_MM = 0.1
@@ -17,7 +18,8 @@ LEAST_MM = 0.1
 class ConfigModel(BaseModel):
     """Base of the configuration models: unknown keys are mistakes, values do not change.
 
-    Relative paths are taken from the folder of the file. `what` names the file in errors.
+    Relative paths are taken from the folder of the file; `~` and variables in paths are expanded. `what` names the file
+    in errors.
     """
 
     what: ClassVar[str] = "configuration"
@@ -29,12 +31,14 @@ class ConfigModel(BaseModel):
     def _check(cls, value: object, info: ValidationInfo) -> object:
         if str(info.field_name).endswith("_mm") and isinstance(value, float) and 0 < abs(value) < LEAST_MM:
             raise ValueError(f"{value:g} is too small for mm; did you mean {1000 * value:g}, the thousandfold?")
-        if not isinstance(value, Path):
-            return value
-        if value == Path() or "\0" in str(value):
+        if isinstance(value, Path) and (value == Path() or "\0" in str(value)):
             raise ValueError(f"must be the path of a file, not {str(value)!r}")
-        # Normalised, not resolved: a port's link must stay a link.
-        return Path(os.path.normpath(info.context["folder"] / value)) if info.context else value
+        # Without a file the paths are those of the computer that wrote them, such as a recording's.
+        if not info.context:
+            return value
+        if isinstance(value, tuple):
+            return tuple(_located(one, info.context["folder"]) for one in value)
+        return _located(value, info.context["folder"])
 
     def walk(self, key: str = "") -> Iterator[tuple[str, object]]:
         """Yield every value and section within this section, with its key in the file."""
@@ -45,6 +49,14 @@ class ConfigModel(BaseModel):
                 yield path, item
                 if isinstance(item, ConfigModel):
                     yield from item.walk(path)
+
+
+def _located(value: object, folder: Path) -> object:
+    """Return a path from a file in `folder` as an absolute one, and any other value as it is."""
+    if not isinstance(value, Path):
+        return value
+    # Normalised, not resolved: a port's link must stay a link.
+    return Path(os.path.normpath(folder / expanded_path(value)))
 
 
 Model = TypeVar("Model", bound=ConfigModel)
@@ -72,6 +84,10 @@ def either(one: str, other: str) -> Any:
     return model_validator(mode="after")(check)
 
 
-def load_yaml_model(path: str | Path, model: type[Model]) -> Model:
-    """Return a YAML file's content as a pydantic model; raises UserError with every mistake."""
-    return load_model(Path(path), model, UserError, model.what)
+def load_yaml_model(path: str | Path, model: type[Model], values: Mapping[str, str] | None = None) -> Model:
+    """Return a YAML file's content as a pydantic model; raises UserError with every mistake.
+
+    `values` replace some of the content: YAML by its keys, such as `loop.kp`.
+    """
+    document = Document.read(Path(path), UserError, model.what)
+    return (document.with_values(values) if values else document).model(model)

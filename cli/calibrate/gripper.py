@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     way = parser.add_mutually_exclusive_group(required=True)
     way.add_argument("--host", metavar="ADDRESS", help="the robot's controller, for the URCap's socket")
     way.add_argument("--serial-number", metavar="NUMBER", help="the USB adapter's serial number, for Modbus RTU")
-    way.add_argument("--port", metavar="PATH", help="the USB adapter's port, for Modbus RTU")
+    add_option(way, "--port", Path, "PATH", "the USB adapter's port, for Modbus RTU")
     add_option(parser, "--socket-port", PORT, "PORT", "the URCap's (default: %(default)s)", default=URCAP_PORT)
     names = ", ".join(MODELS)
     text = f"{names}; as `gripper.model` in the configuration (default: %(default)s)"
@@ -52,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
     if args.host is not None:
         client = SocketClient(args.host, args.socket_port)
     else:
-        client = ModbusClient(serial_number=args.serial_number, path=args.port)
+        path = str(args.port) if args.port is not None else None
+        client = ModbusClient(serial_number=args.serial_number, path=path)
     gripper = RobotiqGripper(client, WidthCalibration.nominal(args.model))
     operator = Operator(stdout_is_for_json=args.json)
     gauges = asyncio.run(_grip(gripper, args.diameter_mm, operator))

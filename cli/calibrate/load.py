@@ -29,7 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     port = parser.add_mutually_exclusive_group(required=True)
     port.add_argument("--serial-number", metavar="NUMBER", help="the board's USB serial number")
-    port.add_argument("--port", metavar="PATH", help="the board's serial port")
+    add_option(port, "--port", Path, "PATH", "the board's serial port")
     text = "a known mass to put on the cell; give it once per mass: several show whether they agree"
     add_option(parser, "--mass-g", float, "G", text, action="append", required=True)
     text = "from the shaft to the cell (default: %(default)s)"

@@ -6,6 +6,8 @@ import os
 import socket
 from urllib.parse import urlsplit
 
+from shearloop.files import expanded_path
+
 PUBLISH_ADDRESS = "tcp://127.0.0.1:7761"
 COMMAND_ADDRESS = "tcp://127.0.0.1:7762"
 LARGEST_PORT = 65535
@@ -15,6 +17,12 @@ LONGEST_IPC = 107
 COMMAND_TIMEOUT_S = 2.0
 # The robot may have to power up, release its brakes and start its program, and the gripper to activate.
 UNLOCK_TIMEOUT_S = 60.0
+
+
+def expanded(address: str) -> str:
+    """Return an address with `~` and variables of an ipc one's path replaced; raises ValueError as `expanded_path`."""
+    scheme, separator, path = address.partition("://")
+    return f"ipc://{expanded_path(path)}" if scheme == "ipc" and separator and path else address
 
 
 def is_local(address: str) -> bool:

@@ -23,8 +23,8 @@ FailureKind = Literal[
 ARRIVED: Final = "arrived"
 STOPPED_ON_COMMAND: Final = "stopped on command"
 
-# A joint slower than this is at rest: the noise of a real arm's speed signal is lower.
-REST_RAD_PER_S: Final = 2e-3
+# A joint slower than this is at rest: speeds of up to 0.003 rad/s were reported from arms that stand.
+REST_RAD_PER_S: Final = 0.01
 
 # The longest cycle during recovery: the dashboard client waits 2.5 s for a reply, the control client 3 s for a program.
 RECOVERY_HANG_S: Final = 6.0

@@ -42,6 +42,8 @@ ACCELERATION_S = 0.04
 PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
 # A straight move goes on for this fraction of `silence_timeout_s` after a cycle of the worker.
 LEASE_SHARE = 0.3
+# A motion has ended after so many samples at rest, one after the other.
+REST_SAMPLES = 3
 # The time allowed for a motion to end: nominal time × factor + constant.
 MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
 # The controller rounds its factors on speeds; the slider's steps are 1 %.
@@ -99,6 +101,8 @@ class MotionExecutor:
         # The script's thread for speeds runs; it has to be ended before a linear move.
         self._speed_thread = False
         self._rested_ns = now_ns
+        # How many samples at rest came last.
+        self._at_rest = 0
         self._accelerations = Accelerations()
 
     @property
@@ -200,6 +204,7 @@ class MotionExecutor:
         """Note the arm's accelerations, and whether an idle arm rests; call this in every cycle."""
         if self._motion is not None or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
             self._rested_ns = now_ns
+        self._at_rest = self._at_rest + 1 if sample.rests else 0
         self._accelerations.add(sample)
 
     def violation(self, sample: RtdeSample) -> str:
@@ -225,6 +230,11 @@ class MotionExecutor:
                 self.leave_to_watchdog(ASTRAY)
             case None:
                 self._arm.send_heartbeat()
+
+    @property
+    def _rests(self) -> bool:
+        """Whether the arm has come to rest: the noise of a single sample does not decide."""
+        return self._at_rest >= REST_SAMPLES
 
     def _left_s(self, decided_ns: int, now_ns: int) -> float:
         """Return how long a wrist speed still holds."""
@@ -255,7 +265,7 @@ class MotionExecutor:
         # The end of the move and the joint speeds come over two connections, and one may lag.
         waited = now_ns - move.begun_ns > ARRIVED_AFTER_S * 1e9
         ended = move.seen or (waited and is_close(sample.tcp_pose, move.end, CLOSE))
-        if ended and not sample.moving_linearly and sample.rests:
+        if ended and not sample.moving_linearly and self._rests:
             self._motion, self.end_reason = None, ARRIVED
         elif reason:
             self.stop(sample, now_ns, reason)
@@ -270,11 +280,11 @@ class MotionExecutor:
             self.leave_to_watchdog(NOT_STOPPING)
         elif self._speed_thread:
             deceleration = clip_stop(braking.deceleration_rad_per_s2, sample, self._settings)
-            if self._send_speed(WristSpeed(0.0, deceleration), 0.0) and sample.rests:
+            if self._send_speed(WristSpeed(0.0, deceleration), 0.0) and self._rests:
                 self._end_speed_thread()
                 self._motion = None
         else:
-            if not sample.moving_linearly and sample.rests:
+            if not sample.moving_linearly and self._rests:
                 self._motion = None
             self._arm.send_heartbeat()
 
@@ -391,7 +401,10 @@ def why_unfit(sample: RtdeSample, settings: UrSettings) -> str:
     if sample.protective_stop:
         return "Protective stop: look for its cause, clear the workspace, then unlock (not in the first 5 s)."
     if sample.emergency_stop:
-        return "Emergency stop: make the cell safe, release the button, then unlock."
+        return (
+            "Emergency stop: make the cell safe, release the button, keep hands out of the gripper, then unlock: a "
+            "gripper that lost its power opens and closes its fingers once."
+        )
     if sample.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
         other = f"The robot's safety system is in the mode “{sample.safety_mode_name}”: look at the teach pendant."
         return _SAFETY.get(sample.safety_mode, other)

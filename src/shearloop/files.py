@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -11,6 +12,31 @@ from typing import BinaryIO
 _LONGEST_DETAIL = 300
 # What file systems answer that cannot flush a folder, and what a folder answers that may be written and not read.
 _NO_FLUSH = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
+# A variable as shells write it. Other signs after a `$` are part of a file's name.
+_VARIABLE = re.compile(r"\$(?:([A-Za-z_]\w*)|\{([A-Za-z_]\w*)\})", re.ASCII)
+
+
+def expanded_path(written: str | Path) -> Path:
+    """Return a path with `~`, `~user` and variables such as `$HOME` replaced, as a shell does it.
+
+    Raises ValueError for a variable that is not set and for an unknown user.
+    """
+
+    def value_of(variable: re.Match[str]) -> str:
+        name = variable[1] or variable[2]
+        if name not in os.environ:
+            raise ValueError(f"has the variable ${name}, which is not set here; set it, or write the folder's name")
+        return os.environ[name]
+
+    # The home folder first: a shell takes no `~` from a variable.
+    try:
+        home = Path(written).expanduser()
+    except RuntimeError as error:
+        name = Path(written).parts[0]
+        raise ValueError(
+            f"begins with {name}, the home of an unknown user; write the whole path of a file of this name"
+        ) from error
+    return Path(_VARIABLE.sub(value_of, str(home)))
 
 
 @contextmanager

@@ -1,16 +1,18 @@
 """Configuration files: every mistake is reported, at once, by file, key and allowed range."""
 
+import importlib
 import os
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args, get_origin
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
+from shearloop.cli.config_schema import MODELS, schema_of
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
@@ -54,6 +56,79 @@ def test_a_good_file_becomes_a_model_that_does_not_change(tmp_path):
     assert found == Outer(torque_limit_nm=1.0, steps=(Inner(hold_s=2.5),), spare=Inner(hold_s=1))
     with pytest.raises(ValidationError, match="frozen"):
         found.torque_limit_nm = 2.0
+
+
+def path_keys(model, found):
+    """Add every key of a model, and of those below it, whose type has a path in it: model and name."""
+    for name, field in getattr(model, "model_fields", {}).items():
+        for kind in parts_of(field.annotation):
+            if kind is Path:
+                found.add((model, name))
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                path_keys(kind, found)
+    return found
+
+
+def parts_of(kind):
+    yield kind
+    for part in get_args(kind):
+        yield from parts_of(part)
+
+
+def count_paths(schema):
+    if isinstance(schema, list):
+        return sum(map(count_paths, schema))
+    if not isinstance(schema, dict):
+        return 0
+    return (schema.get("format") == "path") + sum(map(count_paths, schema.values()))
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_path_in_a_file_is_expanded(tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("HOME", "/home/person")
+    monkeypatch.setenv("DATA", "/data")
+    module, name = MODELS[kind]
+    keys = path_keys(getattr(importlib.import_module(module), name), set())
+    # No path hides in another kind of class.
+    assert len(keys) == count_paths(schema_of(kind))
+    written = {
+        "~/a": "/home/person/a",
+        "$HOME/a": "/home/person/a",
+        "${DATA}/a": "/data/a",
+        "a~/b$1": tmp_path / "a~/b$1",
+    }
+    for model, key in keys:
+        field = model.model_fields[key]
+        assert issubclass(model, ConfigModel)
+        # The key alone, with the checks that every model inherits.
+        one = create_model("One", __base__=ConfigModel, **{key: (field.annotation, ...)})
+        for text, expected in written.items():
+            many = tuple in map(get_origin, parts_of(field.annotation))
+            value = getattr(one.model_validate({key: [text] if many else text}, context={"folder": tmp_path}), key)
+            assert value == ((Path(expected),) if many else Path(expected)), (model, key)
+
+
+def test_a_path_that_cannot_be_expanded_is_refused(tmp_path, monkeypatch):
+    monkeypatch.delenv("NOWHERE", raising=False)
+    text = "fingertips: {right: {device: {serial_number: '1'}}}\nrecording: {folder: $NOWHERE/a}\n"
+    said = refused(tmp_path, text, DaemonConfig)
+    assert "a.yaml:2: recording.folder: has the variable $NOWHERE, which is not set here" in said
+    said = refused(tmp_path, text.replace("$NOWHERE", "~no-such-user"), DaemonConfig)
+    assert "recording.folder: begins with ~no-such-user, the home of an unknown user" in said
+
+
+def test_the_daemon_gets_expanded_paths_and_addresses(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/person")
+    path = tmp_path / "rig.yaml"
+    path.write_text(
+        "load_cell: {device: {path: ~/port}}\nexperiments: [~/experiments, .]\npublish: ipc://$HOME/run/p\n"
+        "recording: {folder: ~/recordings}\n"
+    )
+    config = load_yaml_model(path, DaemonConfig)
+    assert config.load_cell.device.path == Path("/home/person/port")
+    assert config.experiments == (Path("/home/person/experiments"), tmp_path)
+    assert config.recording.folder == Path("/home/person/recordings")
+    assert config.publish == "ipc:///home/person/run/p"
 
 
 def test_all_mistakes_are_reported_together_with_key_and_range(tmp_path):

@@ -39,6 +39,23 @@ def test_linear_move_that_rejects_its_stop_is_left_to_the_watchdog():
     assert "silent" in flight.state.end_reason
 
 
+def test_noise_of_a_standing_arm_is_rest_and_one_slow_sample_is_not():
+    flight = turning()
+    assert flight.ask(Stop(4.0)).accepted
+    flight.fly_until(lambda state: abs(state.qd_rad_per_s[5]) < 0.2)
+    turning_on = flight.wrist_speed
+    flight.arm.be(qd_rad_per_s=(0.0,) * 6)
+    flight.handler.tick(flight.arm.reading, flight.now_ns)
+    assert flight.state.motion == "stopping", "one sample decides nothing"
+    flight.arm.be(qd_rad_per_s=(0.0, 0.0, 0.0, 0.0, 0.0, turning_on))
+    flight.fly_until(lambda state: state.rests)
+    # As a real arm reports it at rest.
+    for joint in (0.003, -0.003) * 3:
+        flight.arm.be(qd_rad_per_s=(joint,) * 6)
+        flight.handler.tick(flight.arm.reading, flight.now_ns)
+    assert flight.state.motion == "idle"
+
+
 def test_arm_that_moves_without_a_command_is_left_to_the_watchdog():
     flight = flying()
     flight.arm.target = 0.1
@@ -180,6 +197,7 @@ def test_recovery_from_an_emergency_stop_needs_the_button_released():
     flight.arm.be(safety_mode=7, robot_mode=3)
     flight.fly(10)
     assert flight.state.emergency_stop
+    assert "opens and closes its fingers" in flight.state.blocked
     assert "still pressed" in flight.ask(Unlock()).refusal
     flight.arm.be(safety_mode=1)
     flight.fly(10)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from shearloop.drivers.ur.messages import Disconnect, MoveLinear, Stop, WristSpeed
+from shearloop.drivers.ur.motion import REST_SAMPLES
 from tests.drivers.ur.flight import CYCLE_NS, LIMITS, POSE, SETTINGS, Flight, flying, turning
 
 
@@ -102,7 +103,7 @@ def test_linear_move_gets_heartbeats_and_reports_its_arrival():
     flight.arm.be(moving_linearly=False, qd_rad_per_s=(0.1, 0.0, 0.0, 0.0, 0.0, 0.0))
     flight.handler.tick(flight.arm.reading, flight.now_ns)
     assert flight.state.motion == "linear", "its joints still move"
-    flight.fly(2)
+    flight.fly(1 + REST_SAMPLES)
     assert (flight.state.motion, flight.state.end_reason) == ("idle", "arrived")
 
 

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from shearloop.cli import bank, init
 from shearloop.cli import run as run_command
 from shearloop.cli.emulator_processes import SHEARLOOP, running
-from shearloop.cli.options import PORT, add_option
+from shearloop.cli.options import PORT, add_option, path_of
 from shearloop.cli.view import PAGE_PORT
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.process import interrupt_status
@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--port", PORT, "PORT", text)
     parser.add_argument("--prepare", action="store_true", help="only write the files; do not run")
     text = "play this .mat recording on one fingertip, without a robot: k, sigma and the heatmap"
-    parser.add_argument("--play", "--recording", type=Path, metavar="FILE", help=text)
+    parser.add_argument("--play", "--recording", type=path_of, metavar="FILE", help=text)
     parser.epilog = (
         "Builds a bank and calibrations, emulates the whole rig, grips a tool, identifies it, holds 0.10 N·m on it and "
         "lets go. Prints the address of the live page, which needs the extra `view`."

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import add_option
+from shearloop.cli.options import add_option, path_of
 from shearloop.errors import UserError
 from shearloop.printable import printable
 
@@ -37,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     text = "replace a value of the configuration, e.g. loop.kp=0.5; repeatable"
     add_option(parser, "--set", _assignment, "KEY=VALUE", text, action="append", default=[])
     text = "let the configuration's EIT emulators play this .mat recording"
-    parser.add_argument("--play", "--recording", type=Path, metavar="FILE", help=text)
+    parser.add_argument("--play", "--recording", type=path_of, metavar="FILE", help=text)
     text = "rehearse: emulate every device of this configuration, and run its experiment; no real device is opened"
     parser.add_argument("--emulate", action="store_true", help=text)
     add_option(parser, "--record", Path, "DIR", "record everything into files in this folder")

@@ -61,9 +61,9 @@ def run(args: argparse.Namespace) -> int:
             "and `shearloop demo` writes it anew"
         )
     if args.recording is not None:
-        from shearloop.tools.recordings.matlab_import import read_stream
+        from shearloop.tools.recordings.matlab_import import read_lines
 
-        read_stream(args.recording)
+        read_lines(args.recording)
     print("The demo starts …", flush=True)
     # In a process of its own: the daemon would keep the memory of the fits.
     with running([*SHEARLOOP, "demo", "--prepare", "--folder", str(args.folder), *played]) as process:

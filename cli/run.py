@@ -134,14 +134,14 @@ def _config(args: argparse.Namespace) -> "DaemonConfig":
     config = load_daemon_config(args.config)
     options = check_emulators(config.emulators, args.config)
     if args.recording is not None:
-        from shearloop.tools.recordings.matlab_import import read_stream
+        from shearloop.tools.recordings.matlab_import import read_lines
 
         boards = [given for given in options if given.device == "eit-kit"]
         if not boards:
             raise UserError(f"{args.config} has no eit-kit among its `emulators` to play --recording {args.recording}")
         for given in boards:
             # Without its frames the daemon would wait forever.
-            read_stream(args.recording, given.side)
+            read_lines(args.recording, given.side)
     if args.record is not None:
         config = config.model_copy(update={"recording": RecordingConfig(folder=args.record)})
     return config

@@ -9,12 +9,11 @@ import argparse
 import contextlib
 import importlib
 import os
-import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from types import ModuleType
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from shearloop.daemon.errors import USER_ERRORS
 from shearloop.daemon.process import interrupt_status, raise_ending_signals
@@ -29,34 +28,52 @@ os.environ.setdefault("NO_COLOR", "1")
 
 # Ctrl-C is their usual end, and nothing is left undone.
 _ENDED_BY_INTERRUPT = ("shearloop listen", "shearloop view", "shearloop emulate")
-# The module of each command in this package, and its summary for the overview.
-COMMANDS = {
-    "demo": ("demo", "run the whole rig, emulated, in closed loop"),
-    "init": ("init", "write a commented configuration and experiments to start from"),
-    "run": ("run", "run the daemon that a configuration describes"),
-    "import": ("recording", "convert the paper's MATLAB streams into a recording"),
-    "recording": ("recording", "inspect recordings, repair them, and export them as tables"),
-    "replay": ("replay", "send a recording through the same estimators again, as if live"),
-    "evaluate": ("evaluate", "judge a calibrated estimator on recordings or slices"),
-    "adapt": ("adapt", "correct a calibration's gain by one or a few twists of known torque"),
-    "chart": ("chart", "chart speed against accuracy, stability, and how much model is needed"),
-    "check": ("check", "check a configuration and the files it names"),
-    "schema": ("schema", "print the JSON Schema of a configuration, an experiment or another file"),
-    "listen": ("listen", "print what a running daemon publishes"),
-    "command": ("command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),
-    "view": ("view", "show a running daemon as a page in the browser, with a stop button"),
-    "calibrate": ("calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"),
-    "emulate": ("emulate", "emulate a device, byte for byte, on a port of its own"),
-    "bank": ("bank", "solve, build, design and inspect banks of simulated signals"),
-    "doctor": ("doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
-    "ports": ("ports", "list the serial ports with their serial numbers"),
-    "keys": ("keys", "make the keys for daemon and clients on a network"),
-    "completion": ("completion", "print the completion script for bash, zsh or tcsh"),
-    "install": ("install", "install the daemon as a service of this computer"),
-    "uninstall": ("install", "remove the service"),
-    "skin": ("skin", "compare the shear skin's models with its paper, and calibrate a skin"),
-    "reproduce": ("reproduce", "compute the paper's numbers and figures from recorded slices"),
+
+
+class Command(NamedTuple):
+    """A command's module in this package, and its summary for the overview."""
+
+    module: str
+    summary: str
+
+
+# The commands of each group of the overview, in its order.
+GROUPS: Mapping[str, Mapping[str, Command]] = {
+    "run": {
+        "demo": Command("demo", "run the whole rig, emulated, in closed loop"),
+        "init": Command("init", "write a commented configuration and experiments to start from"),
+        "run": Command("run", "run the daemon that a configuration describes"),
+        "view": Command("view", "show a running daemon as a page in the browser, with a stop button"),
+        "command": Command("command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),
+        "listen": Command("listen", "print what a running daemon publishes"),
+    },
+    "bring up": {
+        "ports": Command("ports", "list the serial ports with their serial numbers"),
+        "check": Command("check", "check a configuration and the files it names, or print an experiment's plan"),
+        "doctor": Command("doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
+        "install": Command("install", "install the daemon as a service of this computer"),
+        "uninstall": Command("install", "remove the service"),
+        "keys": Command("keys", "make the keys for daemon and clients on a network"),
+        "schema": Command("schema", "print the JSON Schema of a configuration, an experiment or another file"),
+        "completion": Command("completion", "print the completion script for bash, zsh or tcsh"),
+    },
+    "recordings": {"recording": Command("recording", "list, inspect, repair, export, replay and import recordings")},
+    "calibrate": {
+        "calibrate": Command("calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"),
+        "adapt": Command("adapt", "correct a calibration's gain by one or a few twists of known torque"),
+        "evaluate": Command("evaluate", "judge a calibrated estimator on recordings or slices"),
+        "bank": Command("bank", "solve, build, design and inspect banks of simulated signals"),
+    },
+    "research": {
+        "reproduce": Command("reproduce", "compute the paper's numbers and figures from recorded slices"),
+        "chart": Command("chart", "chart speed against accuracy, stability, and how much model is needed"),
+        "skin": Command("skin", "compare the shear skin's models with its paper, and calibrate a skin"),
+        "emulate": Command("emulate", "emulate a device, byte for byte, on a port of its own"),
+    },
 }
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
+# Spellings that scripts use, and the words that stand for them.
+OTHER_SPELLINGS = {"replay": ("recording", "replay"), "import": ("recording", "import")}
 
 # What may move the rig: no other word is taken for one of these.
 MOVING = frozenset({"start", "resume", "unlock", "release", "commission"})
@@ -72,53 +89,67 @@ With your own: `shearloop init DIR` writes a configuration, `shearloop ports` sh
 class Parser(argparse.ArgumentParser):
     """Reports a mistake in one sentence and names the help; takes a list's values from between options too."""
 
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # So that argparse raises its errors, with the argument, and does not print them.
+        self.exit_on_error = False
+
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """Return the arguments and what is left over, as argparse does, with a list's later values in the list.
+        """Return the arguments, with a list's later values in the list; nothing is left over.
 
         argparse ends a list of positional arguments at the first option: in `NAME --out DIR REC`, REC is left over.
         """
-        found, extras = super().parse_known_args(args, namespace)
-        lists = [action for action in self._actions if not action.option_strings and action.nargs in ("*", "+")]
-        # A word after an unknown option may be its value.
-        if lists and not any(text.startswith("-") for text in extras):
-            more = [self._get_value(lists[-1], text) for text in extras]
-            setattr(found, lists[-1].dest, [*getattr(found, lists[-1].dest), *more])
-            return found, []
-        return found, extras
+        try:
+            found, extras = super().parse_known_args(args, namespace)
+            lists = [action for action in self._actions if not action.option_strings and action.nargs in ("*", "+")]
+            # A word after an unknown option may be its value.
+            if lists and not any(text.startswith("-") for text in extras):
+                more = [self._get_value(lists[-1], text) for text in extras]
+                setattr(found, lists[-1].dest, [*getattr(found, lists[-1].dest), *more])
+                extras = []
+        except argparse.ArgumentError as error:
+            if error.argument_name is None:
+                self.error(error.message)
+            # The types of options begin their sentence with the value.
+            of_type = isinstance(error.__context__, argparse.ArgumentTypeError)
+            self._refuse(f"{error.argument_name}{'' if of_type else ':'} {error.message}")
+        if extras:
+            near = get_close_matches(extras[0].partition("=")[0], self._option_string_actions, 1)
+            meant = f"; did you mean {near[0]}?" if near else ""
+            self._refuse(f"unrecognized arguments: {' '.join(extras)}{meant}")
+        return found, []
 
     def error(self, message: str) -> NoReturn:
-        """Raise UserError with the sentence."""
-        raise UserError(f"{self._plain(message)}; see `{self.prog} --help`")
+        """Raise UserError with argparse's sentence, and with the choices for each missing word that it names."""
+        words = message.replace(",", " ").split()
+        lists = [
+            f"; {action.metavar or action.dest} is one of {', '.join(map(str, action.choices))}"
+            for action in self._actions
+            if action.required and action.choices and (action.metavar or action.dest) in words
+        ]
+        self._refuse(message + "".join(lists))
 
-    def _plain(self, message: str) -> str:
-        """Return argparse's message without `argument`, and with the nearest known word."""
-        value = re.fullmatch(r"argument (\S+): (.* is .*)", message)
-        if value is not None:
-            return f"{value[1]} {value[2]}"
-        choice = re.fullmatch(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)\)", message)
-        if choice is not None:
-            name, given, known = choice[1], choice[2], [one.strip("'") for one in choice[3].split(", ")]
-            of = f" of {name}" if name.startswith("--") else ""
-            # A mistyped word must not become a motion.
-            safe = [one for one in known if one not in MOVING]
-            meant = "".join(f"; did you mean {one}?" for one in get_close_matches(given, safe, 1))
-            return f"there is no {given!r}{of}{meant or '; there are ' + ', '.join(known)}"
-        required = re.fullmatch(r"the following arguments are required: (.*)", message)
-        if required is not None:
-            lists = [
-                f"; {action.metavar or action.dest} is one of {', '.join(action.choices)}"
-                for action in self._actions
-                if action.choices and (action.metavar or action.dest) in required[1].split(", ")
-            ]
-            return message + "".join(lists)
-        unknown = re.match(r"unrecognized arguments: (\S+)", message)
-        near = get_close_matches(unknown[1], self._option_string_actions, 1) if unknown else []
-        return f"{message}; did you mean {near[0]}?" if near else message
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse a value that is not among the choices, with the nearest one."""
+        if action.choices is None or value in action.choices:
+            return
+        known = list(map(str, action.choices))
+        of = f" of {action.option_strings[-1]}" if action.option_strings else ""
+        # A mistyped word must not become a motion.
+        near = get_close_matches(str(value), [one for one in known if one not in MOVING], 1)
+        self._refuse(f"there is no {value!r}{of}; {f'did you mean {near[0]}?' if near else _there_are(known)}")
+
+    def _refuse(self, sentence: str) -> NoReturn:
+        raise UserError(f"{sentence}; see `{self.prog} --help`")
+
+
+def _there_are(known: Sequence[str]) -> str:
+    return f"there {'is' if len(known) == 1 else 'are'} {', '.join(known)}"
 
 
 def command_module(name: str) -> ModuleType:
     """Import and return the module of a command."""
-    return importlib.import_module(f"shearloop.cli.{COMMANDS[name][0]}")
+    return importlib.import_module(f"shearloop.cli.{COMMANDS[name].module}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -132,10 +163,14 @@ def _run(argv: Sequence[str] | None) -> int:
     if arguments[:1] in ([], ["help"]):
         arguments = [*arguments[1:2], "--help"]
     program = "shearloop"
+    if (words := OTHER_SPELLINGS.get(arguments[0])) is not None:
+        with contextlib.suppress(OSError):
+            print(f"`shearloop {arguments[0]}` is `shearloop {' '.join(words)}`", file=sys.stderr)
+        arguments = [*words, *arguments[1:]]
     try:
         name = _overview().parse_args(arguments[:1]).command
         program, module = f"shearloop {name}", command_module(name)
-        parser = Parser(prog=program, description=COMMANDS[name][1])
+        parser = Parser(prog=program, description=COMMANDS[name].summary)
         module.configure(parser)
         expand = getattr(module, "expand_default_command", list)
         args = parser.parse_args(expand(arguments[1:]))
@@ -159,11 +194,14 @@ def _run(argv: Sequence[str] | None) -> int:
 
 def _overview() -> argparse.ArgumentParser:
     width = max(map(len, COMMANDS))
-    listing = "\n".join(f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
+    listing = "\n\n".join(
+        "\n".join([f"{group}:", *(f"  {name:<{width}}  {command.summary}" for name, command in commands.items())])
+        for group, commands in GROUPS.items()
+    )
     parser = Parser(
         prog="shearloop",
         description="Closed-loop twisting with soft shear-sensing skins.",
-        epilog=f"commands:\n{listing}\n\n`shearloop COMMAND --help` explains one. {_FIRST_STEPS}",
+        epilog=f"{listing}\n\n`shearloop COMMAND --help` explains one. {_FIRST_STEPS}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")

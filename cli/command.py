@@ -9,10 +9,12 @@ from typing import Any
 
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys
 from shearloop.daemon.messaging import addresses, stop_client
+from shearloop.daemon.messaging.callers import caller
 
 COMMANDS = {
     "tare": "set the zero of the torque sensors, with nothing gripped and no experiment running",
     "status": "show the experiment and the state of each task",
+    "experiments": "list the experiments that `start` may name",
     "start": "start an experiment",
     "pause": "hold the arm until `resume`; moving fingers finish their move",
     "resume": "continue after `pause`",
@@ -52,7 +54,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Send one command and print its reply; status 1 if the daemon refused it."""
-    arguments: dict[str, Any] = {} if args.source is None else {"source": args.source}
+    arguments: dict[str, Any] = {"by": caller("shearloop command")}
+    if args.source is not None:
+        arguments["source"] = args.source
     if args.yes:
         arguments["confirmed"] = True
     if args.experiment is not None:
@@ -116,5 +120,15 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
         rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
         loop = [loop_line(reply["loop"]), ""] if "loop" in reply else []
         return [*loop, *table(("task", "state", "rate", "notes"), rows)]
+    if name == "experiments":
+        from shearloop.cli.terminal import table
+
+        own = reply["configured"]
+        known = [(one["path"], one["name"], "configured" if one["path"] == own else "") for one in reply["experiments"]]
+        return table(("file", "name", ""), known)
+    if name == "stop":
+        if reply.get("ended"):
+            return ["stop: nothing was moving; the daemon has ended"]
+        return [f"stop: stopped {reply['stopped']}" if reply.get("stopped") else "stop: nothing was moving"]
     values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
     return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -30,8 +30,8 @@ def full_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="shearloop")
     parser.add_argument("--version", action="store_true", help="show the version and exit")
     commands = parser.add_subparsers(dest="command")
-    for name, (_, summary) in COMMANDS.items():
-        subparser = commands.add_parser(name, help=summary)
+    for name, command in COMMANDS.items():
+        subparser = commands.add_parser(name, help=command.summary)
         command_module(name).configure(subparser)
         _mark_files(subparser)
     return parser

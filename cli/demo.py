@@ -2,18 +2,22 @@
 
 import argparse
 import json
+import socket
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from shearloop.cli import bank, init
 from shearloop.cli import run as run_command
 from shearloop.cli.emulator_processes import SHEARLOOP, running
-from shearloop.cli.options import add_option
+from shearloop.cli.options import PORT, add_option
+from shearloop.cli.view import PAGE_PORT
+from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.process import interrupt_status
 from shearloop.errors import UserError, missing
 from shearloop.tools.outputs import writing
@@ -21,11 +25,19 @@ from shearloop.tools.outputs import writing
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
 
+HOST = "127.0.0.1"
+# Of a robot's controller.
+RTDE_PORT = 30004
+# A daemon on a busy computer answers within it.
+STATUS_S = 2.0
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `demo`."""
     text = "folder for configuration, bank and calibrations, kept for later runs (default: %(default)s)"
     add_option(parser, "--folder", Path, "DIR", text, default=Path("shearloop-demo"))
+    text = f"the page's port on 127.0.0.1; 0 for any free one (default: {PAGE_PORT}, or any if that is taken)"
+    add_option(parser, "--port", PORT, "PORT", text)
     parser.add_argument("--prepare", action="store_true", help="only write the files; do not run")
     text = "play this .mat recording on one fingertip, without a robot: k, sigma and the heatmap"
     add_option(parser, "--recording", Path, "FILE", text)
@@ -53,8 +65,12 @@ def run(args: argparse.Namespace) -> int:
     name = "demo.yaml" if args.recording is None else "fingertip_demo.yaml"
     played = [] if args.recording is None else ["--recording", str(args.recording)]
     config = load_daemon_config(folder / name)
-    # Mistakes are found before anything is built and served.
-    open_settings(config)
+    # Mistakes, and another daemon, are found before anything is built and served.
+    settings = open_settings(config)
+    check_ports(config, settings.host if settings is not None else None)
+    port = args.port if args.port is not None else PAGE_PORT if _is_free(HOST, PAGE_PORT) else 0
+    if port and not _is_free(HOST, port):
+        raise UserError(f"the page cannot be served on {HOST}:{port}, which is taken; give another --port")
     if args.recording is None and not config.autostart:
         raise UserError(
             f"{folder / name} starts nothing by itself: it needs `emulated: true` and `autostart: true`; remove it, "
@@ -70,8 +86,39 @@ def run(args: argparse.Namespace) -> int:
         status = process.wait()
     if status:
         return status
-    with page(config):
+    with page(config, port):
         return _call(run_command, str(folder / name), "--show", *played)
+
+
+def check_ports(config: "DaemonConfig", robot: str | None) -> None:
+    """Raise UserError if another daemon, or another emulated rig, has the addresses of this configuration."""
+    reply = None
+    with suppress(TimeoutError):
+        reply = send_to_stop_socket(config.commands, {"command": "status"}, STATUS_S)
+    if reply is not None:
+        running = reply.get("daemon", {})
+        shown = "" if _is_free(HOST, PAGE_PORT) else f", its page is http://{HOST}:{PAGE_PORT}/"
+        raise UserError(
+            f"a daemon runs already at {config.commands}: process {running.get('process')} ({running.get('rig')}) in "
+            f"{running.get('folder')}{shown}; `shearloop command stop --connect {config.commands}` stops its "
+            "experiment, and a second time ends it"
+        )
+    ours = [urlsplit(address) for address in (config.publish, config.commands) if address.startswith("tcp://")]
+    places = [(str(one.hostname), one.port) for one in ours if one.port]
+    places += [(robot, RTDE_PORT)] if robot is not None and config.emulators else []
+    for host, port in places:
+        if not _is_free(host, port):
+            raise UserError(f"{host}:{port} is taken by another program; `ss -ltnp` names it: end it first")
+
+
+def _is_free(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError:
+            return False
+    return True
 
 
 def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:
@@ -105,13 +152,13 @@ def _is_calibrated(data: Path, signals: Path) -> bool:
 
 
 @contextmanager
-def page(config: "DaemonConfig") -> Iterator[None]:
-    """Serve the live page in a process of its own."""
+def page(config: "DaemonConfig", port: int) -> Iterator[None]:
+    """Serve the live page on this port in a process of its own."""
     if find_spec("aiohttp") is None:
         print(missing("aiohttp", "view", "the live page"), flush=True)
         yield
         return
-    options = ("--connect", config.publish, "--commands", config.commands, "--port", "0", "--json")
+    options = ("--connect", config.publish, "--commands", config.commands, "--port", str(port), "--json")
     with running([*SHEARLOOP, "view", *options], stdout=subprocess.PIPE) as process:
         # Empty where the page has ended; its own sentence says why.
         if process.stdout is not None and (line := process.stdout.readline()):

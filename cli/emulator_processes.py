@@ -9,9 +9,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
+from shearloop.daemon.process import end_with_parent
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:
@@ -27,8 +29,12 @@ SHEARLOOP = (sys.executable, "-m", "shearloop")
 
 @contextlib.contextmanager
 def running(command: Sequence[str], **options: Any) -> "Iterator[subprocess.Popen[bytes]]":
-    """Run a command in a process group of its own, which Ctrl-C does not reach, and end it; options are of Popen."""
-    with subprocess.Popen(command, process_group=0, bufsize=0, **options) as process:
+    """Run a command in a process group of its own, which Ctrl-C does not reach, and end it; options are of Popen.
+
+    It ends with this process, also if that is killed.
+    """
+    end = partial(end_with_parent, os.getpid())
+    with subprocess.Popen(command, process_group=0, bufsize=0, preexec_fn=end, **options) as process:  # noqa: PLW1509
         try:
             yield process
         finally:

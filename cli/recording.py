@@ -1,4 +1,4 @@
-"""`shearloop recording` and `shearloop import mat`: inspect, repair, export and import recordings."""
+"""`shearloop recording`: list, inspect, repair, export, replay and import recordings."""
 
 import argparse
 import json
@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shearloop.cli import replay
 from shearloop.cli.options import (
     PAPERS_RECORDINGS,
     add_action,
@@ -18,7 +19,7 @@ from shearloop.cli.options import (
     load_fingertip,
     run_action,
 )
-from shearloop.cli.terminal import print_result
+from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError
 from shearloop.tools.outputs import check_overwrite, progress_bar, writing
 from shearloop.tools.recordings.time_formats import DATENUM, TIME_FORMATS
@@ -34,19 +35,12 @@ run = run_action
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the actions of `recording`, or the formats of `import` to its parser."""
-    if parser.prog.endswith(" import"):
-        formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True)
-        mat = add_action(formats, "mat", "import the paper's MATLAB streams", _import)
-        add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
-        add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
-        formats_text = "; ".join(f"{name}: {form.words}" for name, form in TIME_FORMATS.items())
-        text = f"what the first column's times are (default: %(default)s). {formats_text}"
-        mat.add_argument("--time-format", choices=tuple(TIME_FORMATS), default=DATENUM, help=text)
-        add_json(mat)
-        parser.epilog = PAPERS_RECORDINGS
-        return
+    """Add the actions of `recording`."""
     parts = parser.add_subparsers(dest="part", metavar="WHAT", required=True)
+    listed = add_action(parts, "list", "list the recordings of a folder, oldest first", _list)
+    text = "folder to search, with those below it (default: the present one)"
+    add_option(listed, "folder", Path, "DIR", text, nargs="?", default=Path())
+    listed.add_argument("--json", action="store_true", help="one JSON object per recording")
     info = add_action(parts, "info", "show the content of recordings, closed or not", _info)
     add_option(info, "recordings", Path, "REC", "recordings (.mcap or .mcap.partial)", nargs="+")
     info.add_argument("--json", action="store_true", help="one JSON object per recording")
@@ -63,6 +57,44 @@ def configure(parser: argparse.ArgumentParser) -> None:
     export.add_argument("--topic", action="append", metavar="TOPIC", help="export only this topic; repeatable")
     add_fingertip(export)
     add_json(export)
+    summary = "send a recording through the same estimators again, as if live"
+    replay.configure(add_action(parts, "replay", summary, replay.run))
+    summary = "import other formats"
+    imported = parts.add_parser("import", help=summary, description=summary, epilog=PAPERS_RECORDINGS)
+    formats = imported.add_subparsers(dest="format", metavar="FORMAT", required=True)
+    mat = add_action(formats, "mat", "import the paper's MATLAB streams", _import)
+    add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
+    add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
+    formats_text = "; ".join(f"{name}: {form.words}" for name, form in TIME_FORMATS.items())
+    text = f"what the first column's times are (default: %(default)s). {formats_text}"
+    mat.add_argument("--time-format", choices=tuple(TIME_FORMATS), default=DATENUM, help=text)
+    add_json(mat)
+
+
+def _list(args: argparse.Namespace) -> int:
+    from shearloop.tools.recordings.reader import list_recordings
+
+    found = list_recordings(args.folder)
+    if args.json:
+        for one in found:
+            print(json.dumps(asdict(one), ensure_ascii=False))
+        return 0
+    if not found:
+        print(f"{args.folder}: no recording is in this folder or below it")
+        return 0
+    rows = []
+    for one in found:
+        began = "" if one.first_unix_ns is None else _local_time(one.first_unix_ns)
+        lasts = "" if one.duration_s is None else f"{one.duration_s:.0f} s"
+        remark = one.unreadable or ("" if one.closed else "not closed, or being written")
+        ran = ", ".join(one.experiments)
+        rows.append((began, lasts, f"{one.size_bytes / 1e6:.1f} MB", one.path, ran, remark))
+    print(*table(("from", "lasts", "size", "file", "experiment", ""), rows), sep="\n")
+    return 0
+
+
+def _local_time(unix_ns: int) -> str:
+    return datetime.fromtimestamp(unix_ns / 1e9).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -80,7 +112,7 @@ def _summary_text(found: "RecordingSummary") -> str:
 
     lines = [found.path]
     if found.first_unix_ns is not None:
-        began = datetime.fromtimestamp(found.first_unix_ns / 1e9).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+        began = _local_time(found.first_unix_ns)
         lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.size_bytes / 1e6:.2f} MB")
     lines.append(f"  source   {found.metadata.get('source', 'unknown: not a recording of shearloop')}")
     lines += [f"  ran      {name}" for name in found.experiments]

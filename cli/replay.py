@@ -1,4 +1,4 @@
-"""`shearloop replay REC`: process a recording again and publish it as if live."""
+"""`shearloop recording replay REC`: process a recording again and publish it as if live."""
 
 import argparse
 import asyncio

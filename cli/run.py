@@ -31,6 +31,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--show", action="store_true", help=text)
     text = "log JSON lines (the default under systemd)"
     parser.add_argument("--json-log", action="store_true", default=None, help=text)
+    choices = ("debug", "info", "warning", "error")
+    text = "log this and what is worse (default: info; on a terminal with --show: warning)"
+    parser.add_argument("--log-level", choices=choices, metavar="LEVEL", help=f"{text}; one of {', '.join(choices)}")
+    text = "replace a value of the configuration, e.g. loop.kp=0.5; repeatable"
+    add_option(parser, "--set", _assignment, "KEY=VALUE", text, action="append", default=[])
     add_option(parser, "--recording", Path, "FILE", "let the configuration's EIT emulators play this .mat recording")
     text = "rehearse: emulate every device of this configuration, and run its experiment; no real device is opened"
     parser.add_argument("--emulate", action="store_true", help=text)
@@ -40,6 +45,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "configuration says stop_when_done. Exit status: 0 it ended as requested, 2 it could not run (and why), "
         "3 the experiment of stop_when_done was stopped before its end."
     )
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    key, sign, value = text.partition("=")
+    if not (key and sign):
+        raise argparse.ArgumentTypeError(f"{text} is not of the form KEY=VALUE, such as loop.kp=0.5")
+    return key, value
 
 
 def run(args: argparse.Namespace) -> int:
@@ -56,6 +68,8 @@ def run(args: argparse.Namespace) -> int:
     # A terminal shows one line that changes, and only warnings between.
     terminal = args.show and not args.json_log and sys.stdout.isatty() and sys.stderr.isatty()
     level, before = (logging.WARNING, CLEAR_LINE) if terminal else (logging.INFO, "")
+    if args.log_level is not None:
+        level = getattr(logging, args.log_level.upper())
     with (
         without_long_collections() as on_ready,
         logging_to_stderr(json_lines=args.json_log, level=level, before=before),
@@ -131,7 +145,7 @@ def _config(args: argparse.Namespace) -> "DaemonConfig":
     from shearloop.cli.emulator_processes import check_emulators
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
 
-    config = load_daemon_config(args.config)
+    config = load_daemon_config(args.config, dict(args.set))
     options = check_emulators(config.emulators, args.config)
     if args.recording is not None:
         from shearloop.tools.recordings.matlab_import import read_lines

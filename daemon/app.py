@@ -5,28 +5,32 @@ import contextlib
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import structlog
 import zmq
 import zmq.asyncio
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commands import Commands
+from shearloop.daemon.commands import Answered, Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
+from shearloop.daemon.messaging.callers import caller_of
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import ClientAuthenticator, load_server_keys
+from shearloop.daemon.messaging.messages import DaemonCommand
 from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
-from shearloop.daemon.rig import Rig, build_rig
-from shearloop.daemon.rig_memory import Remembered
+from shearloop.daemon.rig import Rig, build_rig, open_settings
+from shearloop.daemon.rig_memory import Remembered, sole_driver
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.service import notify
-from shearloop.daemon.supervisor import HealthReporter, Reporter, Supervisor, Task, TaskFacts
+from shearloop.daemon.supervisor import MAX_ERROR_LENGTH, HealthReporter, Reporter, Supervisor, Task, TaskFacts
+from shearloop.printable import printable
 
 # The end waits this long for the report of an experiment that it has stopped; a dead loop reports none.
 REPORTED_WITHIN_S = 0.2
@@ -66,6 +70,8 @@ class Daemon:
             clients = config.curve.clients if config.curve is not None and config.network_addresses else None
             authenticator = ClientAuthenticator(context, clients, refusals)
             opened.callback(authenticator.close)
+            if (settings := open_settings(config)) is not None:
+                opened.enter_context(sole_driver(settings.host))
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
             self.publisher.add_listener(self._summary)
             self.recorder: Recorder | None = None
@@ -73,17 +79,23 @@ class Daemon:
                 self.recorder = Recorder(config.recording.folder, daemon_identity(config), clock)
                 self.publisher.add_listener(self.recorder.record_message)
                 opened.callback(self.recorder.close)
-            self.health = HealthReporter(self.publisher, self.supervisor, clock, emulated=config.emulated)
+            self.health = HealthReporter(self.publisher, self.supervisor, clock, config.emulated, config.name)
             self.sensors, self._rig = build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
             if self._rig is not None:
-                self.health.tare_refusal = self._rig.control_loop.tare_refusal
+                self.health.refusals |= {
+                    "tare": self._rig.control_loop.tare_refusal,
+                    "start": self._rig.runner.start_refusal,
+                    "release": self._rig.runner.release_refusal,
+                }
             self._experiment: ConfiguredExperiment | None = None
             if config.experiment is not None and self._rig is not None:
                 daemon_end = self._end if config.stop_when_done else None
                 self._experiment = ConfiguredExperiment(
                     config.experiment, self._rig, autostart=config.autostart, daemon_end=daemon_end
                 )
-            self.commands = Commands(self._rig, self.sensors, self._experiment, self.health, self._end)
+            self.commands = Commands(
+                self._rig, self.sensors, self._experiment, self.health, self._end, partial(self._tell, clock)
+            )
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)
             stop_socket = StopSocket(server.address, self.commands.keyless_handlers(), refusals)
@@ -145,6 +157,21 @@ class Daemon:
     def stop(self) -> None:
         """End `run` as soon as the tasks have ended."""
         self._end.set()
+
+    def _tell(self, clock: Clock, answered: Answered) -> None:
+        """Publish a command and its answer."""
+        name, request, refusal = answered
+        subject = request.get("experiment") or request.get("source")
+        told = DaemonCommand(
+            source="daemon",
+            t_mono_ns=clock.now_ns(),
+            command=name,
+            subject=printable(subject)[:MAX_ERROR_LENGTH] if isinstance(subject, str) else "",
+            by=caller_of(request),
+            accepted=refusal is None,
+            reason=refusal or "",
+        )
+        self.publisher.publish(told)
 
     def _log_recordings(self) -> None:
         if self.recorder is None:

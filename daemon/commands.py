@@ -1,22 +1,35 @@
 """The daemon's commands: one handler each, which executes the command or refuses it with a reason."""
 
 import asyncio
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.experiment_schema import first_motion
 from shearloop.daemon.control.loop_runner import loop_state
+from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.experiment_files import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig, Sensors
 from shearloop.daemon.supervisor import HealthReporter
 from shearloop.errors import UserError
 
+EXPERIMENTS = "experiments"
 STOP_DELAY_S = 0.05
 # What `status` shows of `loop.state`.
 LOOP_KEYS = ("phase", "run", "experiment", "step", "steps", "step_name", "activity", "progress", "reasons")
+
+
+class Answered(NamedTuple):
+    """A command's name and request, and why it was refused, or None."""
+
+    name: str
+    request: Request
+    refusal: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +44,40 @@ class Commands:
     experiment: ConfiguredExperiment | None
     health: HealthReporter
     daemon_end: asyncio.Event
+    # Takes each command that was answered, but for questions.
+    tell: Callable[["Answered"], None] = lambda _: None
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
-        named = {"tare": self._tare, STATUS: self._status, STOP: self._stop, "start": self._start}
+        asking = {STATUS: self._status, EXPERIMENTS: self._experiments}
+        return asking | {name: partial(self._told, name, handler) for name, handler in self._acting().items()}
+
+    def _acting(self) -> Mapping[str, Handler]:
+        named: dict[str, Handler] = {"tare": self._tare, STOP: self._stop, "start": self._start}
         named |= {"pause": self._pause, "resume": self._resume, "unlock": self._unlock}
         return {**named, "release": self._release}
+
+    async def _told(self, name: str, handler: Handler, request: Request) -> Reply:
+        """Carry out a command, and tell what came of it."""
+        refusal = None
+        try:
+            return await handler(request)
+        except CommandRefusedError as error:
+            refusal = str(error)
+            raise
+        finally:
+            if not request.get("ask"):
+                self.tell(Answered(name, request, refusal))
+
+    async def _experiments(self, _request: Request) -> Reply:
+        """Return the experiments that `start` may name, and the one that it runs if it names none."""
+        rig = required_rig(self.rig)
+        try:
+            found = await rig.experiments.list()
+        except UserError as error:
+            raise CommandRefusedError(str(error)) from error
+        own = str(self.experiment.path) if self.experiment is not None else ""
+        return {"experiments": [{"path": path, "name": name} for path, name in found.items()], "configured": own}
 
     def keyless_handlers(self) -> Mapping[str, Handler]:
         """Return the handlers for users of this machine without a key: only `stop` and `status` work."""
@@ -56,7 +97,10 @@ class Commands:
             if request.get("ask"):
                 _refuse_if(rig.runner.start_refusal())
                 file = (await rig.experiments.read(Path(path))).file
-                return {"question": f"Start {file.name!r}? {first_motion(file)[0].upper()}{first_motion(file)[1:]}."}
+                motion = first_motion(file)
+                plan = plan_of(file, rig.experiments.robot, rig.experiments.gripper)
+                question = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}."
+                return {"question": question, "plan": list(plan.sentences())}
             _refuse_if(await rig.start(Path(path)))
         except InvalidExperimentError as error:
             raise CommandRefusedError(str(error), invalid=True) from error
@@ -103,10 +147,11 @@ class Commands:
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()
+        daemon = {"process": os.getpid(), "folder": os.getcwd(), "rig": self.health.rig}
         if self.rig is None:
-            return {"tasks": tasks}
+            return {"tasks": tasks, "daemon": daemon}
         state = loop_state(self.rig.control_loop, 0.0, 0)
-        return {"tasks": tasks, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
+        return {"tasks": tasks, "daemon": daemon, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
 
     async def _stop(self, request: Request) -> Reply:
         spare_daemon = bool(request.get("spare_daemon"))
@@ -119,7 +164,7 @@ class Commands:
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
         # Nothing moves, so the daemon itself stops, once the reply is sent.
         asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
-        return {}
+        return {"ended": True}
 
 
 def required_rig(rig: Rig | None) -> Rig:

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -257,6 +257,7 @@ class DaemonConfig(ConfigModel):
         "steps",
     )
 
+    name: str = Field("", max_length=60, description="name of the rig, for the page; default: that of this file")
     publish: Address = Field(addresses.PUBLISH_ADDRESS, description="ZeroMQ address of the messages")
     commands: Address = Field(addresses.COMMAND_ADDRESS, description="ZeroMQ address of the commands")
     curve: CurveConfig | None = Field(None, description="keys for addresses that are open to the network")
@@ -360,6 +361,7 @@ def _is_hardware(port: Path) -> bool:
     return port.is_relative_to("/dev") and not port.is_relative_to("/dev/pts")
 
 
-def load_daemon_config(path: Path) -> DaemonConfig:
-    """Return the configuration of a YAML file; raises UserError with every mistake."""
-    return load_yaml_model(path, DaemonConfig)
+def load_daemon_config(path: Path, values: Mapping[str, str] | None = None) -> DaemonConfig:
+    """Return the configuration of a YAML file, some `values` of it replaced; raises UserError with every mistake."""
+    config = load_yaml_model(path, DaemonConfig, values)
+    return config if config.name else config.model_copy(update={"name": path.stem})

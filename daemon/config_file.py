@@ -1,7 +1,7 @@
 """The base of configuration models, and the loader of their files."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, mod
 
 from shearloop.errors import UserError
 from shearloop.files import expanded_path
-from shearloop.yaml_files import load_model
+from shearloop.yaml_files import Document
 
 # No length of a tool, a grip or a lever is smaller.
 LEAST_MM = 0.1
@@ -84,6 +84,10 @@ def either(one: str, other: str) -> Any:
     return model_validator(mode="after")(check)
 
 
-def load_yaml_model(path: str | Path, model: type[Model]) -> Model:
-    """Return a YAML file's content as a pydantic model; raises UserError with every mistake."""
-    return load_model(Path(path), model, UserError, model.what)
+def load_yaml_model(path: str | Path, model: type[Model], values: Mapping[str, str] | None = None) -> Model:
+    """Return a YAML file's content as a pydantic model; raises UserError with every mistake.
+
+    `values` replace some of the content: YAML by its keys, such as `loop.kp`.
+    """
+    document = Document.read(Path(path), UserError, model.what)
+    return (document.with_values(values) if values else document).model(model)

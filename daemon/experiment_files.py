@@ -9,7 +9,9 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
+from typing import TypeVar
 
 import structlog
 
@@ -25,6 +27,9 @@ from shearloop.yaml_files import MOST_BYTES, Document, shown
 READ_WITHIN_S = 5.0
 # Of a path in a message.
 _LONGEST_NAME = 300
+# Files of a folder that are looked at for the list.
+MOST_LISTED = 500
+Found = TypeVar("Found")
 
 
 class InvalidExperimentError(UserError):
@@ -82,30 +87,49 @@ class ExperimentFiles:
     _reading: threading.Thread | None = field(default=None, init=False)
 
     async def read(self, path: Path) -> ReadExperiment:
-        """Return the experiment of a file; raises UserError without the file's content, at the latest after 5 s.
+        """Return the experiment of a file; raises UserError without the file's content, at the latest after 5 s."""
+        return await self._in_thread(lambda: self._read(path), str(path))
 
-        It is read in a thread, one at a time: no file keeps the event loop, or the threads of others, from working.
-        """
+    async def list(self) -> dict[str, str]:
+        """Return the names of the valid experiments in `folders` and below them, by path; raises UserError."""
+        return await self._in_thread(self._list, "the folders of experiments")
+
+    async def _in_thread(self, work: Callable[[], Found], what: str) -> Found:
+        """Return what a thread finds, one at a time: no file keeps the event loop, or others' threads, from working."""
         if self._reading is not None and self._reading.is_alive():
             raise UserError("the file of another start is being read; wait for its end")
         loop = asyncio.get_running_loop()
-        result: asyncio.Future[ReadExperiment] = loop.create_future()
+        result: asyncio.Future[Found] = loop.create_future()
         # A daemon thread: a drive that does not answer must not keep the process alive.
         reading = self._reading = threading.Thread(
-            target=_run, args=(lambda: self._read(path), loop, result), name="experiment", daemon=True
+            target=_run, args=(work, loop, result), name="experiment", daemon=True
         )
         reading.start()
         try:
             await asyncio.wait({result}, timeout=READ_WITHIN_S)
             if not result.done():
                 cure = "copy it to a local drive"
-                raise UserError(f"{path}: the experiment was not read within {READ_WITHIN_S:g} s; {cure}")
+                raise UserError(f"{what}: the experiment was not read within {READ_WITHIN_S:g} s; {cure}")
         finally:
             # Nobody waits for what comes later.
             result.cancel()
         # Nothing is left for it to do.
         reading.join()
         return result.result()
+
+    def _list(self) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for folder in self.folders:
+            own = folder.resolve()
+            # A link may lead elsewhere.
+            paths = (path for path in own.rglob("*.yaml") if path.is_file() and path.resolve().is_relative_to(own))
+            for path in sorted(islice(paths, MOST_LISTED)):
+                # Configurations lie beside experiments; what `start` would refuse is not offered.
+                with suppress(UserError, OSError):
+                    document = Document.parse(path, read_file(path, MOST_BYTES), UserError, ExperimentFile.what)
+                    if isinstance(document.content, dict) and "steps" in document.content:
+                        found[str(path)] = _checked(document, self.robot, self.gripper).name
+        return found
 
     def _read(self, named: Path) -> ReadExperiment:
         name = str(named) if len(str(named)) <= _LONGEST_NAME else shown(str(named))
@@ -132,9 +156,7 @@ class ExperimentFiles:
         return ReadExperiment(path, file, data)
 
 
-def _run(
-    read: Callable[[], ReadExperiment], loop: asyncio.AbstractEventLoop, result: "asyncio.Future[ReadExperiment]"
-) -> None:
+def _run(read: Callable[[], Found], loop: asyncio.AbstractEventLoop, result: "asyncio.Future[Found]") -> None:
     """Read in a thread, and hand the result or the error to the event loop, if it still waits for it."""
     try:
         found, error = read(), None

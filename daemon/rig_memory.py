@@ -1,10 +1,12 @@
 """What must outlive the daemon's process: a stop, the experiment that runs, and the grip; a file for each robot."""
 
 import asyncio
+import contextlib
+import fcntl
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import structlog
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.errors import UserError
 
 VERSION = 1
 # The file follows the loop's state at this interval, besides the start of each experiment.
@@ -113,6 +116,32 @@ def memory_path(host: str) -> Path:
         state = os.environ.get("XDG_STATE_HOME", "")
         folder = str((Path(state) if os.path.isabs(state) else Path.home() / ".local" / "state") / "shearloop")
     return Path(folder) / f"robot-{re.sub(r'[^A-Za-z0-9.-]', '_', host)}.json"
+
+
+@contextlib.contextmanager
+def sole_driver(host: str) -> Iterator[None]:
+    """Keep other daemons of this user away from a robot; raises UserError if one of them has it.
+
+    Two daemons would share the robot's memory, and neither would know of the other's stops and grips. The lock ends
+    with the process, however that ends. Where the file cannot be made, no experiment starts, and nothing is locked.
+    """
+    path = memory_path(host).with_suffix(".lock")
+    with contextlib.ExitStack() as opened:
+        with contextlib.suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = opened.enter_context(path.open("a+", encoding="utf-8"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                raise UserError(
+                    f"the robot at {host} is driven by another daemon of this computer (process {file.read()}): "
+                    "stop that one first, with `shearloop command stop`, or name another robot in the configuration"
+                ) from None
+            file.truncate(0)
+            file.write(str(os.getpid()))
+            file.flush()
+        yield
 
 
 def read_memory(path: Path) -> Remembered:

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import platform
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -104,8 +105,9 @@ class HealthReporter:
     clock: Clock
     # Every device is emulated.
     emulated: bool = False
-    # Why `tare` is refused now, or None.
-    tare_refusal: Callable[[], str | None] = lambda: None
+    rig: str = ""
+    # Why each of some commands is refused now, or None.
+    refusals: dict[str, Callable[[], str | None]] = field(default_factory=dict)
     reporters: dict[str, Reporter] = field(default_factory=dict)
 
     def tasks(self) -> dict[str, TaskFacts]:
@@ -114,6 +116,9 @@ class HealthReporter:
         for name, reporter in self.reporters.items():
             gathered[name] = {**gathered.get(name, {}), **_facts(reporter)}
         return gathered
+
+    def _refusal(self, command: str) -> str:
+        return (self.refusals[command]() or "") if command in self.refusals else ""
 
     def publish_end(self, *, finished: bool, summary: str) -> None:
         """Publish that the daemon ends, as its last message."""
@@ -144,8 +149,12 @@ class HealthReporter:
                 source="daemon",
                 t_mono_ns=self.clock.now_ns(),
                 tasks=self.tasks(),
+                host=platform.node(),
+                rig=self.rig,
                 emulated=self.emulated,
-                tare_refusal=self.tare_refusal() or "",
+                tare_refusal=self._refusal("tare"),
+                start_refusal=self._refusal("start"),
+                release_refusal=self._refusal("release"),
                 loop_lag_s=lag_s,
                 memory_mb=resident_memory_mb(),
                 cpu_percent=100.0 * used_s / passed_s,

@@ -16,10 +16,10 @@ from shearloop.words import counted
 if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, EmulatorConfig, SkinConfig
     from shearloop.daemon.control.experiment_schema import Mistake
+    from shearloop.daemon.control.plan import Plan
     from shearloop.daemon.sensing.frame_estimator import FrameEstimator
     from shearloop.drivers.robotiq.models import GripperModel
     from shearloop.drivers.ur.settings import UrLimits, UrSettings
-    from shearloop.tools.plan import Plan
     from shearloop.yaml_files import Document
 
 # Raises UserError for an emulator of a configuration that cannot be started; the emulators are no affair of this room.
@@ -128,7 +128,7 @@ def _add_plan(
 ) -> None:
     """Add the plan of an experiment whose keys and values are valid."""
     from shearloop.daemon.control.experiment_schema import ExperimentFile
-    from shearloop.tools.plan import plan_of
+    from shearloop.daemon.control.plan import plan_of
 
     refused: dict[int, tuple[str, ...]] = {}
     for (section, *place), why in mistakes:

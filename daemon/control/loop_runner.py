@@ -743,6 +743,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         tool_mm=experiment.file.tool_mm if experiment is not None else None,
         torque_source=driving,
         torque_nm=latest.torque_nm if latest is not None else None,
+        torque_limit_nm=experiment.limits.torque_nm if experiment is not None else None,
         set_point_nm=controller.set_point_nm if controller is not None else None,
         ramp_nm=controller.ramp_nm if controller is not None else None,
         filtered_torque_nm=controller.torque_nm if controller is not None else None,

@@ -109,9 +109,14 @@ def pulse_response(model: LoopModel, lag_s: float = 0.0) -> FloatArray:
     start_s = model.age_s + 0.5 * period + lag_s
     count = math.ceil((float(t_s[-1]) + start_s + 0.5 * model.window_s) / model.sample_period_s) + 2
     middle_s = np.arange(count, dtype=np.float64) * model.sample_period_s - start_s
-    if middle_s[0] + 0.5 * model.window_s > 1e-9:
+    if _sees_its_own_correction(model, lag_s):
         raise ValueError(f"a torque that is {model.age_s:g} s old cannot be the mean over {model.window_s:g} s")
     return np.diff(window_means(t_s, angle, middle_s, model.window_s), prepend=0.0)
+
+
+def _sees_its_own_correction(model: LoopModel, lag_s: float = 0.0) -> bool:
+    """Return whether a torque would arrive before its acquisition has ended."""
+    return 0.5 * model.window_s - (model.age_s + 0.5 * model.command_period_s + lag_s) > 1e-9
 
 
 def gain_limit(model: LoopModel, highest: float = 4.0) -> float:
@@ -267,6 +272,12 @@ def passing_gain(model: LoopModel, config: LoopConfig) -> float | None:
 def margin_refusal(settings: ControllerSettings, found: ToolModel, config: LoopConfig) -> str | None:
     """Return None for a controller with the required margins, else a sentence with the margins and the cure."""
     model = loop_model(settings, found)
+    if _sees_its_own_correction(model):
+        return (
+            f"controller refused: its torques arrive {found.age_s:.3g} s after the middle of their acquisition, which "
+            f"is said to take {settings.window_s:.3g} s; give the sensor's true period in the configuration "
+            "(`frame_period_s`, for the load cell `rate_hz`), and identify again"
+        )
     has = margins(model)
     if _passes(has, config, found.sample_period_s):
         return None

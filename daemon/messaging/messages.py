@@ -216,6 +216,7 @@ class LoopState(Message):
     tool_mm: float | None = column("mm", "diameter of the tool, if the experiment names it")
     torque_source: str = column("", "source of the torque that the loop controls")
     torque_nm: float | None = column("N·m", "its latest valid value")
+    torque_limit_nm: float | None = column("N·m", "the experiment stops beyond plus or minus this torque")
     set_point_nm: float | None = column("N·m", "the setpoint at the end of the ramp")
     ramp_nm: float | None = column("N·m", "the setpoint now")
     filtered_torque_nm: float | None = column("N·m", "the torque now, from measurements, wrist angle and stiffness")
@@ -244,6 +245,17 @@ class LoopStop(Message):
     stands_after_s: float | None = column("s", "until the robot measured a standstill; nil if it did not within 5 s")
 
 
+@message("daemon.command", rate_hz=None)
+class DaemonCommand(Message):
+    """A command that the daemon was sent, other than `status`, and its answer."""
+
+    command: str = column("", "name of the command")
+    subject: str = column("", "file of the experiment, or the sensor; empty without one")
+    by: str = column("", "who sent it, as they say themselves; nobody checks it")
+    accepted: bool = column("", "whether it was carried out")
+    reason: str = column("", "why it was refused, in sentences; empty when it was accepted")
+
+
 @message("health", rate_hz=1.0)
 class Health(Message):
     """The state of the process and of each of its tasks."""
@@ -251,8 +263,12 @@ class Health(Message):
     tasks: Mapping[str, Mapping[str, Scalar | Mapping[str, int]]] = column(
         "", "per task: alive, done, restarts, rate_hz, expected_hz, errors by kind, and the latest error in a sentence"
     )
+    host: str = column("", "name of the computer that the daemon runs on")
+    rig: str = column("", "name of the rig: the configuration's `name`, else that of its file")
     emulated: bool = column("", "whether every device is emulated, by `emulated: true` in the configuration")
     tare_refusal: str = column("", "why `tare` is refused now, in a sentence; empty when it is not")
+    start_refusal: str = column("", "why `start` is refused now, whatever the experiment; empty when it is not")
+    release_refusal: str = column("", "why `release` is refused now; empty when it is not")
     loop_lag_s: float = column("s", "how late the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")
     cpu_percent: float = column("%", "of one core since the message before")

@@ -12,6 +12,7 @@ from shearloop.bank.errors import MatchingError
 from shearloop.bank.matching import best_match
 from shearloop.bank.models import MODELS
 from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, DaemonEnd, EitEstimate, EitHeatmap
+from shearloop.daemon.web.event_log import EventLog
 
 # Pairs of topic and source. A rig has nine topics and two fingertips.
 MAX_STREAMS = 64
@@ -60,6 +61,7 @@ class MessageStore:
         # Whether the latest message says that the daemon has ended.
         self._ended = False
         self.refused: Counter[str] = Counter()
+        self._log = EventLog()
 
     def add(self, topic: str, content: Mapping[str, Any], now_s: float) -> None:
         """Store one decoded message that arrived at `now_s`; count invalid ones by kind."""
@@ -79,12 +81,16 @@ class MessageStore:
             self.number += 1
             self._ended = topic == DaemonEnd.topic
             self._stored[topic, source] = StoredMessage(self.number, now_s, text.removeprefix("{"))
+            self._log.add(topic, content, self.number)
             if topic in CHARTED:
                 sample = {key: content.get(key) for key in ("timestamp", *CHARTED[topic])}
                 self._samples.setdefault((topic, source), deque(maxlen=MAX_SAMPLES)).append((now_s, sample))
 
     def batch(self, after: int, now_s: float, **other: Any) -> str:
-        """Return JSON of `other`, and of every message numbered after `after`, oldest first, with its age."""
+        """Return JSON of `other`, and of every message numbered after `after`, oldest first, with its age.
+
+        With them come the events of these messages, and of all that later ones have replaced.
+        """
         stored = sorted(self._stored.values())
         quiet_s = max(0.0, now_s - stored[-1].arrival_s) if stored else None
         messages = ",".join(
@@ -92,7 +98,12 @@ class MessageStore:
             for message in stored
             if message.number > after
         )
-        state = {"quiet_s": quiet_s, "ended": self._ended, "refused": dict(self.refused)}
+        state = {
+            "quiet_s": quiet_s,
+            "ended": self._ended,
+            "refused": dict(self.refused),
+            "events": self._log.after(after),
+        }
         head = page_json({**state, **other})
         return f'{head.removesuffix("}")}, "messages": [{messages}]}}'
 

@@ -27,6 +27,7 @@ from aiohttp import WSCloseCode, web
 from shearloop.bank.fingertip import Fingertip
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys
+from shearloop.daemon.messaging.callers import caller
 from shearloop.daemon.messaging.client import ask, connect
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
@@ -43,6 +44,8 @@ TOKEN_LENGTHS = range(32, 201)
 SHUTDOWN_S = 1.0
 # A daemon that ends together with the viewer is still shown as ended.
 LAST_MESSAGES_S = 0.1
+# Who sends the page's commands, besides the user who serves it.
+PROGRAM = "the live page"
 # Commands that move something, or change what moves it.
 NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock", "release")
 # Those that the page asks about first, with the daemon's question.
@@ -140,11 +143,10 @@ class Bridge:
         finally:
             self._socket.unsubscribe(messages.EitHeatmap.topic)
 
-    async def command(self, name: str, **arguments: bool) -> dict[str, Any]:
+    async def command(self, name: str, **arguments: bool | str) -> dict[str, Any]:
         """Return the daemon's reply to a command; raise UserError without a reply."""
-        return await self._request(
-            {"command": name, **arguments}, UNLOCK_TIMEOUT_S if name in SLOW else COMMAND_TIMEOUT_S
-        )
+        content = {"command": name, "by": caller(PROGRAM), **arguments}
+        return await self._request(content, UNLOCK_TIMEOUT_S if name in SLOW else COMMAND_TIMEOUT_S)
 
     async def stop(self) -> dict[str, Any]:
         """Return the daemon's reply to a stop of all motion; simultaneous calls share one request.
@@ -157,7 +159,7 @@ class Bridge:
         return await asyncio.shield(self._stopping)
 
     async def _request_stop(self) -> dict[str, Any]:
-        content, address = {"command": "stop", "spare_daemon": True}, self._address.commands
+        content, address = {"command": "stop", "by": caller(PROGRAM), "spare_daemon": True}, self._address.commands
         reply = None
         if not needs_keys(address):
             # A local daemon accepts it even without valid keys.
@@ -232,6 +234,7 @@ def make_app(bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str
     app.router.add_get("/", page.index)
     app.router.add_static("/assets", _ASSETS, follow_symlinks=True)
     app.router.add_get("/settings.json", page.settings)
+    app.router.add_get("/experiments.json", page.experiments)
     app.router.add_get("/stream", page.stream)
     app.router.add_post("/stop", page.stop)
     app.router.add_post("/commands/{name}", page.command)
@@ -308,6 +311,10 @@ class _Page:
     async def settings(self, _request: web.Request) -> web.Response:
         return web.json_response(self._settings)
 
+    async def experiments(self, _request: web.Request) -> web.Response:
+        """Return the experiments that `start` may name, and the configured one."""
+        return await self._reply("experiments", self._bridge.command("experiments"))
+
     async def stop(self, _request: web.Request) -> web.Response:
         """Stop all motion; needs no token."""
         structlog.get_logger().info("stop requested")
@@ -321,8 +328,12 @@ class _Page:
         if refusal is not None:
             return self._refuse(*refusal)
         # The first press asks, the second one confirms.
-        confirmed = {"confirmed" if "confirmed" in request.query else "ask": True} if name in ASKED else {}
-        return await self._reply(name, self._bridge.command(name, **confirmed))
+        arguments: dict[str, bool | str] = {}
+        if name in ASKED:
+            arguments["confirmed" if "confirmed" in request.query else "ask"] = True
+        if name == "start" and request.query.get("experiment"):
+            arguments["experiment"] = request.query["experiment"]
+        return await self._reply(name, self._bridge.command(name, **arguments))
 
     async def _reply(self, name: str, requested: Awaitable[dict[str, Any]]) -> web.Response:
         try:
@@ -330,7 +341,7 @@ class _Page:
         except UserError as error:
             return self._refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
-        keys = ("ok", "reason", "stopped", "tared", "experiment", "question")
+        keys = ("ok", "reason", "stopped", "tared", "experiment", "question", "plan", "experiments", "configured")
         content = {key: reply[key] for key in keys if key in reply}
         return web.json_response(content, status=200 if reply.get("ok") else 409)
 

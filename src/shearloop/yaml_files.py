@@ -4,6 +4,7 @@ Each caller names the exception to raise. Its message has a line for each mistak
 allowed: …; did you mean …?`.
 """
 
+import copy
 import math
 import re
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -140,6 +141,43 @@ class Document:
             return _validated(self.content, model, self.path.resolve().parent)
         except ValidationError as error:
             raise self.raises("\n".join(_mistakes(error, model, self.content, str(self.path), self._root))) from error
+
+    def with_values(self, values: Mapping[str, str]) -> Self:
+        """Return the document with other values, given as YAML by their keys, such as `loop.kp` or `steps.0`.
+
+        Sections that are missing are made. Mistakes in the result are named without a line.
+        """
+        content = copy.deepcopy(self.content)
+        for key, text in values.items():
+            try:
+                value = yaml.load(text, _Loader)  # noqa: S506 - it is a SafeLoader
+            except yaml.MarkedYAMLError as error:
+                raise self.raises(f"{key}={text}: the value is not YAML: {_syntax(error)}") from error
+            *sections, last = key.split(".")
+            section = content
+            for number, name in enumerate(sections):
+                section = self._section(section, name, ".".join(sections[:number]))
+            if isinstance(section, list):
+                section[self._index(section, last, ".".join(sections))] = value
+            elif isinstance(section, dict):
+                section[last] = value
+            else:
+                raise self.raises(f"{self.path}: {'.'.join(sections)} is a value, so it has no {last}")
+        return type(self)(self.path, content, self.raises, None)
+
+    def _section(self, section: Any, name: str, key: str) -> Any:
+        if isinstance(section, list):
+            return section[self._index(section, name, key)]
+        if not isinstance(section, dict):
+            raise self.raises(f"{self.path}: {key} is a value, so it has no {name}")
+        if section.get(name) is None:
+            section[name] = {}
+        return section[name]
+
+    def _index(self, section: list[Any], name: str, key: str) -> int:
+        if not (name.isdecimal() and int(name) < len(section)):
+            raise self.raises(f"{self.path}: {key} is a list of {len(section)}, so {name} is not one of its numbers")
+        return int(name)
 
     def located(self, mistakes: Iterable[tuple[tuple[int | str, ...], str]]) -> list[str]:
         """Return `file:line: key: sentence` for each mistake, given by its location in the content."""

@@ -21,7 +21,7 @@ import pytest
 import zmq.asyncio
 
 from shearloop.bank.models import MODELS
-from shearloop.cli import COMMANDS, command_module, main
+from shearloop.cli import COMMANDS, GROUPS, OTHER_SPELLINGS, command_module, main
 from shearloop.cli.bank import MODEL_NAMES
 from shearloop.cli.completion import full_parser
 from shearloop.cli.options import path_of
@@ -185,7 +185,14 @@ def test_a_command_line_mistake_is_one_sentence(arguments, part, mistake):
     [
         ("chart", "the following arguments are required: NAME, --out; NAME is one of speed-accuracy, stability, loop"),
         ("schema", "the following arguments are required: kind; kind is one of configuration, experiment, robot, bank"),
-        ("import", "the following arguments are required: FORMAT; FORMAT is one of mat"),
+        ("recording import", "the following arguments are required: FORMAT; FORMAT is one of mat"),
+        ("recording lsit", "there is no 'lsit'; did you mean list?"),
+        ("recording info", "the following arguments are required: REC"),
+        ("run x.yaml --log-level loud", "there is no 'loud' of --log-level; there are debug, info, warning, error"),
+        ("run x.yaml --set loop.kp", "--set loop.kp is not of the form KEY=VALUE, such as loop.kp=0.5"),
+        ("listen --timeout", "--timeout: expected one argument"),
+        ("command strat", "there is no 'strat'; did you mean status?"),
+        ("command relase", "there is no 'relase'; there are tare, status, experiments, start,"),
         ("bank info", "the following arguments are required: PATH"),
         ("chart scene --out DIR --bnak my.bank", "unrecognized arguments: --bnak my.bank; did you mean --bank?"),
         ("command stauts", "there is no 'stauts'; did you mean status?"),
@@ -196,7 +203,8 @@ def test_a_command_line_mistake_is_one_sentence(arguments, part, mistake):
 def test_a_mistake_in_the_words_names_the_help(arguments, sentence, mistake):
     said = mistake(*arguments.split())
     assert f": {sentence}" in said
-    program = "shearloop bank info" if arguments == "bank info" else f"shearloop {arguments.split()[0]}"
+    nested = arguments in ("bank info", "recording import", "recording info")
+    program = f"shearloop {arguments if nested else arguments.split()[0]}"
     assert said.endswith(f"; see `{program} --help`\n")
 
 
@@ -272,6 +280,41 @@ def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(number, statu
 def test_recording_option_needs_an_emulator(config, mistake):
     said = mistake("run", str(config()), "--recording", "some.mat")
     assert "has no eit-kit among its `emulators`" in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("replay no.mcap", "recording replay"), ("import mat no.mat --out a.mcap", "recording import")]
+)
+def test_other_spellings_work_and_answer_with_the_command(old, new, ran, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first, rest = ran(*old.split(), status=2).err.split("\n", 1)
+    assert first == f"`shearloop {old.split()[0]}` is `shearloop {new}`"
+    assert rest == ran(*new.split(), *old.split()[1:], status=2).err
+    assert set(OTHER_SPELLINGS).isdisjoint(COMMANDS)
+
+
+def test_the_overview_has_every_command_in_one_group(capsys):
+    with pytest.raises(SystemExit):
+        main([])
+    printed = capsys.readouterr().out
+    for group, commands in GROUPS.items():
+        section = printed.partition(f"\n{group}:\n")[2].partition("\n\n")[0]
+        assert [line.split()[0] for line in section.splitlines()] == list(commands)
+
+
+def test_set_replaces_values_of_the_configuration(config, tmp_path, mistake):
+    path = config()
+    found = load_daemon_config(path, {"loop.kp": "0.25", "recording.folder": "kept", "fingertips.right.bank": "b.bank"})
+    assert (found.loop.kp, found.recording.folder) == (0.25, tmp_path / "kept")
+    assert found.fingertips["right"].bank == tmp_path / "b.bank"
+    assert found.publish == load_daemon_config(path).publish
+    for assignment, sentence in (
+        ("loop.kq=1", "loop.kq: is not a known key; allowed: "),
+        ("loop.kp=[1", "loop.kp=[1: the value is not YAML"),
+        ("publish.port=3", "publish is a value, so it has no port"),
+        ("emulators.2.device=rig", "emulators is a list of 0, so 2 is not one of its numbers"),
+    ):
+        assert sentence in mistake("run", str(config(emulators=[])), "--set", assignment)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -586,7 +629,7 @@ def test_a_stop_imports_little():
 
         def reply():
             request, client = daemon.recvfrom(1024)
-            assert msgpack.unpackb(request) == {"command": "stop"}
+            assert msgpack.unpackb(request)["command"] == "stop"
             daemon.sendto(msgpack.packb({"ok": True, "stopped": "one"}), client)
 
         threading.Thread(target=reply, daemon=True).start()

@@ -31,7 +31,7 @@ def matlab() -> bytes:
         ("bank build --config {bank} --out", "a bank"),
         ("bank solve --mesh no --model step --k 1 --sigma 1 --out", "an array of NumPy"),
         ("bank design no.mcap --out", "a configuration"),
-        ("import mat no.mat --out", "a recording"),
+        ("recording import mat no.mat --out", "a recording"),
         ("recording export no.mcap --format mat --out", "a MATLAB file"),
     ],
 )

@@ -1,6 +1,7 @@
 """The whole loop over real ports: the daemon, the real drivers, and the rig played by a process of its own."""
 
 import asyncio
+import json
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
@@ -14,8 +15,11 @@ import yaml
 
 from shearloop.bank.bank_file import Bank
 from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.run_summary import RunSummary
+from shearloop.errors import UserError
 from tests.emulator_process import own_address
 from tests.fixtures.daemons import ask, robot_at, running_daemon, shearloop
 from tests.paper_curve import paper_curve
@@ -104,20 +108,33 @@ class Watcher:
 
 
 @asynccontextmanager
-async def running_rig(
-    path: Path, bank: Path, speed: int = SPEED
-) -> AsyncIterator[tuple[Daemon, Watcher, Callable[[str], None], Callable[..., Any]]]:
+async def emulated_rig(folder: Path, bank: Path, speed: int = SPEED) -> AsyncIterator[asyncio.subprocess.Process]:
     async with shearloop(
-        *("emulate", "rig", "--bank", str(bank), "--run-dir", str(path.parent), "--host", HOST),
+        *("emulate", "rig", "--bank", str(bank), "--run-dir", str(folder), "--host", HOST),
         *("--speed", str(speed), "--paper-sketch", "--unlock-wait-s", "0.2", "--power-on-s", "0.1"),
         stdin=asyncio.subprocess.PIPE,
     ) as rig:
         assert (await rig.stdout.readline()).startswith(b"rig ready")
-        async with running_daemon(path) as daemon:
-            watcher = Watcher(daemon)
-            await watcher.until("robot.state", lambda _: True)
-            await watcher.until("gripper.state", lambda _: True)
-            yield daemon, watcher, lambda line: rig.stdin.write(f"{line}\n".encode()), partial(ask, daemon)
+        yield rig
+
+
+async def truth(rig: asyncio.subprocess.Process) -> dict[str, Any]:
+    """Return what is really so in the rig now."""
+    rig.stdin.write(b"truth\n")
+    while "gripped" not in (said := json.loads(await rig.stdout.readline())):
+        continue
+    return said
+
+
+@asynccontextmanager
+async def running_rig(
+    path: Path, bank: Path, speed: int = SPEED
+) -> AsyncIterator[tuple[Daemon, Watcher, Callable[[str], None], Callable[..., Any]]]:
+    async with emulated_rig(path.parent, bank, speed) as rig, running_daemon(path) as daemon:
+        watcher = Watcher(daemon)
+        await watcher.until("robot.state", lambda _: True)
+        await watcher.until("gripper.state", lambda _: True)
+        yield daemon, watcher, lambda line: rig.stdin.write(f"{line}\n".encode()), partial(ask, daemon)
 
 
 async def started(command: Callable[..., Any], path: str) -> None:
@@ -224,7 +241,9 @@ async def test_a_board_that_is_unplugged_holds_the_wrist(rig_config, tiny_bank, 
         assert state["speed_command_rad_per_s"] == 0.0
 
 
-async def test_nothing_moves_after_a_restart_a_reconnection_and_an_acknowledgement(rig_config, tiny_bank, tmp_path):
+async def test_nothing_moves_after_a_restart_a_reconnection_and_an_acknowledgement(
+    rig_config, tiny_bank, tmp_path, log
+):
     """A tool is gripped, an experiment is configured, the daemon ends in the middle, and nobody asks for a motion."""
     path = experiment(tmp_path, SLOW_TWIST)
     content = {**yaml.safe_load(rig_config.read_text()), "experiment": path}
@@ -234,8 +253,8 @@ async def test_nothing_moves_after_a_restart_a_reconnection_and_an_acknowledgeme
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
         first.stop()
         await first._end.wait()
-        # Its last task ends once the wrist stands.
-        while any(record.alive for record in first.supervisor.records.values()):  # noqa: ASYNC110
+        # It has the robot to itself until it has ended.
+        while "stopped" not in log.said:  # noqa: ASYNC110
             await asyncio.sleep(0.05)
         async with running_daemon(second_config(rig_config)) as daemon:
             again, ask_again = Watcher(daemon), partial(ask, daemon)
@@ -257,3 +276,83 @@ async def test_nothing_moves_after_a_restart_a_reconnection_and_an_acknowledgeme
             reply = await ask_again("release", confirmed=True)
             assert reply["ok"], reply
             assert again.seen["gripper.state"][-1]["width_mm"] > tool["width_mm"] + 50
+
+
+@asynccontextmanager
+async def twisting_process(config: Path, rig: asyncio.subprocess.Process) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run the daemon as a process of its own, which twists a gripped tool."""
+    address = load_daemon_config(config).commands
+    async with shearloop(
+        "run", str(config), stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL
+    ) as own:
+
+        async def command(name: str, **arguments: Any) -> dict[str, Any]:
+            try:
+                return await asyncio.to_thread(send_command, address, {"command": name, **arguments}, 5.0)
+            except (UserError, TimeoutError) as absent:
+                return {"ok": False, "reason": str(absent)}
+
+        while not (await command("start", experiment=experiment(config.parent, SLOW_TWIST)))["ok"]:  # noqa: ASYNC110
+            await asyncio.sleep(0.1)
+        while not ((now := await truth(rig))["gripped"] and abs(now["torque_nm"]) > 0.01):
+            continue
+        yield own
+
+
+async def nothing_moves(watcher: Watcher, rig: asyncio.subprocess.Process, before: dict[str, Any]) -> None:
+    """Two seconds of the robot's states later wrist and fingers are where they were."""
+    last = watcher.seen["robot.state"][-1]["seq"]
+    await watcher.until("robot.state", lambda state: state["seq"] > last + 50)
+    after = await truth(rig)
+    assert after["gripped"]
+    assert after["wrist_rad"] == pytest.approx(before["wrist_rad"], abs=1e-4)
+    assert after["width_mm"] == before["width_mm"]
+
+
+async def standing(rig: asyncio.subprocess.Process) -> dict[str, Any]:
+    """Return the truth once the wrist stands."""
+    before = await truth(rig)
+    while (now := await truth(rig))["wrist_rad"] != before["wrist_rad"] or now["time_s"] < before["time_s"] + 0.3:
+        before = before if now["wrist_rad"] == before["wrist_rad"] else now
+    return now
+
+
+async def test_after_a_kill_with_a_gripped_tool_nothing_moves_and_start_waits_for_unlock(rig_config, tiny_bank):
+    content = {**yaml.safe_load(rig_config.read_text()), "experiment": "experiment.yaml"}
+    rig_config.write_text(yaml.safe_dump(content))
+    second = second_config(rig_config)
+    async with emulated_rig(rig_config.parent, tiny_bank) as rig:
+        async with twisting_process(rig_config, rig) as killed:
+            async with shearloop("run", str(second)) as refused:
+                _, errors = await refused.communicate()
+            assert refused.returncode == 2
+            assert f"is driven by another daemon of this computer (process {killed.pid})" in errors.decode()
+            killed.kill()
+            await killed.wait()
+        still = await standing(rig)
+        async with running_daemon(second) as daemon:
+            watcher, command = Watcher(daemon), partial(ask, daemon)
+            await watcher.until("loop.state", lambda state: "still holds something" in state["reasons"])
+            await watcher.until("robot.state", lambda _: True)
+            await nothing_moves(watcher, rig, still)
+            assert "while 'test' was under way" in (await command("start"))["reason"]
+            assert (await command("unlock"))["ok"]
+            await nothing_moves(watcher, rig, still)
+
+
+async def test_a_daemon_of_another_user_that_gets_the_arm_after_a_kill_moves_nothing(
+    rig_config, tiny_bank, monkeypatch, tmp_path
+):
+    """It keeps its memory elsewhere: the robot's registers lock it out until the first one is killed."""
+    content = {**yaml.safe_load(rig_config.read_text()), "experiment": "experiment.yaml"}
+    rig_config.write_text(yaml.safe_dump(content))
+    async with emulated_rig(rig_config.parent, tiny_bank) as rig, twisting_process(rig_config, rig) as killed:
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+        async with running_daemon(second_config(rig_config)) as daemon:
+            watcher = Watcher(daemon)
+            await watcher.until("gripper.state", lambda _: True)
+            killed.kill()
+            await killed.wait()
+            still = await standing(rig)
+            await watcher.until("robot.state", lambda _: True)
+            await nothing_moves(watcher, rig, still)

@@ -48,6 +48,16 @@ async def test_an_experiment_in_a_folder_or_below_it_is_read_once(folder):
     assert (found.file.name, found.data) == ("one", path.read_bytes())
 
 
+async def test_the_list_has_the_valid_experiments_of_the_folders_alone(folder):
+    (folder / "more").mkdir()
+    valid = write(folder / "more" / "one.yaml", VALID)
+    write(folder / "rig.yaml", {"publish": "ipc:///tmp/x"})
+    write(folder / "wrong.yaml", {"name": "wrong", "steps": [{"do": "wiat"}]})
+    write(folder / "broken.yaml", "name: [")
+    (folder / "link.yaml").symlink_to(write(folder.parent / "secret.yaml", VALID))
+    assert await ExperimentFiles((folder,)).list() == {str(valid): "one"}
+
+
 def linked(folder: Path) -> Path:
     (folder / "link.yaml").symlink_to(write(folder.parent / "secret", SECRET))
     return folder / "link.yaml"

@@ -278,7 +278,8 @@ def _check_index(file: IO[bytes], footer: Footer) -> None:
 
 def _unusable(path: Path, reason: str) -> UserError:
     return UserError(
-        f"{path}: this recording cannot be used: {reason}; record it again, or import it again with `shearloop import`"
+        f"{path}: this recording cannot be used: {reason}; record it again, or import it again with "
+        "`shearloop recording import`"
     )
 
 
@@ -288,6 +289,53 @@ class TopicSummary:
 
     messages: int = 0
     rate_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ListedRecording:
+    """One recording of a folder, times in Unix ns; the keys of `recording list --json`."""
+
+    path: str
+    size_bytes: int
+    closed: bool
+    first_unix_ns: int | None = None
+    duration_s: float | None = None
+    experiments: tuple[str, ...] = ()
+    # Why its index cannot be read; empty where it can, or was never written.
+    unreadable: str = ""
+
+
+def list_recordings(folder: Path) -> list[ListedRecording]:
+    """Return the recordings in a folder and below it, those of a known beginning first and by it.
+
+    Reads the indices only. Raises UserError for a folder that is none.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder} is no folder; `shearloop recording info FILE` shows one recording")
+    paths = [path for path in folder.rglob("*") if path.name.endswith((".mcap", f".mcap{PARTIAL}")) and path.is_file()]
+    return sorted(map(_listed, paths), key=lambda one: (one.first_unix_ns is None, one.first_unix_ns or 0, one.path))
+
+
+def _listed(path: Path) -> ListedRecording:
+    size = path.stat().st_size
+    if path.suffix == PARTIAL:
+        return ListedRecording(str(path), size, closed=False)
+    try:
+        with reading(path), open_file(path) as file:
+            reader = make_reader(file)
+            summary = reader.get_summary()
+            if summary is None or summary.statistics is None:
+                return ListedRecording(str(path), size, closed=False)
+            counts = summary.statistics
+            experiments = [one for one in reader.iter_metadata() if one.name == schema.EXPERIMENT_METADATA]
+    except UserError as error:
+        return ListedRecording(str(path), size, closed=True, unreadable=str(error))
+    first_ns = counts.message_start_time if counts.message_count else None
+    duration_s = (counts.message_end_time - counts.message_start_time) / 1e9
+    names = tuple(one.metadata.get("name", "") for one in experiments)
+    return ListedRecording(
+        str(path), size, closed=True, first_unix_ns=first_ns, duration_s=duration_s, experiments=names
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,7 +4,7 @@ import { TimeChart } from "./chart.js";
 import { colours, onColours } from "./colours.js";
 import { Controls } from "./controls.js";
 import { Link } from "./link.js";
-import { estimatesFirst, FingertipPanel, gripperPanel, healthPanel, isFingertip, loopPanel, robotPanel, shearPanel, torquePanel, wantedNow } from "./panels.js";
+import { estimatesFirst, eventsPanel, FingertipPanel, gripperPanel, headPanel, healthPanel, isFingertip, loopPanel, robotPanel, shearPanel, torquePanel, wantedNow } from "./panels.js";
 import { Series } from "./series.js";
 import { age, byId, number, put, show } from "./text.js";
 
@@ -83,6 +83,16 @@ function fingertips() {
   }
 }
 
+// A phone shows the chart before the buttons that a token permits.
+const phone = matchMedia("(max-width: 640px)");
+
+function arrangeControls() {
+  if (phone.matches) byId("torque").after(byId("controls"));
+  else byId("lead").after(byId("controls"));
+}
+phone.addEventListener("change", arrangeControls);
+arrangeControls();
+
 // Panels move to the column that has room: fingertips stand on the right, two to a column.
 function arrange() {
   const shear = link.get("skin.shear") !== undefined;
@@ -117,6 +127,7 @@ function linkLine() {
 
 function draw() {
   linkLine();
+  headPanel(link);
   loopPanel(link);
   torquePanel(link);
   fingertips();
@@ -126,7 +137,9 @@ function draw() {
   robotPanel(link);
   gripperPanel(link);
   healthPanel(link, drawn);
-  torqueChart.setLines(chartLines());
+  eventsPanel(link, drawn);
+  const loop = link.get("loop.state");
+  torqueChart.setLines(chartLines(), loop && !link.isOld(loop) ? loop.content.torque_limit_nm ?? null : null);
   torqueChart.draw(torques, link.unixNow());
   if (link.get("skin.shear")) {
     shearChart.setLines([{ name: "shear", low: "shear low", high: "shear high", label: "shear force, with its interval", stroke: colours.first, fill: colours.first + BAND, width: 2 }]);

@@ -15,17 +15,42 @@ export class TimeChart {
     this.unit = unit;
     this.least = least;
     this.lines = [];
+    this.limit = null;
     new ResizeObserver(() => this.resize()).observe(element);
     onColours(() => { this.lines = []; });
   }
 
-  setLines(lines) {
-    if (JSON.stringify(lines) === JSON.stringify(this.lines)) return;
+  // `limit` is drawn as lines above and below zero; null for none.
+  setLines(lines, limit = null) {
+    if (JSON.stringify(lines) === JSON.stringify(this.lines) && limit === this.limit) return;
     this.lines = lines;
+    this.limit = limit;
     this.names = lines.flatMap((line) => (line.low ? [line.low, line.high, line.name] : [line.name]));
     this.chart?.destroy();
     this.chart = new uPlot(this.options(lines), [[], ...this.names.map(() => [])], this.element);
-    this.legend.replaceChildren(...lines.map((line) => this.sample(line)));
+    const all = limit === null ? lines : [...lines, { ...this.limitStyle(), label: `limit ±${limit} ${this.unit}` }];
+    this.legend.replaceChildren(...all.map((line) => this.sample(line)));
+  }
+
+  limitStyle() { return { stroke: colours.limit, width: 2, dash: [1, 4] }; }
+
+  drawLimit(chart) {
+    if (this.limit === null) return;
+    const { ctx: pen, bbox } = chart;
+    const { stroke, width, dash } = this.limitStyle();
+    pen.save();
+    pen.strokeStyle = stroke;
+    pen.lineWidth = width * devicePixelRatio;
+    pen.setLineDash(dash.map((length) => length * devicePixelRatio));
+    for (const value of [this.limit, -this.limit]) {
+      const y = chart.valToPos(value, "y", true);
+      if (y < bbox.top || y > bbox.top + bbox.height) continue;
+      pen.beginPath();
+      pen.moveTo(bbox.left, y);
+      pen.lineTo(bbox.left + bbox.width, y);
+      pen.stroke();
+    }
+    pen.restore();
   }
 
   options(lines) {
@@ -51,6 +76,7 @@ export class TimeChart {
       bands,
       legend: { show: false },
       cursor: { show: false },
+      hooks: { draw: [(chart) => this.drawLimit(chart)] },
       scales: {
         x: { time: false, auto: false, range: () => [this.now - SPAN_S, this.now] },
         y: { range: (_, low, high) => this.range(low, high) },
@@ -64,8 +90,16 @@ export class TimeChart {
 
   range(low, high) {
     if (low === null || high === null || !(high >= low)) return [-this.least, this.least];
+    [low, high] = this.withLimit(low, high);
     const room = 0.1 * Math.max(high - low, this.least);
     return [Math.min(low - room, -this.least / 5), Math.max(high + room, this.least)];
+  }
+
+  // The limit on the side of the larger values belongs to the picture, unless it would flatten them.
+  withLimit(low, high) {
+    const reach = Math.max(-low, high, this.least);
+    if (this.limit === null || this.limit > 5 * reach) return [low, high];
+    return high >= -low ? [low, Math.max(high, this.limit)] : [Math.min(low, -this.limit), high];
   }
 
   size() { return { width: Math.max(200, this.element.clientWidth), height: Math.max(120, this.element.clientHeight) }; }

@@ -1,7 +1,7 @@
 // The colours of canvases, from the style sheet's variables; read again when the screen turns dark or light.
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
-const NAMES = ["ink", "panel", "grid", "wanted", "first", "second", "third", "skin"];
+const NAMES = ["ink", "panel", "grid", "wanted", "first", "second", "third", "skin", "limit"];
 
 export const colours = {};
 

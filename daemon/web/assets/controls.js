@@ -8,6 +8,8 @@ const TOKEN_NEEDED = "needs the token: open the address that `shearloop view` pr
 // A daemon answers within milliseconds; `unlock` takes longer.
 const LATE_MS = 65000;
 const STOP_LATE_MS = 4000;
+// An answer goes after so long; that a stop is not confirmed stays.
+const SHOWN_MS = 8000;
 
 export class Controls {
   constructor() {
@@ -49,6 +51,26 @@ export class Controls {
   update(link) {
     this.reasons = refusals(link);
     this.refresh();
+    const heard = link.state() === "live" && link.get("loop.state") !== undefined;
+    if (heard && !this.heard) this.offer();
+    this.heard = heard;
+  }
+
+  // Fill the picker with the experiments that the daemon offers.
+  async offer() {
+    const picker = byId("experiment");
+    let reply;
+    try {
+      reply = await (await fetch("experiments.json", { signal: AbortSignal.timeout(LATE_MS) })).json();
+    } catch {
+      reply = {};
+    }
+    const before = picker.value;
+    const offered = reply.experiments ?? [];
+    picker.replaceChildren(...offered.map(({ path, name }) => new Option(name, path)));
+    const paths = offered.map(({ path }) => path);
+    picker.value = paths.includes(before) ? before : reply.configured || (paths[0] ?? "");
+    show(picker, offered.length > 0);
   }
 
   refresh() {
@@ -71,13 +93,15 @@ export class Controls {
     this.tell("stopping …");
     const reply = await this.ask("stop", {}, STOP_LATE_MS);
     if (reply.ok) this.tell(reply.stopped ? `stopped: ${reply.stopped}` : "stop: nothing was moving");
-    else this.tell(`STOP NOT CONFIRMED: ${reply.reason}. Use the emergency stop of the robot.`, "bad");
+    else this.tell(`STOP NOT CONFIRMED: ${reply.reason}. Use the emergency stop of the robot.`, "bad", true);
   }
 
   // The daemon's question, which `confirm` answers; an empty one is taken away.
-  ask_about(name, question = "") {
+  ask_about(name, question = "", plan = []) {
     this.asked = name;
     put(byId("question-text"), question);
+    put(byId("plan"), plan.join("\n"));
+    show(byId("plan"), plan.length > 0);
     put(byId("confirm"), `Yes, ${name}`);
     show(byId("question"), name !== "");
   }
@@ -85,16 +109,20 @@ export class Controls {
   confirm() {
     const name = this.asked;
     this.ask_about("");
-    if (name && !this.reasons[name]) this.command(name, "?confirmed");
+    if (name && !this.reasons[name]) this.command(name, true, this.picked);
   }
 
-  async command(name, query = "") {
+  // The experiment of a question is that of its confirmation, whatever is picked meanwhile.
+  async command(name, confirmed = false, picked = byId("experiment").value) {
     this.ask_about("");
+    this.picked = picked;
+    const words = [confirmed ? "confirmed" : "", name === "start" && picked ? `experiment=${encodeURIComponent(picked)}` : ""];
+    const query = `?${words.filter(Boolean).join("&")}`;
     this.tell(`${name} …`);
     const reply = await this.ask(`commands/${name}${query}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
     if (reply.ok && reply.question) {
       this.tell("");
-      this.ask_about(name, reply.question);
+      this.ask_about(name, reply.question, reply.plan);
     } else if (reply.ok) this.tell(`${name}: done`);
     else this.tell(`${name} was refused: ${reply.reason}`, "bad");
     // Ask again after a wrong token.
@@ -110,10 +138,12 @@ export class Controls {
     }
   }
 
-  tell(sentence, kind = "") {
+  tell(sentence, kind = "", stays = false) {
     const answer = byId("answer");
     answer.dataset.kind = kind;
     put(answer, sentence);
+    clearTimeout(this.going);
+    if (!stays) this.going = setTimeout(() => put(answer, ""), SHOWN_MS);
   }
 }
 
@@ -135,10 +165,10 @@ function refusals(link) {
   const locked = stopped || link.get("robot.state")?.content.blocked || link.get("gripper.state")?.content.fault;
   return {
     tare: busy || (health?.tare_refusal ?? ""),
-    start: busy || (stopped ? "unlock first" : ""),
+    start: busy || (stopped ? "unlock first" : health?.start_refusal ?? ""),
     pause: idle || (phase === "paused" ? "it is paused" : ""),
     resume: idle || (phase === "running" ? "nothing is paused" : ""),
     unlock: locked ? "" : "nothing is locked",
-    release: busy || (link.get("gripper.state") ? "" : "no gripper answers"),
+    release: busy || (link.get("gripper.state") ? health?.release_refusal ?? "" : "no gripper answers"),
   };
 }

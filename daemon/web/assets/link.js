@@ -6,6 +6,9 @@ const LOST_AFTER_S = 1.0;
 // Messages that are further from now come from a replay; a step back by more than this starts it again.
 const REPLAYED_S = 5.0;
 
+// Lines of the list of what happened.
+const MOST_EVENTS = 200;
+
 const seconds = () => performance.now() / 1000;
 
 export class Link {
@@ -14,6 +17,9 @@ export class Link {
     this.settings = settings;
     this.latest = new Map();
     this.refused = {};
+    // What happened, oldest first; another viewer begins another list.
+    this.events = [];
+    this.eventsOf = 0;
     this.ended = false;
     this.onMessage = onMessage;
     this.batchAt = null;
@@ -35,12 +41,19 @@ export class Link {
     if (batch.first) {
       // Another viewer or daemon: drop all earlier data.
       this.latest.clear();
+      this.events = [];
+      this.eventsOf += 1;
       this.daemonAt = null;
       this.said = null;
     }
     this.batchAt = now;
     this.offset = batch.now - now;
     this.refused = batch.refused;
+    this.events.push(...batch.events);
+    if (this.events.length > MOST_EVENTS) {
+      this.events = this.events.slice(-MOST_EVENTS);
+      this.eventsOf += 1;
+    }
     this.ended = batch.ended;
     for (const message of batch.history) this.onMessage(message);
     if (batch.quiet_s !== null) this.daemonAt = now - batch.quiet_s;
@@ -87,10 +100,8 @@ export class Link {
 
   ageOf(message) { return seconds() - message.at; }
 
-  // Whether a message is stale.
+  // Whether a message is stale; all are once the daemon has ended.
   isOld(message) {
-    const end = this.end();
-    if (end && this.state() === "ended") return end.at - message.at > this.staleAfter(message);
     return this.state() !== "live" || this.ageOf(message) > this.staleAfter(message);
   }
 

@@ -197,16 +197,47 @@ export function gripperPanel(link) {
   put(byId("gripper-current"), number(said.current_ma, 0, "mA"));
 }
 
+// The rig, the computer that it runs on, and the page's title with the state.
+export function headPanel(link) {
+  const health = link.get("health")?.content;
+  show(byId("emulated"), Boolean(health?.emulated));
+  const name = [health?.rig, health?.host && `on ${health.host}`].filter(Boolean).join(" ");
+  put(byId("rig"), name);
+  const title = [stateWord(link), health?.emulated ? "EMULATED" : "", name].filter(Boolean).join(" · ");
+  if (document.title !== title) document.title = title;
+  const alarm = { ended: "ended", dead: "silent", lost: "silent" }[link.state()] ?? (isStopped(link) ? "stopped" : "");
+  if (document.body.dataset.alarm !== alarm) document.body.dataset.alarm = alarm;
+}
+
+const isStopped = (link) => link.get("loop.state")?.content.phase === "stopped";
+
+function stateWord(link) {
+  const loop = link.get("loop.state")?.content;
+  const lost = { ended: "ENDED", dead: "NO DAEMON", lost: "NO VIEWER", connecting: "connecting" }[link.state()];
+  if (lost) return lost;
+  if (!loop) return "no robot";
+  const word = { stopped: "STOPPED", held: "HOLD" }[loop.phase] ?? loop.phase;
+  const holds = loop.phase === "running" && loop.set_point_nm != null;
+  return holds ? `holding ${number(loop.ramp_nm ?? loop.set_point_nm, 2, "N·m", { signed: true })}` : word;
+}
+
 export function healthPanel(link, drawn) {
   const message = link.get("health");
   markAge(byId("health"), link, message);
   if (message === drawn.health) return;
   drawn.health = message;
   const said = message?.content;
-  const tasks = Object.entries(said?.tasks ?? {});
+  const tasks = Object.entries(said?.tasks ?? {}).map(([name, facts]) => taskOf(name, facts));
   const chips = byId("tasks");
   while (chips.children.length > tasks.length) chips.lastElementChild.remove();
-  tasks.forEach(([name, facts], i) => fillChip(chips.children[i] ?? newChip(), name, facts));
+  tasks.forEach((task, i) => fillChip(chips.children[i] ?? newChip(), task));
+  const named = (state) => tasks.filter((task) => task.state === state).map((task) => task.name).join(", ");
+  const [dead, warned] = [named("dead"), named("warned")];
+  const trouble = [dead && `✗ DEAD: ${dead}`, warned && `! errors: ${warned}`].filter(Boolean).join("; ");
+  byId("health").dataset.state = dead ? "dead" : warned ? "warned" : "alive";
+  put(byId("tasks-line"), said ? trouble || `✓ all ${tasks.length} are well` : "–");
+  put(byId("trouble"), trouble);
+  show(byId("trouble"), trouble !== "");
   put(byId("process"), said ? `${number(said.memory_mb, 0, "MB")}, ${number(said.cpu_percent, 1, "%")} of a core, event loop ${number(1000 * said.loop_lag_s, 1, "ms")} late` : "");
 }
 
@@ -216,23 +247,44 @@ function newChip() {
   return chip;
 }
 
-// A chip opens to show what the task reports.
-function fillChip(chip, name, facts) {
+// A task's state, and what it reports.
+function taskOf(name, facts) {
   const dead = facts.alive === false && !facts.done;
   const error = facts.error || facts.last_error || "";
   const [state, text] = dead ? ["dead", `✗ ${name}: DEAD`] : facts.done ? ["done", `✓ ${name}: done`] : facts.error ? ["warned", `! ${name}: error`] : ["alive", `✓ ${name}`];
-  chip.dataset.state = state;
   const rate = facts.rate_hz == null ? "" : `${number(facts.rate_hz, 2)}${facts.expected_hz == null ? "" : ` of ${number(facts.expected_hz, 2)}`} Hz`;
   const errors = Object.entries(facts.errors ?? {}).map(([kind, count]) => `${count} ${kind}`).join(", ");
-  put(chip.querySelector("summary"), text);
   const restarts = facts.restarts ? `restarted ${facts.restarts === 1 ? "once" : `${facts.restarts} times`}` : "";
-  put(chip.querySelector("p"), [rate, errors && `errors: ${errors}`, restarts, error].filter(Boolean).join("; ") || "no errors");
+  const report = [rate, errors && `errors: ${errors}`, restarts, error].filter(Boolean).join("; ") || "no errors";
+  return { name, state, text, report };
+}
+
+function fillChip(chip, { state, text, report }) {
+  chip.dataset.state = state;
+  put(chip.querySelector("b"), text);
+  put(chip.querySelector("p"), report);
+}
+
+// What happened, the latest first.
+export function eventsPanel(link, drawn) {
+  if (drawn.events === link.events.length && drawn.eventsOf === link.eventsOf) return;
+  drawn.events = link.events.length;
+  drawn.eventsOf = link.eventsOf;
+  byId("events").replaceChildren(...[...link.events].reverse().map((event) => {
+    const item = document.createElement("li");
+    item.dataset.kind = event.kind;
+    const time = document.createElement("time");
+    put(time, new Date(1000 * event.timestamp).toLocaleTimeString([], { hour12: false }));
+    item.append(time, ` ${event.text}`);
+    return item;
+  }));
 }
 
 // The loop's phase, and every reason for a hold.
 export function loopPanel(link) {
   const message = link.get("loop.state");
-  const current = message && !link.isOld(message) ? message.content : undefined;
+  // The last state of a daemon that has ended stands struck out.
+  const current = message && (!link.isOld(message) || link.end()) ? message.content : undefined;
   const step = current?.steps ? `, step ${current.step} of ${current.steps}` : "";
   put(byId("phase-name"), current ? `${current.phase}${current.experiment ? `: ${current.experiment}` : ""}${step}` : "–");
   const reasons = current?.reasons ?? "";
@@ -265,7 +317,7 @@ export function loopPanel(link) {
 function stopTimes(stop, current) {
   if (stop?.experiment !== current.experiment) return "";
   const seconds = (value) => (value === null ? "unknown" : `${value.toFixed(3)} s`);
-  return `Standstill after ${seconds(stop.stands_after_s)}: decided ${seconds(stop.decided_after_s)}, sent ${seconds(stop.sent_after_s)}.`;
+  return `After its cause: decided ${seconds(stop.decided_after_s)}, confirmed by the robot's process ${seconds(stop.sent_after_s)}, arm at rest ${seconds(stop.stands_after_s)}.`;
 }
 
 // A reason begins with a small letter and its cure with a capital; split after each full stop before a small letter.

@@ -41,7 +41,7 @@ def readme_commands() -> list[str]:
     section = readme.partition("## Record, replay, calibrate")[2].partition("\n## ")[0]
     found = re.findall(rf"^    ({re.escape(PROGRAM)} .*)$", section, re.MULTILINE)
     names = [command.split()[1] for command in found]
-    assert names == ["run", "run", "replay", "calibrate", "evaluate"]
+    assert names == ["run", "run", "recording", "calibrate", "evaluate"]
     return found
 
 

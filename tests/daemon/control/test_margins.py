@@ -215,6 +215,13 @@ def test_where_no_gain_passes_the_sentence_says_so():
     assert "no gain would pass" in sentence
 
 
+def test_torques_that_arrive_before_their_acquisition_can_have_ended_are_refused_with_the_key():
+    """A board whose frames take less time than the configuration says."""
+    sentence = margin_refusal(replace(SETTINGS, window_s=0.5408), replace(FOUND, age_s=0.12), LoopConfig())
+    assert "its torques arrive 0.12 s after the middle of their acquisition, which is said to take 0.541 s" in sentence
+    assert "`frame_period_s`" in sentence
+
+
 def test_the_model_takes_over_what_was_identified():
     model = loop_model(SETTINGS, replace(FOUND, stiffness_nm_per_rad=0.5, lag_s=0.2))
     assert model.stiffness_ratio == 2.0

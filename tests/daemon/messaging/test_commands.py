@@ -14,7 +14,8 @@ import zmq.asyncio
 
 from shearloop.cli.command import COMMANDS
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commands import Commands
+from shearloop.daemon.commands import EXPERIMENTS, Commands
+from shearloop.daemon.messaging.callers import UNKNOWN, caller, caller_of
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, CommandServer, RequestExecutor
 from shearloop.daemon.messaging.messages import decode, encode
@@ -130,7 +131,38 @@ def test_foreign_messages_are_an_error(tmp_path):
 def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
     server = pytest.importorskip("shearloop.daemon.web.server", reason="the live page needs the extra `view`")
     handled = Commands(rig=None, sensors=None, experiment=None, health=None, daemon_end=None).handlers()
-    assert set(COMMANDS) == set(handled) == {*server.NEEDS_TOKEN, STATUS, STOP}
+    assert set(COMMANDS) == set(handled) == {*server.NEEDS_TOKEN, STATUS, STOP, EXPERIMENTS}
+
+
+async def test_commands_are_told_with_their_answer_and_questions_are_not():
+    told: list[tuple[str, str | None]] = []
+    sensors = SimpleNamespace(tareable={"right": SimpleNamespace(tare=lambda: None)})
+    handlers = Commands(
+        rig=None,
+        sensors=sensors,
+        experiment=None,
+        health=SimpleNamespace(tasks=dict, rig="bench"),
+        daemon_end=asyncio.Event(),
+        tell=lambda answered: told.append((answered.name, answered.refusal)),
+    ).handlers()
+    await handlers["tare"]({"by": "ann"})
+    await handlers[STATUS]({})
+    for name, request_ in (("tare", {"source": "left"}), ("start", {}), ("start", {"ask": True})):
+        with pytest.raises(CommandRefusedError):
+            await handlers[name](request_)
+    assert [name for name, _ in told] == ["tare", "tare", "start"]
+    assert told[0][1] is None
+    assert "there is no sensor 'left' to tare" in str(told[1][1])
+
+
+@pytest.mark.parametrize(
+    ("by", "shown"),
+    [("ann@rig, a script", "ann@rig, a script"), ("a\nb\x1b[2J", "a b\\u001b[2J"), ("", UNKNOWN), (7, UNKNOWN)],
+)
+def test_who_sends_a_command_is_one_printable_line(by, shown):
+    assert caller_of({"by": by}) == shown
+    assert len(caller_of({"by": "x" * 500})) <= 80
+    assert caller("shearloop command").endswith(f"@{os.uname().nodename}, shearloop command")
 
 
 async def test_tare_is_refused_during_an_experiment():

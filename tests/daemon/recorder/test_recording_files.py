@@ -1,6 +1,7 @@
 """Recordings as files: written, read, inspected, repaired, exported, imported."""
 
 import csv
+import json
 import os
 import sys
 from pathlib import Path
@@ -49,6 +50,32 @@ def test_info_shows_the_content(recording, ran, result_of):
     printed = result_of("recording", "info", recording)
     assert printed["topics"]["load.torque"]["messages"] == 4
     assert (printed["closed"], printed["same_code"], printed["size_bytes"]) == (True, True, recording.stat().st_size)
+
+
+def test_list_shows_the_recordings_of_a_folder_with_what_is_known_of_each(recording, tmp_path, ran, mistake):
+    later, torn = tmp_path / "later" / "twist.mcap", tmp_path / "torn.mcap.partial"
+    later.parent.mkdir()
+    with new_recording(later, "a bench") as writer:
+        writer.add_torque(2 * 10**18, 0.1)
+    torn.write_bytes(recording.read_bytes()[:-400])
+    (tmp_path / "other.mcap").write_bytes(b"no recording")
+    lines = ran("recording", "list", tmp_path).out.splitlines()
+    names = [next(word for word in line.split() if ".mcap" in word) for line in lines[1:]]
+    assert [Path(name).relative_to(tmp_path) for name in names] == [
+        Path("twist.mcap"),
+        Path("later/twist.mcap"),
+        Path("other.mcap"),
+        Path("torn.mcap.partial"),
+    ]
+    assert lines[1].split()[3] == "2"
+    assert "this is not an MCAP file, or is empty" in lines[3]
+    assert "not closed, or being written" in lines[4]
+    found = [json.loads(line) for line in ran("recording", "list", tmp_path, "--json").out.splitlines()]
+    assert [one["closed"] for one in found] == [True, True, True, False]
+    assert found[0]["first_unix_ns"] == 10**18
+    assert "is no folder" in mistake("recording", "list", recording)
+    later.unlink()
+    assert "no recording is in this folder" in ran("recording", "list", later.parent).out
 
 
 def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, ran, mistake):

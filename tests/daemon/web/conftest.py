@@ -65,7 +65,7 @@ class FakeDaemon(Killable):
     @property
     def asked(self) -> list[str]:
         """The commands that came, in order."""
-        return (self._folder / "asked").read_text().split()
+        return (self._folder / "asked").read_text().splitlines()
 
     def forget(self) -> None:
         (self._folder / "asked").write_text("")

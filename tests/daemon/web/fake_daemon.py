@@ -54,6 +54,12 @@ def messages() -> dict[str, dict[str, Any]]:
 
 
 MESSAGES = messages()
+EXPERIMENTS = {"/rig/experiments/hold.yaml": "hold 0.10 N·m", "/rig/experiments/loosen.yaml": "loosen"}
+PLAN = [
+    "plan of 'loosen', driven by right:",
+    "   1  grip  closes the fingers",
+    "   2  loosen  clockwise by up to 0.3 N·m",
+]
 COMMANDS = ("tare", "start", "pause", "resume", "unlock", "release", "stop")
 
 
@@ -104,9 +110,10 @@ async def serve(folder: Path) -> None:
     def handler(name: str) -> Callable[[Mapping[str, Any]], Any]:
         async def handle(request: Mapping[str, Any]) -> dict[str, Any]:
             if request.get("ask"):
-                return {"question": f"Really {name}? The first motion is told."}
+                plan = {"plan": PLAN} if name == "start" else {}
+                return {"question": f"Really {name}? The first motion is told.", **plan}
             with (folder / "asked").open("a") as asked:
-                asked.write(f"{name}\n")
+                asked.write(" ".join(filter(None, (name, Path(request.get("experiment", "")).stem))) + "\n")
             refusal = json.loads((folder / "changed").read_text())["refusal"]
             if refusal:
                 raise CommandRefusedError(refusal)
@@ -114,10 +121,13 @@ async def serve(folder: Path) -> None:
 
         return handle
 
+    async def experiments(_request: Mapping[str, Any]) -> dict[str, Any]:
+        found = [{"path": path, "name": name} for path, name in EXPERIMENTS.items()]
+        return {"experiments": found, "configured": next(iter(EXPERIMENTS))}
+
+    handlers = {**{name: handler(name) for name in COMMANDS}, "experiments": experiments}
     with zmq.asyncio.Context() as context:
-        await CommandServer(
-            context, f"ipc://{folder}/commands", {name: handler(name) for name in COMMANDS}, Refusals()
-        ).run()
+        await CommandServer(context, f"ipc://{folder}/commands", handlers, Refusals()).run()
 
 
 if __name__ == "__main__":

@@ -90,18 +90,21 @@ def test_the_page_shows_the_messages_numbers(browsed):
         "#phase-name": "running: hold 0.10 N·m, step 6 of 7",
         "#phase-activity": "holding",
         "#progress-text": "62 %, about 38 s left",
-        "#process": "142 MB, 6.0 % of a core, event loop 1.3 ms late",
     }
     browsed.until_shown(shown)
     chips = browsed.page.locator("#tasks .chip")
-    assert chips.locator("summary").all_inner_texts() == ["! right: error", "✗ loop: DEAD", "✓ experiment: done"]
+    assert chips.locator("b").all_text_contents() == ["! right: error", "✗ loop: DEAD", "✓ experiment: done"]
     assert chips.locator("p").all_text_contents() == [
         "1.85 of 1.85 Hz; errors: 3 wrong length, 1 not a number; restarted 2 times; look at the cable",
         "restarted once; RuntimeError: a bug",
         "no errors",
     ]
-    chips.first.click()
+    assert browsed.text("#tasks-line") == browsed.text("#trouble") == "✗ DEAD: loop; ! errors: right"
+    assert not chips.first.is_visible()
+    browsed.page.click("#health summary")
     browsed.page.wait_for_selector("#tasks .chip p >> nth=0", state="visible")
+    browsed.until_shown({"#process": "142 MB, 6.0 % of a core, event loop 1.3 ms late"})
+    browsed.page.click("#health summary")
     assert "maximum at row 90, column 10, runner-up at row 70, column 30" in str(
         browsed.page.get_attribute(".fingertip .map", "aria-label")
     )
@@ -198,7 +201,9 @@ def test_every_reason_for_a_hold_is_shown(browsed):
                 "#safety-mode": "protective stop (3)",
                 "#gripper-fault": "fault 11: overheated",
                 "#holding-title": "Stopped: stop and keep grip",
-                "#phase-activity": "Standstill after 0.123 s: decided 0.004 s, sent 0.006 s.",
+                "#phase-activity": (
+                    "After its cause: decided 0.004 s, confirmed by the robot's process 0.006 s, arm at rest 0.123 s."
+                ),
                 "#wanted": "–",
                 "#progress-text": "",
             },
@@ -264,3 +269,49 @@ def test_two_fingertips_and_their_combined_estimate(browsed):
     assert browsed.layout()["spilt"] == []
     browsed.viewer.kill()
     browsed.viewer.start()
+
+
+def test_head_and_title_name_rig_computer_emulation_and_state(browsed):
+    page = browsed.open()
+    assert page.title() == "holding +0.09 N·m · bench on rig-pc"
+    assert not page.is_visible("#emulated")
+    assert browsed.text("#rig") == "bench on rig-pc"
+    browsed.daemon.say(health={"emulated": True}, loop={"phase": "stopped", "response": "stop and keep grip"})
+    page.wait_for_function("() => document.title === 'STOPPED · EMULATED · bench on rig-pc'")
+    assert browsed.text("#where") == "EMULATED bench on rig-pc"
+    assert page.evaluate("document.body.dataset.alarm") == "stopped"
+    browsed.daemon.say(loop={"phase": "held", "reasons": REASONS})
+    page.wait_for_function("() => document.title.startsWith('HOLD · ') && document.body.dataset.alarm === ''")
+
+
+def test_limits_are_lines_of_the_chart(browsed):
+    page = browsed.open()
+    count = """async () => {
+      const { colours } = await import('/assets/colours.js');
+      const own = new OffscreenCanvas(1, 1).getContext('2d');
+      own.fillStyle = colours.limit;
+      own.fillRect(0, 0, 1, 1);
+      const [r, g, b] = own.getImageData(0, 0, 1, 1).data;
+      const canvas = document.querySelector('#torque-chart canvas');
+      const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+      let found = 0;
+      for (let i = 0; i < data.length; i += 4) {
+        found += Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b) < 12;
+      }
+      return found > 50;
+    }"""
+    browsed.until("#torque-legend", "limit ±0.25 N·m")
+    page.wait_for_function(count)
+    browsed.daemon.say(loop={"torque_limit_nm": None})
+    page.wait_for_function("() => !document.querySelector('#torque-legend').textContent.includes('limit')")
+    assert not page.evaluate(count)
+
+
+def test_what_happened_survives_a_reload(browsed):
+    page = browsed.open()
+    browsed.daemon.say(loop={"phase": "held", "reasons": REASONS})
+    browsed.until("#events", "holding: the torque estimate is not valid")
+    page.reload()
+    browsed.until("#events", "holding: the torque estimate is not valid")
+    assert "step 6 of 7: hold_torque" in browsed.text("#events")
+    assert "loop is dead: RuntimeError: a bug" in browsed.text("#events")

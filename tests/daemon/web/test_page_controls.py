@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.web.fake_daemon import MESSAGES, REASONS
+from tests.daemon.web.fake_daemon import MESSAGES, PLAN, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
 COMMANDS = ("tare", "start", "pause", "resume", "unlock", "release")
@@ -19,6 +19,8 @@ SIZES = {
 PHASES = [
     ("idle", {}, {"tare", "start", "release"}),
     ("idle", {"health": {"tare_refusal": "its fingers hold something"}}, {"start", "release"}),
+    ("idle", {"health": {"start_refusal": "an unlock is under way"}}, {"tare", "release"}),
+    ("idle", {"health": {"release_refusal": "the arm is moving"}}, {"tare", "start"}),
     ("running", {}, {"pause"}),
     ("paused", {}, {"resume"}),
     ("held", {}, {"pause", "resume"}),
@@ -86,7 +88,7 @@ def test_commands_reach_the_daemon_with_the_token(browsed):
                 assert browsed.daemon.asked == sent, "the first press moves nothing"
                 page.click("#confirm")
             browsed.until("#answer", f"{name}: done")
-            sent.append(name)
+            sent.append("start hold" if name == "start" else name)
     assert browsed.daemon.asked == sent
     browsed.daemon.say(refusal="no experiment is running")
     page.click("[data-command=pause]:enabled")
@@ -107,7 +109,7 @@ def test_the_keyboard_reaches_everything_and_stop_first(browsed):
     browsed.daemon.say(loop={"phase": "idle"})
     page.wait_for_selector("[data-command=tare]:enabled")
     reached: list[dict[str, Any]] = []
-    for _ in range(8):
+    for _ in range(9):
         page.keyboard.press("Tab")
         reached.append(
             page.evaluate(
@@ -118,8 +120,8 @@ def test_the_keyboard_reaches_everything_and_stop_first(browsed):
                 }"""
             )
         )
-    assert [each["name"] for each in reached][:5] == ["stop", "tare", "start", "release", "SUMMARY"]
-    assert all(each["ring"] != "none" for each in reached[:5]), "where the keyboard is can be seen"
+    assert [each["name"] for each in reached][:6] == ["stop", "tare", "experiment", "start", "release", "SUMMARY"]
+    assert all(each["ring"] != "none" for each in reached[:6]), "where the keyboard is can be seen"
     page.focus("#stop")
     page.keyboard.press("Enter")
     browsed.until("#answer", "stopped: hold 0.10 N·m")
@@ -127,6 +129,44 @@ def test_the_keyboard_reaches_everything_and_stop_first(browsed):
     page.keyboard.press("Space")
     browsed.until("#answer", "tare: done")
     assert browsed.daemon.asked == ["stop", "tare"]
+
+
+def test_the_picked_experiment_shows_its_plan_and_is_the_one_that_starts(browsed):
+    page = browsed.open(token=True)
+    browsed.daemon.say(loop={"phase": "idle"})
+    page.wait_for_selector("[data-command=start]:enabled")
+    page.wait_for_selector("#experiment:visible")
+    assert page.locator("#experiment option").all_text_contents() == ["hold 0.10 N·m", "loosen"]
+    page.select_option("#experiment", label="loosen")
+    page.click("[data-command=start]")
+    browsed.until("#plan", "\n".join(PLAN))
+    assert page.is_visible("#plan")
+    page.select_option("#experiment", label="hold 0.10 N·m")
+    page.click("#confirm")
+    browsed.until("#answer", "start: done")
+    assert browsed.daemon.asked == ["start loosen"], "what was asked about, not what was picked after"
+    assert not page.is_visible("#plan")
+
+
+def test_a_refusal_goes_after_some_seconds(browsed):
+    page = browsed.open(token=True)
+    browsed.daemon.say(loop={"phase": "running"}, refusal="no experiment is running")
+    page.click("[data-command=pause]:enabled")
+    browsed.until("#answer", "pause was refused: no experiment is running")
+    page.wait_for_function("() => document.querySelector('#answer').textContent === ''")
+
+
+def test_a_phone_shows_the_chart_on_its_first_screen(browsed):
+    page = browsed.open(token=True)
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.wait_for_function("() => document.querySelector('#torque').nextElementSibling.id === 'controls'")
+    page.wait_for_selector("#torque-chart canvas")
+    page.evaluate("window.scrollTo(0, 0)")
+    box = page.locator("#torque-chart").bounding_box()
+    page.set_viewport_size({"width": 1024, "height": 700})
+    page.wait_for_function("() => document.querySelector('#lead').nextElementSibling.id === 'controls'")
+    assert box["y"] + box["height"] <= 700
+    assert box["height"] >= 200
 
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
@@ -147,7 +187,7 @@ def test_the_page_fits_and_stop_stays_visible(size, browsed):
     assert found["stop"]["height"] >= 70
     assert all(min(button["width"], button["height"]) >= 44 for button in found["buttons"])
     panels = found["panels"]
-    assert len(panels) == 6
+    assert len(panels) == 7
     for n, one in enumerate(panels):
         for other in panels[n + 1 :]:
             apart = one["right"] <= other["left"] or other["right"] <= one["left"]
@@ -170,7 +210,7 @@ def test_a_wide_page_has_no_empty_part_and_begins_with_what_drives_the_loop(chan
     covered = page.evaluate(COVERED)
     boxes = {
         name: page.locator(name).bounding_box()
-        for name in ("#stop", "#tasks .chip >> nth=2", "#torque-source", "#torque-now", "#torque-interval")
+        for name in ("#stop", "#trouble", "#torque-source", "#torque-now", "#torque-interval")
     }
     page.set_viewport_size({"width": 1024, "height": 700})
     assert covered > 0.93
@@ -246,10 +286,15 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     browsed.daemon.kill()
     page.wait_for_timeout(2500)  # longer than a silent daemon stays unnoticed
     assert browsed.text("#link-state") == "✓ DONE"
+    # It looks as ended as it is: nothing that is shown is of now.
+    browsed.until_old(6)
+    assert page.evaluate("document.body.dataset.alarm") == "ended"
+    assert page.title().startswith("ENDED · ")
+    struck = "(id) => getComputedStyle(document.getElementById(id)).textDecorationLine"
+    assert page.evaluate(struck, "torque-now") == page.evaluate(struck, "phase") == "line-through"
     browsed.viewer.kill()
     browsed.until("#link-reason", "the daemon and the viewer have ended; the last values are shown")
     assert browsed.text("#link-state") == "✓ DONE"
-    browsed.until_old(0)
     browsed.daemon.say()
     browsed.daemon.start()
     browsed.viewer.start()
@@ -276,7 +321,7 @@ def test_a_lost_viewer_is_shown_and_reconnects(browsed):
     page.set_viewport_size({"width": 1280, "height": 800})
     found = browsed.layout()
     page.set_viewport_size({"width": 1024, "height": 700})
-    assert (found["spilt"], len(found["panels"])) == ([], 5)
+    assert (found["spilt"], len(found["panels"])) == ([], 6)
 
 
 def test_a_missing_daemon_is_shown_with_the_cure(browsed):

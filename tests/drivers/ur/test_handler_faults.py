@@ -197,6 +197,7 @@ def test_recovery_from_an_emergency_stop_needs_the_button_released():
     flight.arm.be(safety_mode=7, robot_mode=3)
     flight.fly(10)
     assert flight.state.emergency_stop
+    assert "opens and closes its fingers" in flight.state.blocked
     assert "still pressed" in flight.ask(Unlock()).refusal
     flight.arm.be(safety_mode=1)
     flight.fly(10)

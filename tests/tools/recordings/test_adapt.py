@@ -7,7 +7,7 @@ def cylinder(shared, tmp_path, ran):
 
     def imported(name):
         files = [shared / "recordings" / "streams" / "cylinders" / f"{name}_{what}.mat" for what in ("right", "truth")]
-        ran("import", "mat", *files, "--out", tmp_path / f"{name}.mcap")
+        ran("recording", "import", "mat", *files, "--out", tmp_path / f"{name}.mcap")
         return tmp_path / f"{name}.mcap"
 
     return imported

@@ -133,7 +133,7 @@ def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, 
 
 def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_folder, tmp_path, ran, mistake):
     recording, calibration = tmp_path / "a.mcap", tmp_path / "a.cal"
-    printed = ran("import", "mat", mat_folder(), "--out", recording).out
+    printed = ran("recording", "import", "mat", mat_folder(), "--out", recording).out
     assert "60 frames of the right side, 60 frames of the left side, 355 torques" in printed
     ran("calibrate", slices_folder / "torque_slices", "--out", calibration)
     assert "made from slices, and cannot judge raw frames" in mistake("evaluate", calibration, recording)
@@ -231,7 +231,7 @@ def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, t
     assert "slice 5 of 20 mm equals" in refusal
     assert "slice 2 of 20 mm, and 1 more is such a copy; leave copies out" in refusal
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
-    ran("import", "mat", mat_folder(), "--out", first)
+    ran("recording", "import", "mat", mat_folder(), "--out", first)
     second.write_bytes(first.read_bytes())
     assert f"{second} equals {first}; leave copies out" in refused(first, second)
 

@@ -68,7 +68,7 @@ def test_every_way_out_refuses_a_strange_message(form, topic, changes, problem, 
     path = recorded(tmp_path / "x.mcap", *strange)
     if form == "replay":
         arguments = ["--config", config(), "--publish", f"ipc://{tmp_path}/r", "--speed", "max"]
-        said = mistake("replay", path, *arguments)
+        said = mistake("recording", "replay", path, *arguments)
     elif form == "lerobot" and topic == "eit.heatmap.right":
         # A dataset has no heatmaps.
         return

@@ -134,7 +134,7 @@ def spoilt(content: bytes, what: str) -> bytes:
     ("arguments", "damages"),
     [
         (["recording", "export", "{path}"], ["chunk", "index", "cut", "short"]),
-        (["replay", "{path}", "--publish", "{address}"], ["chunk", "configuration", "cut", "short"]),
+        (["recording", "replay", "{path}", "--publish", "{address}"], ["chunk", "configuration", "cut", "short"]),
         (["calibrate", "{path}", "--out", "{out}"], ["chunk", "cut", "short"]),
     ],
 )
@@ -164,8 +164,8 @@ def test_a_wrong_byte_that_all_readers_would_accept_is_found_by_its_checksum(whe
 
 def test_a_check_without_a_comparison_fails(config, imported, tmp_path, ran):
     arguments = ["--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--config", str(config())]
-    assert "Nothing was compared" in ran("replay", imported, *arguments).err
-    assert main(["replay", str(imported), *arguments, "--check"]) == 1
+    assert "Nothing was compared" in ran("recording", "replay", imported, *arguments).err
+    assert main(["recording", "replay", str(imported), *arguments, "--check"]) == 1
 
 
 LINE = [0.25] * PAPER_TABLE.n_line_values
@@ -195,7 +195,7 @@ EVALUATE = ["evaluate", "{calibration}", "{path}"]
 CSV, LEROBOT, SLICES = (
     ["recording", "export", "{path}", "--format", form, "--out", "{out}"] for form in ("csv", "lerobot", "slices")
 )
-REPLAY = ["replay", "{path}", "--speed", "max", "--publish", "{address}"]
+REPLAY = ["recording", "replay", "{path}", "--speed", "max", "--publish", "{address}"]
 INFO = ["recording", "info", "{path}"]
 BARE = json.dumps(CONFIGURATION).encode()
 

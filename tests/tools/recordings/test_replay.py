@@ -113,7 +113,7 @@ def test_a_replay_equals_the_recording_at_any_speed(config, tmp_path, tiny_calib
     changed = yaml.safe_load((tmp_path / "config.yaml").read_text())
     changed["fingertips"]["right"]["average_frames"] = 2
     (tmp_path / "changed.yaml").write_text(yaml.safe_dump(changed))
-    arguments = ["replay", str(path), "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check"]
+    arguments = ["recording", "replay", str(path), "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check"]
     assert "eit.estimate of right, number" in ran(*arguments, "--config", tmp_path / "changed.yaml", status=1).err
 
 
@@ -132,7 +132,7 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, ran: Callabl
         assert again[: len(then)] == then
     zeros = [c for t, c in fast if t == "eit.estimate" and c["reason"].startswith("taking the idle frame, 1 of")]
     assert len(zeros) == 2, "the operator's tare is replayed"
-    errors = ran("replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
+    errors = ran("recording", "replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
     assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in errors
 
 
@@ -179,7 +179,7 @@ def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path):
     ],
 )
 def test_mistakes_end_in_one_sentence(arguments, message, imported, mistake):
-    assert message in mistake("replay", *(one.format(imported=imported) for one in arguments))
+    assert message in mistake("recording", "replay", *(one.format(imported=imported) for one in arguments))
 
 
 def test_nan_is_restored():

@@ -80,7 +80,7 @@ def test_a_skin_replay_gives_equal_forces(tmp_path, socket, average_s, ran):
     reasons = {content["reason"].split(",")[0] for _, content in now}
     assert {"", "taking the zero"} <= reasons
     assert any("gauge 1 is open" in why for why in reasons)
-    said = ran("replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
+    said = ran("recording", "replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
     count = comparison.compared["skin.shear"]
     assert f"skin.shear: {count} of {count} equal the recorded ones" in said
 

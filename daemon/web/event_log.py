@@ -1,0 +1,128 @@
+"""What happened, in lines: steps, holds, faults, stops, commands and by whom. No I/O: it is told each message."""
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from shearloop.daemon.messaging.messages import DaemonEnd
+
+# A page shows no more.
+MAX_EVENTS = 200
+ACTIVE = frozenset({"running", "paused", "held"})
+
+
+@dataclass(slots=True)
+class EventLog:
+    """The latest events of a daemon, each a map of number, timestamp (Unix s), kind and text."""
+
+    events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
+    # The latest message of each topic that tells events by its changes.
+    _before: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def add(self, topic: str, content: Mapping[str, Any], number: int) -> None:
+        """Take a message, and keep what happened since the one before it; `number` is the message's."""
+        tell = _TELLERS.get(topic)
+        if tell is None:
+            return
+        before = self._before.get(topic, {})
+        if topic != DaemonEnd.topic:
+            self._before.pop(DaemonEnd.topic, None)
+        self._before[topic] = content
+        for kind, text in tell(before, content):
+            self.events.append({"number": number, "timestamp": content["timestamp"], "kind": kind, "text": text})
+
+    def after(self, number: int) -> list[dict[str, Any]]:
+        """Return the events of messages numbered after `number`, oldest first."""
+        return [event for event in self.events if event["number"] > number]
+
+
+Told = Iterator[tuple[str, str]]
+
+
+def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+    phase, was = now.get("phase"), before.get("phase")
+    experiment, reasons = now.get("experiment", ""), str(now.get("reasons") or "")
+    begun = phase in ACTIVE and (was not in ACTIVE or before.get("run") != now.get("run"))
+    if begun:
+        yield "step", f"{experiment} runs"
+    if phase in ACTIVE and (begun or before.get("step") != now.get("step")):
+        yield "step", f"step {now.get('step')} of {now.get('steps')}: {now.get('step_name') or now.get('activity')}"
+    if phase == was:
+        return
+    if phase == "held":
+        yield "hold", f"holding: {reasons}"
+    elif phase == "paused":
+        yield "hold", "paused"
+    elif phase == "running" and was in ("held", "paused"):
+        yield "step", "goes on"
+    elif phase == "stopped":
+        yield "stop", f"STOPPED, {now.get('response')}: {reasons or now.get('activity')}"
+    elif phase == "done":
+        yield "step", f"{experiment} is done"
+    elif phase == "idle" and was == "stopped":
+        yield "step", "the stop is acknowledged"
+
+
+def _stop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+    if all(before.get(key, ...) == now.get(key) for key in ("experiment", "decided_after_s", "stands_after_s")):
+        return
+
+    def after(key: str) -> str:
+        value = now.get(key)
+        return f"{value:.3f} s" if isinstance(value, float) else "unknown"
+
+    yield (
+        "stop",
+        f"times of the stop, from its cause: decided {after('decided_after_s')}, confirmed by the robot's process "
+        f"{after('sent_after_s')}, arm at rest {after('stands_after_s')}",
+    )
+
+
+def _command(_before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+    subject = f" {now['subject']}" if now.get("subject") else ""
+    answer = "" if now.get("accepted") else f", REFUSED: {now.get('reason')}"
+    yield "command" if now.get("accepted") else "refusal", f"{now.get('command')}{subject}, by {now.get('by')}{answer}"
+
+
+def _health(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+    earlier = before.get("tasks") or {}
+    for name, facts in (now.get("tasks") or {}).items():
+        was = earlier.get(name, {})
+        dead, error = _dead(facts), facts.get("error") or ""
+        if dead and not _dead(was):
+            yield "fault", f"{name} is dead: {facts.get('last_error') or error or 'no reason is known'}"
+        elif not dead and _dead(was):
+            yield "step", f"{name} runs again"
+        if error and not was.get("error"):
+            yield "fault", f"{name}: {error}"
+
+
+def _dead(facts: Mapping[str, Any]) -> bool:
+    return facts.get("alive") is False and not facts.get("done")
+
+
+def _text_of(key: str) -> Callable[[Mapping[str, Any], Mapping[str, Any]], Told]:
+    """Return what tells a sentence that appears in a key."""
+
+    def tell(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+        if now.get(key) and not before.get(key):
+            yield "fault", str(now[key])
+
+    return tell
+
+
+def _end(before: Mapping[str, Any], _now: Mapping[str, Any]) -> Told:
+    if not before:
+        yield "stop", "the daemon has ended"
+
+
+_TELLERS: Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], Told]] = {
+    "loop.state": _loop,
+    "loop.stop": _stop,
+    "daemon.command": _command,
+    "health": _health,
+    "robot.state": _text_of("blocked"),
+    "gripper.state": _text_of("fault_text"),
+    "daemon.end": _end,
+}

@@ -1,0 +1,100 @@
+"""The list of what happened: one line for each change, whoever asks for it and however often it is said."""
+
+from typing import Any
+
+from shearloop.daemon.web.event_log import MAX_EVENTS, EventLog
+from shearloop.daemon.web.message_store import MessageStore
+
+
+def lines(*told: tuple[str, dict[str, Any]]) -> list[tuple[str, str]]:
+    """Return the kinds and texts of the events of these messages, each said twice."""
+    log = EventLog()
+    for number, (topic, content) in enumerate(told):
+        for again in range(2 if topic != "daemon.command" else 1):
+            log.add(topic, {"timestamp": float(number), **content}, 2 * number + again + 1)
+    return [(event["kind"], event["text"]) for event in log.events]
+
+
+def loop(phase: str, step: int = 1, **changed: Any) -> tuple[str, dict[str, Any]]:
+    state = {"phase": phase, "run": 1, "experiment": "hold", "step": step, "steps": 3, "step_name": "grip"}
+    return "loop.state", {**state, "reasons": "", "response": "note", **changed}
+
+
+def test_steps_holds_and_stops_are_told_once_each():
+    assert lines(
+        loop("idle"),
+        loop("running"),
+        loop("running", 2),
+        loop("held", 2, reasons="the torque is not valid. Wait."),
+        loop("held", 2, reasons="the torque is not valid. Wait for 0.3 s."),
+        loop("running", 2),
+        loop("stopped", 2, reasons="the operator stopped it.", response="stop and keep grip"),
+        loop("idle", 2),
+        loop("running", run=2),
+        loop("done", run=2),
+    ) == [
+        ("step", "hold runs"),
+        ("step", "step 1 of 3: grip"),
+        ("step", "step 2 of 3: grip"),
+        ("hold", "holding: the torque is not valid. Wait."),
+        ("step", "goes on"),
+        ("stop", "STOPPED, stop and keep grip: the operator stopped it."),
+        ("step", "the stop is acknowledged"),
+        ("step", "hold runs"),
+        ("step", "step 1 of 3: grip"),
+        ("step", "hold is done"),
+    ]
+
+
+def test_commands_are_told_with_who_sent_them_and_why_they_were_refused():
+    sent = {"command": "start", "subject": "hold.yaml", "by": "ann@rig, the live page", "accepted": True, "reason": ""}
+    refused = {**sent, "command": "tare", "subject": "", "accepted": False, "reason": "something is held"}
+    assert lines(("daemon.command", sent), ("daemon.command", refused), ("daemon.command", refused)) == [
+        ("command", "start hold.yaml, by ann@rig, the live page"),
+        *[("refusal", "tare, by ann@rig, the live page, REFUSED: something is held")] * 2,
+    ]
+
+
+def test_faults_of_tasks_and_devices_and_the_end_are_told():
+    alive, dead = {"alive": True, "error": ""}, {"alive": False, "last_error": "RuntimeError: a bug"}
+    times = {"experiment": "hold", "decided_after_s": 0.004, "sent_after_s": 0.006, "stands_after_s": None}
+    assert lines(
+        ("health", {"tasks": {"loop": alive, "right": alive}}),
+        ("health", {"tasks": {"loop": dead, "right": {**alive, "error": "look at the cable"}}}),
+        ("health", {"tasks": {"loop": alive, "right": alive}}),
+        ("robot.state", {"blocked": "it is in a protective stop"}),
+        ("gripper.state", {"fault_text": "no current"}),
+        ("loop.stop", times),
+        ("daemon.end", {}),
+    ) == [
+        ("fault", "loop is dead: RuntimeError: a bug"),
+        ("fault", "right: look at the cable"),
+        ("step", "loop runs again"),
+        ("fault", "it is in a protective stop"),
+        ("fault", "no current"),
+        (
+            "stop",
+            "times of the stop, from its cause: decided 0.004 s, confirmed by the robot's process 0.006 s, "
+            "arm at rest unknown",
+        ),
+        ("stop", "the daemon has ended"),
+    ]
+
+
+def test_a_page_that_is_opened_anew_gets_all_of_them_and_an_open_one_the_new_ones():
+    store = MessageStore(4.0)
+    content = {"timestamp": 1.0, "seq": 0, "source": "loop", "t_mono_ns": 1}
+    store.add("loop.state", {**content, **loop("running")[1]}, 1.0)
+    seen = store.number
+    store.add("loop.state", {**content, **loop("running", 2)[1]}, 1.1)
+    assert "step 1 of 3" in store.batch(0, 2.0)
+    assert "step 1 of 3" not in store.batch(seen, 2.0)
+    assert "step 2 of 3" in store.batch(seen, 2.0)
+
+
+def test_only_the_latest_events_are_kept():
+    log = EventLog()
+    for number in range(MAX_EVENTS + 5):
+        log.add("daemon.command", {"timestamp": 0.0, "command": f"c{number}", "accepted": True, "by": "x"}, number)
+    assert len(log.events) == MAX_EVENTS
+    assert log.events[0]["text"].startswith("c5,")

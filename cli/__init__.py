@@ -51,6 +51,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "ports": Command("ports", "list the serial ports with their serial numbers"),
         "check": Command("check", "check a configuration and the files it names, or print an experiment's plan"),
         "doctor": Command("doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
+        "commission": Command("commission", "measure what a real rig is and does, stage after stage, into a report"),
         "install": Command("install", "install the daemon as a service of this computer"),
         "uninstall": Command("install", "remove the service"),
         "keys": Command("keys", "make the keys for daemon and clients on a network"),

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import add_cluster, add_json, add_option, number, time_range
+from shearloop.cli.options import add_cluster, add_json, add_option, add_recipe, check_recipe, number, time_range
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError, missing
 from shearloop.estimation.defaults import LOADED_NM
+from shearloop.estimation.estimator_names import DEFAULT
 from shearloop.tools.outputs import writing
 from shearloop.words import counted
 
@@ -43,8 +44,12 @@ _MEANINGS = {
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    add_option(parser, "calibration", Path, "CAL", "made by `shearloop calibrate`")
-    add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices", nargs="+")
+    add_option(parser, "calibration", Path, "CAL", "made by `shearloop calibrate`; with --leave-out a recording")
+    # At least one without --leave-out, which `run` checks.
+    add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices", nargs="*")
+    text = "make a calibration without each of these in turn, and judge it there: no CAL, all are recordings"
+    parser.add_argument("--leave-out", choices=("grips", "twists", "levels", "tools"), help=text)
+    add_recipe(parser)
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     text = "share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
     add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
@@ -77,6 +82,11 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
 
+    if args.leave_out is not None:
+        return _leave_out(args)
+    if not args.recordings:
+        raise UserError("name recordings after the calibration, or judge a recipe with --leave-out")
+    _refuse_recipe(args)
     if args.out is not None and args.out.suffix not in _FIGURES:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
     if args.estimates is not None:
@@ -109,6 +119,57 @@ def run(args: argparse.Namespace) -> int:
         frames = f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}"
         sentences.append(f"{frames}: {reason.sentence}")
     return print_result({**by_load, **figures}, sentences, as_json=args.json)
+
+
+def _refuse_recipe(args: argparse.Namespace) -> None:
+    """Raise UserError for an option of a recipe: a calibration is made already."""
+    for option, given in (
+        ("--estimator", args.estimator != DEFAULT),
+        ("--mesh", args.mesh is not None),
+        ("--sides", args.sides is not None),
+        ("--load-cell-delay-s", args.load_cell_delay_s is not None),
+        ("--tool-mm", args.tool_mm is not None),
+        ("--assume-full-range", args.assume_full_range),
+    ):
+        if given:
+            raise UserError(f"{option} is for --leave-out: the calibration is made already; leave it out")
+
+
+def _leave_out(args: argparse.Namespace) -> int:
+    """Judge a recipe by what is left out of it, and print."""
+    from shearloop.tools.calibrate import read_parts
+    from shearloop.tools.evaluate import figures_by_load, figures_of, invalid_reasons, write_estimates
+    from shearloop.tools.leave_out import Recipe, judge_left_out, sentences_of
+    from shearloop.tools.outputs import check_overwrite
+    from shearloop.tools.parallel import open_executor
+
+    paths = [args.calibration, *args.recordings]
+    check_recipe(args, paths)
+    if args.plot or args.out is not None:
+        raise UserError("--plot and --out draw one calibration; leave them out with --leave-out")
+    if args.estimates is not None:
+        check_overwrite(args.estimates, "a table")
+    read = read_parts(
+        paths, time_range=args.time_range, sides=args.sides, load_cell_delay_s=args.load_cell_delay_s,
+        tool_mm=args.tool_mm,
+    )  # fmt: skip
+    bank, mesh = (None if path is None else path.resolve() for path in (args.bank, args.mesh))
+    recipe = Recipe(args.estimator, bank, mesh, read.timing.uncertainty_s, full_range=args.assume_full_range)
+    with open_executor(args.cluster) as pool:
+        found = judge_left_out(args.leave_out, recipe, read.parts, [path.name for path in read.paths], pool)
+    if args.estimates is not None:
+        names = [name for name, tracks in zip(found.names, found.tracks, strict=True) for _ in tracks]
+        with writing(args.estimates, "the estimates"):
+            write_estimates(found.all_tracks, names, args.estimates)
+    for doubt in read.doubts:
+        print(f"Warning: {doubt}.", file=sys.stderr)
+    figures = found.figures(args.loaded_nm)
+    by_load = figures_by_load(found.all_tracks, args.loaded_nm)
+    sentences = _lines({**by_load, "all": figures_of(found.all_tracks)})
+    for reason in invalid_reasons(found.all_tracks):
+        frames = f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}"
+        sentences.append(f"{frames}: {reason.sentence}")
+    return print_result(figures, [*sentences, *sentences_of(found, args.loaded_nm)], as_json=args.json)
 
 
 def _lines(columns: "Mapping[str, Figures]") -> list[str]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from shearloop.daemon.messaging import addresses
 from shearloop.errors import UserError
+from shearloop.estimation.estimator_names import DEFAULT, ESTIMATORS
 from shearloop.files import expanded_path
 
 if TYPE_CHECKING:
@@ -113,6 +114,43 @@ def run_action(args: argparse.Namespace) -> int:
 def add_json(parser: argparse._ActionsContainer) -> None:
     """Add `--json` to a parser or a group."""
     parser.add_argument("--json", action="store_true", help="print the result as JSON, and nothing else, on stdout")
+
+
+def add_recipe(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how a calibration is made, besides `--bank`; `check_recipe` checks them."""
+    text = "estimator to calibrate (default: %(default)s)"
+    parser.add_argument("--estimator", choices=ESTIMATORS, default=DEFAULT, help=text)
+    add_option(parser, "--mesh", Path, "FILE", "a mesh, which the estimator reconstruction needs")
+    add_option(parser, "--sides", _sides, "SIDE[,SIDE]", "sides to use, e.g. right (default: all)")
+    text = "delay of the load cell's timestamps, which is subtracted; 0 accepts them unchecked"
+    add_option(parser, "--load-cell-delay-s", DELAY_S, "S", text)
+    text = "no torque will exceed the slices: intervals do not extend beyond them"
+    parser.add_argument("--assume-full-range", action="store_true", help=text)
+    text = "diameter of the tool in recordings that do not name it; on another tool there is no torque"
+    add_option(parser, "--tool-mm", TOOL_MM, "MM", text)
+
+
+def _sides(text: str) -> tuple[str, ...]:
+    from shearloop.daemon.recorder.schema import SIDES
+
+    sides = tuple(text.split(","))
+    if not set(sides) <= set(SIDES) or len(set(sides)) < len(sides):
+        raise argparse.ArgumentTypeError(f"{text} is not {' or '.join(SIDES)}, or both with a comma between")
+    return sides
+
+
+def check_recipe(args: argparse.Namespace, recordings: Sequence[Path]) -> None:
+    """Raise UserError for an option that has no effect on these recordings or folders of slices."""
+    folders = [path.is_dir() for path in recordings]
+    if args.assume_full_range and not all(folders):
+        raise UserError("--assume-full-range is for slices; leave it out for recordings")
+    for option, given, why in (
+        ("--load-cell-delay-s", args.load_cell_delay_s, "each slice holds its torque itself"),
+        ("--tool-mm", args.tool_mm, "a calibration of slices knows no tool"),
+        ("--sides", args.sides, "slices do not name their side"),
+    ):
+        if given is not None and any(folders):
+            raise UserError(f"{option} is for recordings: {why}; leave it out")
 
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:

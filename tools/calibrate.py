@@ -1,6 +1,7 @@
 """Calibrates an estimator on recordings."""
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,9 @@ class CalibrationResult:
     timing: LoadTiming = TRUSTED
     doubts: Sequence[str] = ()
     tools: Sequence[Measured] = ()
+    # The parts of recordings that it was fitted to, and the time in s that the fit took.
+    parts: Sequence[FrameSeries] = ()
+    fit_s: float = 0.0
 
     @property
     def regressor(self) -> IntervalRegressor | None:
@@ -89,6 +93,38 @@ def calibrate(
     no torque will exceed the slices. Raises UserError for recordings that are given twice, and CalibrationError for
     those that determine no calibration.
     """
+    read = read_parts(paths, time_range=time_range, sides=sides, load_cell_delay_s=load_cell_delay_s, tool_mm=tool_mm)
+    source = _source(paths, time_range, load_cell_delay_s)
+    begun = time.perf_counter()
+    calibration = fit(estimator, read.parts, source, physics, timing=read.timing, full_range=assume_full_range)
+    fit_s = time.perf_counter() - begun
+    frames = sum(len(one.t_s) for one in read.parts)
+    tools = distinct([one.tool_mm for one in read.parts if one.tool_mm is not None])
+    return CalibrationResult(calibration, frames, read.timing, read.doubts, tools, read.parts, fit_s)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadParts:
+    """Parts of recordings to calibrate on, the path of each, the load cell's timing, and named doubts about it."""
+
+    parts: Sequence[FrameSeries]
+    paths: Sequence[Path]
+    timing: LoadTiming
+    doubts: Sequence[str]
+
+
+def read_parts(
+    paths: Sequence[Path],
+    *,
+    time_range: tuple[float, float],
+    sides: tuple[str, ...] | None = None,
+    load_cell_delay_s: float | None = None,
+    tool_mm: float | None = None,
+) -> ReadParts:
+    """Return what `calibrate` fits to these shares (0 to 1) of recordings or of folders of slices.
+
+    Raises UserError for recordings that are given twice, and CalibrationError for a load cell with a wrong clock.
+    """
     check_paths_differ(paths)
     chosen: list[tuple[Path, FrameSeries]] = []
     others: list[tuple[str, FrameSeries]] = []
@@ -113,13 +149,10 @@ def calibrate(
     if all_live:
         # One clock stamped frames and torques as they arrived, whatever the motion shows.
         timing = replace(timing, uncertainty_s=0.0)
-    source = _source(paths, time_range, load_cell_delay_s)
-    calibration = fit(estimator, parts, source, physics, timing=timing, full_range=assume_full_range)
     named = [*((path.name, one) for path, one in chosen), *others]
     warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]
     doubts = [f"{name}: {why}" for name, one in named for reference, why in warned if one is reference]
-    tools = distinct([one.tool_mm for one in parts if one.tool_mm is not None])
-    return CalibrationResult(calibration, sum(len(one.t_s) for one in parts), timing, doubts, tools)
+    return ReadParts(parts, [path for path, _ in chosen], timing, doubts)
 
 
 def adapt_to_recordings(

@@ -40,10 +40,14 @@ class EstimateTrack:
 
     def since(self, first_frame: int) -> "EstimateTrack":
         """Return the part from a frame of the recording on."""
-        first = first_frame - self.series.first_frame
-        series = self.series.between(first, len(self.estimates))
-        profile_nm = None if self.profile_nm is None else self.profile_nm[first:]
-        return EstimateTrack(series, self.estimates[first:], self.latency_ms[first:], profile_nm)
+        return self.between(first_frame - self.series.first_frame, len(self.estimates))
+
+    def between(self, first: int, stop: int) -> "EstimateTrack":
+        """Return rows `first` to `stop`."""
+        profile_nm = None if self.profile_nm is None else self.profile_nm[first:stop]
+        return EstimateTrack(
+            self.series.between(first, stop), self.estimates[first:stop], self.latency_ms[first:stop], profile_nm
+        )
 
 
 def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> EstimateTrack:

@@ -2,13 +2,14 @@
 
 import argparse
 import math
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, time_range
+from shearloop.cli.options import add_json, add_option, add_recipe, check_recipe, time_range
 from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
-from shearloop.estimation.estimator_names import DEFAULT, ESTIMATORS
+from shearloop.estimation.estimator_names import DEFAULT
 from shearloop.tools.outputs import check_overwrite
 
 if TYPE_CHECKING:
@@ -16,38 +17,23 @@ if TYPE_CHECKING:
     from shearloop.estimation.interval_regressor import IntervalRegressor
     from shearloop.tools.calibrate import CalibrationResult
 
+# Refits for what is left out take no longer than about this, by the time of the fit.
+LEFT_OUT_WITHIN_S = 20.0
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices, oldest first", nargs="+")
-    text = "estimator to calibrate (default: %(default)s)"
-    parser.add_argument("--estimator", choices=ESTIMATORS, default=DEFAULT, help=text)
+    add_recipe(parser)
     add_option(parser, "--out", Path, "CAL", "calibration to write", required=True)
     add_option(parser, "--bank", Path, "FILE", "a bank, which the estimators paper and bank need")
-    add_option(parser, "--mesh", Path, "FILE", "a mesh, which the estimator reconstruction needs")
-    add_option(parser, "--sides", _sides, "SIDE[,SIDE]", "sides to use, e.g. right (default: all)")
     text = "share of each recording to use, e.g. 0:0.5"
     add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
-    text = "delay of the load cell's timestamps, which is subtracted; 0 accepts them unchecked"
-    add_option(parser, "--load-cell-delay-s", DELAY_S, "S", text)
-    text = "no torque will exceed the slices: intervals do not extend beyond them"
-    parser.add_argument("--assume-full-range", action="store_true", help=text)
-    text = "diameter of the tool in recordings that do not name it; on another tool there is no torque"
-    add_option(parser, "--tool-mm", TOOL_MM, "MM", text)
     add_json(parser)
     parser.epilog = (
         "A recording has to hold some seconds idle, the grip, several twists (best ten) with the load cell recorded, "
         "and some seconds idle after the release. docs/estimators.md describes the estimators and their needs."
     )
-
-
-def _sides(text: str) -> tuple[str, ...]:
-    from shearloop.daemon.recorder.schema import SIDES
-
-    sides = tuple(text.split(","))
-    if not set(sides) <= set(SIDES) or len(set(sides)) < len(sides):
-        raise argparse.ArgumentTypeError(f"{text} is not {' or '.join(SIDES)}, or both with a comma between")
-    return sides
 
 
 def run(args: argparse.Namespace) -> int:
@@ -58,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.estimation.calibration import ARCHIVE_MAGIC
     from shearloop.tools.calibrate import calibrate
 
-    _check_options(args)
+    check_recipe(args, args.recordings)
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
@@ -70,22 +56,53 @@ def run(args: argparse.Namespace) -> int:
     if args.assume_full_range and result.calibration.torque is None:
         raise UserError("--assume-full-range is about torques, and these slices have diameters only; leave it out")
     result.calibration.save(args.out)
-    sentences = [*sentences_of(result), f"Written to {args.out}."]
-    return print_result({"path": str(args.out), **result.figures()}, sentences, as_json=args.json)
+    judged, said = _judge_left_out(args, result)
+    sentences = [*sentences_of(result), *said, f"Written to {args.out}."]
+    return print_result({"path": str(args.out), **result.figures(), **judged}, sentences, as_json=args.json)
 
 
-def _check_options(args: argparse.Namespace) -> None:
-    """Raise UserError for an option that has no effect on these recordings or folders of slices."""
-    folders = [path.is_dir() for path in args.recordings]
-    if args.assume_full_range and not all(folders):
-        raise UserError("--assume-full-range is for slices; leave it out for recordings")
-    for option, given, why in (
-        ("--load-cell-delay-s", args.load_cell_delay_s, "each slice holds its torque itself"),
-        ("--tool-mm", args.tool_mm, "a calibration of slices knows no tool"),
-        ("--sides", args.sides, "slices do not name their side"),
-    ):
-        if given is not None and any(folders):
-            raise UserError(f"{option} is for recordings: {why}; leave it out")
+def _judge_left_out(args: argparse.Namespace, result: "CalibrationResult") -> tuple[dict[str, object], list[str]]:
+    """Return the figures of what is left out, and what the user should know of them.
+
+    Where the refits would take longer than some seconds, that is the command; without two blocks, it is why.
+    """
+    from shearloop.bank.errors import CalibrationError
+    from shearloop.tools import leave_out
+    from shearloop.tools.parallel import SerialExecutor
+
+    if result.calibration.torque is None:
+        return {"left_out": None}, []
+    kind = leave_out.usual_kind(result.parts)
+    recipe = leave_out.Recipe(
+        args.estimator, args.bank, args.mesh, result.timing.uncertainty_s, full_range=args.assume_full_range
+    )
+    names = [path.name for path in args.recordings]
+    try:
+        blocks = leave_out.find_blocks(kind, result.parts, names if result.calibration.kind == "raw" else [])
+        if len(blocks) * result.fit_s > LEFT_OUT_WITHIN_S:
+            command = shlex.join(_evaluate_command(args, kind))
+            return {"left_out": None, "left_out_command": command}, [f"Judge it by {kind} left out: {command}"]
+        found = leave_out.judge_left_out(kind, recipe, result.parts, names, SerialExecutor())
+    except (UserError, CalibrationError) as error:
+        return {"left_out": None, "left_out_refused": str(error)}, [f"Not judged by {kind} left out: {error}."]
+    return {"left_out": found.figures()}, leave_out.sentences_of(found)
+
+
+def _evaluate_command(args: argparse.Namespace, kind: str) -> list[str]:
+    """Return the words of the command that judges the same recipe."""
+    options = (
+        ("--estimator", None if args.estimator == DEFAULT else args.estimator),
+        ("--bank", args.bank),
+        ("--mesh", args.mesh),
+        ("--sides", args.sides and ",".join(args.sides)),
+        ("--time-range", None if args.time_range == (0.0, 1.0) else "{:g}:{:g}".format(*args.time_range)),
+        ("--load-cell-delay-s", args.load_cell_delay_s),
+        ("--tool-mm", args.tool_mm),
+    )
+    words = ["shearloop", "evaluate", "--leave-out", kind, *map(str, args.recordings)]
+    for option, value in options:
+        words += [] if value is None else [option, str(value)]
+    return words + ["--assume-full-range"] * args.assume_full_range
 
 
 def sentences_of(result: "CalibrationResult") -> list[str]:

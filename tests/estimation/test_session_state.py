@@ -199,3 +199,26 @@ def test_what_is_valid_is_of_one_grip_and_hardly_made_up(motion_calibration):
                     np.testing.assert_allclose(found, gripped - idle, atol=1e-9)
 
     holds()
+
+
+def test_motion_is_read_without_the_gain_of_the_idle_frame(motion_calibration):
+    """After a release the gel's idle voltages stay low for a minute; the next grip moves it in volts as before.
+
+    A board's gain would scale the motion too, and the estimate with it: the spread of gains between grips covers that.
+    """
+    guards, motion = motion_calibration.validators, motion_calibration.estimator.motion
+    idle, gripped = (np.array([getattr(guard, name) for guard in guards]) for name in ("idle", "gripped"))
+    # The gel still creeps, so that there is motion to read.
+    held = [gripped + 0.05 * (gripped - idle) * np.sin(0.3 * i) for i in range(2 * motion.n_lags)]
+
+    def features(idle_share, held_share=1.0):
+        state = SessionState(guards, motion)
+        frames = [*[idle_share * idle] * 12, *(held_share * one for one in held)]
+        return [state.process(TactileFrame.of(0.5 * i, one + 1e-13 * i)) for i, one in enumerate(frames)][-1]
+
+    remembered, fresh, scaled = features(0.95), features(1.0), features(1.1, 1.1)
+    assert not remembered.reasons
+    assert not fresh.reasons
+    assert np.abs(fresh.motion).max() > 0
+    np.testing.assert_allclose(remembered.motion, fresh.motion, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(scaled.motion, 1.1 * fresh.motion, rtol=1e-6, atol=1e-9)

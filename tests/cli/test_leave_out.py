@@ -1,0 +1,49 @@
+"""`evaluate --leave-out`, and what `calibrate` says at its end, from the command line."""
+
+import pytest
+
+from shearloop.tools.recordings.matlab_import import import_mat
+
+
+def test_a_recipe_is_judged_from_the_command_line(shared, tmp_path, result_of, ran, mistake):
+    out, table = tmp_path / "30mm.mcap", tmp_path / "e.csv"
+    import_mat(sorted((shared / "recordings/streams/cylinders").glob("30mm_1_*.mat")), out)
+    recipe = ["--load-cell-delay-s", "0"]
+    judged = result_of("evaluate", "--leave-out", "twists", out, *recipe, "--estimates", table)
+    assert judged["left_out"] == "twists"
+    assert {"r", "rmse_nm", "coverage_95", "winkler_nm", "valid_fraction", "loaded", "unloaded"} <= {*judged}
+    assert judged["loaded"]["baseline_ratio"] > 0
+    assert len(judged["blocks"]) > 2
+    assert table.read_text().startswith("recording,frame,t_s,truth_nm,torque_nm")
+    printed = ran("calibrate", out, *recipe, "--out", tmp_path / "a.cal").out
+    # On a busy computer the refits would take too long, and the command is printed instead.
+    assert "Twists left out in turn" in printed or "shearloop evaluate --leave-out twists" in printed
+    assert "there is one tool, of 30 mm" in mistake("evaluate", "--leave-out", "tools", out, *recipe)
+
+
+@pytest.mark.parametrize("limit_s", [0.0, 1e6])
+def test_calibrate_judges_or_names_the_command(limit_s, slices_folder, tmp_path, result_of, monkeypatch):
+    monkeypatch.setattr("shearloop.cli.calibrate.recording.LEFT_OUT_WITHIN_S", limit_s)
+    made = ["calibrate", slices_folder / "torque_slices", "--estimator", "regression", "--out", tmp_path / "a.cal"]
+    result = result_of(*made)
+    if limit_s:
+        assert result["left_out"]["left_out"] == "levels"
+    else:
+        assert result["left_out"] is None
+        command = result["left_out_command"].split()
+        assert command[:4] == ["shearloop", "evaluate", "--leave-out", "levels"]
+        assert command[-2:] == ["--estimator", "regression"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("a.cal", "name recordings after the calibration"),
+        ("a.cal b.mcap --sides right", "--sides is for --leave-out"),
+        ("--leave-out grips a.mcap --plot", "leave them out with --leave-out"),
+        ("--leave-out grips a.mcap a.mcap", "given twice"),
+        ("--leave-out grips nowhere.mcap", "cannot be read"),
+    ],
+)
+def test_a_mistake_ends_in_one_sentence(arguments, said, mistake):
+    assert said in mistake("evaluate", *arguments.split())

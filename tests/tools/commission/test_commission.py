@@ -1,0 +1,112 @@
+"""The report and stage 0 of a commissioning: each seeded fault fails its own line, and no other."""
+
+import io
+import json
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import yaml
+
+from shearloop.cli import main
+from shearloop.cli.init import packaged_files
+from shearloop.daemon.config import load_daemon_config
+from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.drivers.ur.settings import read_settings
+from shearloop.errors import UserError
+from shearloop.tools.commission.identity import Identity, judge_identity
+from shearloop.tools.commission.report import Line, Report, StageResult, open_report, save_report
+from tests.emulator_process import EmulatorProcess
+
+SIX = (0.0,) * 6
+OUTPUTS = RtdeOutputs(0.0, SIX, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 1.0, 0, 0, 0.0, 1.4, (0.0, 0.0, 0.0), SIX)
+GOOD = Identity("5.17.3.0", "RUNNING", "NORMAL", OUTPUTS, "1.6.5", "A1B2")
+
+
+def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
+    robot = yaml.safe_load(packaged_files()[Path("ur.yaml")]) | {"host": host, "tool": {"payload_kg": 1.4}}
+    (folder / "ur.yaml").write_text(yaml.safe_dump(robot))
+    path = folder / "rig.yaml"
+    path.write_text(yaml.safe_dump({"load_cell": {"device": {"serial_number": "7583"}}, "robot": "ur.yaml"}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("found", "failed"),
+    [
+        (GOOD, []),
+        (replace(GOOD, polyscope="5.99.0.0"), ["PolyScope"]),
+        (replace(GOOD, polyscope="3.15.8.0"), ["generation"]),
+        (replace(GOOD, robot_mode="IDLE"), ["robot mode"]),
+        (replace(GOOD, safety_mode="PROTECTIVE_STOP"), ["safety mode"]),
+        (replace(GOOD, safety_checksum=""), ["safety checksum"]),
+        (replace(GOOD, outputs=replace(OUTPUTS, speed_slider=0.5)), ["speed slider"]),
+        (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.5)), []),
+        (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.51)), ["payload"]),
+        (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=float("nan"))), ["payload"]),
+    ],
+)
+def test_a_fault_fails_exactly_its_own_line(tmp_path, found, failed):
+    config = load_daemon_config(write_rig(tmp_path))
+    lines = judge_identity(found, read_settings(config.robot), config)
+    assert [line.what for line in lines if line.verdict == "failed"] == failed
+    assert "7583" in [line.value for line in lines]
+
+
+def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
+    begun = Report(emulated=False, configuration_sha256="a", robot_settings_sha256="b")
+    assert not begun.passed, "nothing measured is nothing passed"
+    bad, good = (
+        StageResult(stage="0 identity", operator="O", date=date, lines=(Line(what="w", value="<v>", verdict=verdict),))
+        for date, verdict in (("d1", "failed"), ("d2", "passed"))
+    )
+    path = tmp_path / "report.yaml"
+    save_report(path, begun.with_stage(bad))
+    found = open_report(path, begun)
+    assert (found.stages, found.passed) == ((bad,), False)
+    page = save_report(path, found.with_stage(good))
+    assert open_report(path, begun).stages == (good,)
+    text = page.read_text()
+    HTMLParser().feed(text)
+    assert "&lt;v&gt;" in text, "an operator's words are no markup"
+
+
+@pytest.mark.parametrize("changed", ["emulated", "configuration_sha256", "robot_settings_sha256"])
+def test_a_report_of_another_rig_is_not_continued(tmp_path, changed):
+    begun = Report(emulated=False, configuration_sha256="a", robot_settings_sha256="b")
+    path = tmp_path / "report.yaml"
+    save_report(path, begun)
+    other = begun.model_copy(update={changed: True if changed == "emulated" else "c"})
+    with pytest.raises(UserError, match="changed since this report was begun"):
+        open_report(path, other)
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_stage_0_is_run_on_an_emulated_controller_with_scripted_answers(tmp_path, monkeypatch, capsys):
+    robot = EmulatorProcess("ur", "--payload-kg", "1.4", module=7, ready="listening")
+    try:
+        path, out = write_rig(tmp_path, robot.host), tmp_path / "report.yaml"
+        monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
+        assert main(["commission", str(path), "--out", str(out)]) == 0
+        assert "passed payload: 1.400 kg" in capsys.readouterr().out
+        monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
+        assert main(["commission", str(path), "--out", str(out), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == yaml.safe_load(out.read_text())
+        (stage,) = yaml.safe_load(out.read_text())["stages"]
+        assert (stage["stage"], stage["operator"]) == ("0 identity", "Ada")
+        assert "A1B2" in out.with_suffix(".html").read_text()
+        robot.process.stdin.write(b"payload 2\n")
+        robot.process.stdin.flush()
+        monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
+        while main(["commission", str(path), "--out", str(out)]) == 0:
+            monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
+        failed = [
+            line["what"]
+            for line in yaml.safe_load(out.read_text())["stages"][0]["lines"]
+            if line["verdict"] == "failed"
+        ]
+        assert failed == ["payload"]
+    finally:
+        robot.close()

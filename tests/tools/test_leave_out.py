@@ -1,0 +1,123 @@
+"""A recipe is judged by blocks that its fit has not seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shearloop.errors import UserError
+from shearloop.estimation.values import FrameSeries
+from shearloop.tools.evaluate import estimate_series, figures_by_load, figures_of
+from shearloop.tools.leave_out import (
+    KINDS,
+    Recipe,
+    find_blocks,
+    fit_without,
+    judge_block,
+    judge_left_out,
+    sentences_of,
+    usual_kind,
+)
+from shearloop.tools.parallel import SerialExecutor
+from tests.estimation.conftest import sliced, twisting
+
+RECIPE = Recipe("motion_regression")
+
+
+def of_tool(diameter_mm: float, seed: int) -> FrameSeries:
+    played = twisting(cycles=3, seed=seed, tips=(1,), peak_nm=0.002 * diameter_mm)
+    return replace(played, diameter_mm=np.full(len(played.t_s), diameter_mm))
+
+
+MATERIAL = {
+    "twists": lambda: [twisting(cycles=4, tips=(1,))],
+    "grips": lambda: [twisting(cycles=3, seed=seed, tips=(1,)) for seed in (1, 2)],
+    "levels": lambda: [sliced()],
+    "tools": lambda: [of_tool(10.0, 1), of_tool(12.0, 2)],
+}
+
+
+def corrupted(recordings, block):
+    """Return the recordings with other frames and torques where the block is judged."""
+    found = list(recordings)
+    for span in block.judged:
+        one = found[span.recording]
+        channels, torque_nm = one.channels.copy(), one.torque_nm.copy()
+        channels[span.first : span.stop] *= 1.7
+        begin, end = one.t_s[span.first], one.t_s[span.stop - 1]
+        torque_nm[(one.torque_t_s >= begin) & (one.torque_t_s <= end)] *= -3.0
+        found[span.recording] = replace(one, channels=channels, torque_nm=torque_nm)
+    return found
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_block_is_not_in_its_own_fit(kind, tmp_path):
+    recordings = MATERIAL[kind]()
+    names = [f"{number}.mcap" for number in range(len(recordings))]
+    for number, block in enumerate(find_blocks(kind, recordings, names)[:2]):
+        own, other = tmp_path / f"{number}.cal", tmp_path / f"{number}_other.cal"
+        fit_without(RECIPE, recordings, block).save(own)
+        fit_without(RECIPE, corrupted(recordings, block), block).save(other)
+        assert own.read_bytes() == other.read_bytes(), block.name
+
+
+def test_every_loaded_frame_is_judged_once_by_twists():
+    recordings = MATERIAL["twists"]()
+    blocks = find_blocks("twists", recordings, ["a.mcap"])
+    assert [one.name for one in blocks] == [f"twist {number} of a.mcap" for number in (1, 2, 3, 4)]
+    judged = np.concatenate([np.arange(one.judged[0].first, one.judged[0].stop) for one in blocks])
+    assert len(np.unique(judged)) == len(judged)
+    assert {*np.flatnonzero(np.abs(recordings[0].torque_at_frames()) > 0.005)} <= {*judged.tolist()}
+
+
+def test_figures_are_those_of_a_slow_loop():
+    recordings = MATERIAL["grips"]()
+    result = judge_left_out("grips", RECIPE, recordings, ["a", "b"], SerialExecutor())
+    errors = []
+    for number, one in enumerate(recordings):
+        calibration = RECIPE.fit([recordings[1 - number]])
+        track = estimate_series(calibration, one)
+        for truth, estimate in zip(one.torque_at_frames(), track.estimates, strict=True):
+            if estimate.torque_nm is not None and abs(truth) >= 0.005:
+                errors.append(estimate.torque_nm - truth)
+    figures = result.figures()
+    assert figures["loaded"]["rmse_nm"] == pytest.approx(np.sqrt(np.mean(np.square(errors))))
+    assert [one["name"] for one in figures["blocks"]] == ["a", "b"]
+    evaluated = {*figures_of(result.all_tracks), *figures_by_load(result.all_tracks)}
+    assert {*figures} == evaluated | {"left_out", "blocks", "advice"}
+    assert result.advice == "Two grips only: record three, because the gain changes from grip to grip."
+    assert result.advice == sentences_of(result)[-1]
+
+
+def test_the_stopwatch_knows_the_level_that_the_fit_does_not():
+    recordings = MATERIAL["levels"]()
+    block = find_blocks("levels", recordings, [])[0]
+    (track, *_) = judge_block((RECIPE, recordings), block)
+    truth = track.series.torque_at_frames()
+    assert track.profile_nm == pytest.approx(truth, abs=0.015)
+    fitted = recordings[0].torque_at_frames()[block.fitted[0]]
+    assert np.abs(fitted - truth[0]).min() > 0.005
+
+
+@pytest.mark.parametrize(
+    ("kind", "recordings", "said"),
+    [
+        ("twists", lambda: [twisting(cycles=1, tips=(1,))], "there is one twist, which leaves nothing to fit"),
+        ("tools", lambda: [of_tool(10.0, 1)], "there is one tool, of 10 mm"),
+        ("tools", lambda: [twisting(cycles=3, tips=(1,))], "name it with --tool-mm"),
+        ("grips", lambda: [twisting(cycles=3, tips=(1,))], "one recording, and so one grip"),
+        ("levels", lambda: [twisting(cycles=3, tips=(1,))], "leave out grips, twists or tools"),
+        ("twists", lambda: [sliced()], "use --leave-out levels"),
+        ("levels", lambda: [sliced().between(0, 12)], "record 20 or more"),
+    ],
+)
+def test_what_cannot_be_left_out_is_refused_in_one_sentence(kind, recordings, said):
+    chosen = recordings()
+    with pytest.raises(UserError, match=said) as refused:
+        find_blocks(kind, chosen, ["a.mcap"] * len(chosen))
+    assert "\n" not in str(refused.value)
+
+
+def test_calibrate_chooses_the_widest_kind():
+    for kind in KINDS:
+        assert usual_kind(MATERIAL[kind]()) == kind

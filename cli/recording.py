@@ -125,6 +125,10 @@ def _summary_text(found: "RecordingSummary") -> str:
         plural = " " if topic.messages == 1 else "s"
         lines.append(f"  {name:<22} {topic.messages:>8} message{plural} {rate}".rstrip())
     lines += [f"  attached {name}" for name in found.attachments]
+    lines += [
+        f"  {step.after_s:.1f} s after the first message: {step}; the times of the recording do not follow it."
+        for step in found.clock_steps
+    ]
     if not found.closed:
         cure = f"`shearloop recording repair {found.path}` makes an indexed copy" if found.topics else "None is intact"
         torn = counted(found.torn_bytes, "byte is", "bytes are")

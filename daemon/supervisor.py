@@ -139,7 +139,8 @@ class HealthReporter:
                 due_s = loop.time()
             used_s, passed_s = time.process_time() - cpu_s, max(loop.time() - measured_s, 1e-9)
             cpu_s, measured_s = cpu_s + used_s, measured_s + passed_s
-            self.clock.synchronise()
+            if step := self.clock.synchronise():
+                structlog.get_logger().warning(f"{step}; the control loop and recordings do not follow it")
             # A task that stays dead ends the service: systemd's watchdog is fed only while all are alive.
             if dead := self.supervisor.dead:
                 notify(f"STATUS=dead, restarting: {', '.join(dead)}")

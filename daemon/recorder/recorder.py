@@ -24,7 +24,7 @@ import numpy as np
 from pydantic_core import PydanticSerializationError
 
 from shearloop.bank.bank_file import Bank
-from shearloop.daemon.clock import Clock
+from shearloop.daemon.clock import Clock, ClockReading
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging.messages import LoopState, Scalar
 from shearloop.daemon.recorder import schema
@@ -163,10 +163,13 @@ class _Carried:
 class _CurrentFile:
     file: McapFile
     began_ns: int
+    # All Unix times of the file minus the monotonic clock.
+    offset_ns: int
     # Items lost before this file began.
     lost_before: int
     experiment: str = ""
-    offset_ns: int | None = None
+    # The latest reading in `input.clock`.
+    clock: ClockReading | None = None
     closed: bool = False
 
 
@@ -204,7 +207,7 @@ class Recorder:
         """Queue a published message."""
         # A float32 becomes about eight bytes of JSON.
         size = _OVERHEAD_BYTES + 2 * sum(len(value) for value in content.values() if isinstance(value, bytes))
-        self._enqueue(size, partial(self._add_message, topic, content, self._clock.now_ns(), self._clock.offset_ns))
+        self._enqueue(size, partial(self._add_message, topic, content, self._clock.now_ns(), self._clock.reading))
 
     def input_recorder(self, source: str) -> InputRecorder:
         """Return the recorder of one source's raw input."""
@@ -219,16 +222,15 @@ class Recorder:
         """Queue a raw input."""
         if event.kind is InputKind.STATE:
             self._carried.missing.discard(source)
-        add = partial(self._add_input, source, event, self._clock.offset_ns)
+        add = partial(self._add_input, source, event, self._clock.reading)
         self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
 
     def record_experiment(
         self, name: str, attached: tuple[AttachedFile, ...] = (), tool_mm: float | None = None
     ) -> None:
         """Record the start of an experiment: a new file begins, unless the current one has no experiment yet."""
-        t_unix_ns = self._clock.now_ns() + self._clock.offset_ns
         notes = {} if tool_mm is None else {schema.DIAMETER_NOTE: f"{tool_mm:g}"}
-        add = partial(self._add_experiment, name, attached, notes, t_unix_ns)
+        add = partial(self._add_experiment, name, attached, notes, self._clock.now_ns())
         if self._carried.experiment_began:
             self._carried.want_states()
         self._carried.experiment_began = True
@@ -334,10 +336,10 @@ class Recorder:
         self._finish_file(previous, lost)
         self._current.file.add_metadata(schema.CONTINUED_METADATA, {"sources": " ".join(sorted(self._carried.sources))})
         for source, event in list(self._carried.asked.items()):
-            self._add_input(source, event, self._clock.offset_ns)
+            self._add_input(source, event, self._clock.reading)
         for source, event in self._carried.tools.items():
             # The tool is still held, and a replay of this file must know it.
-            self._add_input(source, replace(event, t_ns=self._current.began_ns), self._clock.offset_ns)
+            self._add_input(source, replace(event, t_ns=self._current.began_ns), self._clock.reading)
 
     def _new_file(self, lost_before: int) -> _CurrentFile:
         now_ns, offset_ns = self._clock.now_ns(), self._clock.offset_ns
@@ -350,7 +352,7 @@ class Recorder:
                     file = McapFile(FileIO(self._folder / f"{began}.mcap{PARTIAL}", "xb"))
                     break
         try:
-            file.identify(self._identity.metadata)
+            file.identify({**self._identity.metadata, schema.CLOCK_OFFSET: str(offset_ns)})
             for one in self._identity.attached:
                 file.attach(one.name, one.media_type, one.data, now_ns + offset_ns)
             file.flush()
@@ -359,7 +361,7 @@ class Recorder:
             with suppress(OSError):
                 file.discard()
             raise
-        return _CurrentFile(file, now_ns, lost_before)
+        return _CurrentFile(file, now_ns, offset_ns, lost_before)
 
     def _finish_file(self, current: _CurrentFile, lost: int) -> None:
         """Close a file under a name with its experiment; if that fails, the PARTIAL file stays for a repair."""
@@ -379,11 +381,11 @@ class Recorder:
         else:
             self.closed_files.append(path)
 
-    def _add_message(self, topic: str, content: Mapping[str, Any], now_ns: int, offset_ns: int) -> None:
+    def _add_message(self, topic: str, content: Mapping[str, Any], now_ns: int, clock: ClockReading) -> None:
         if topic == LoopState.topic:
             self._experiment_runs = content["phase"] not in _IDLE_PHASES
-        self._add_clock(now_ns, offset_ns)
-        name = schema.recorded_topic(topic, content["source"])
+        self._add_clock(now_ns, clock)
+        name, offset_ns = schema.recorded_topic(topic, content["source"]), self._current.offset_ns
         try:
             data = schema.message_json(topic, content, offset_ns)
         except ValueError as error:
@@ -392,7 +394,7 @@ class Recorder:
             return
         self._current.file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
 
-    def _add_input(self, source: str, event: RawEvent, offset_ns: int) -> None:
+    def _add_input(self, source: str, event: RawEvent, clock: ClockReading) -> None:
         match event.kind:
             case InputKind.TOOL:
                 self._carried.tools[source] = event
@@ -400,23 +402,26 @@ class Recorder:
                 self._carried.asked[source] = event
             case InputKind.DATA:
                 self._carried.asked.pop(source, None)
-        self._add_clock(event.t_ns, offset_ns)
-        t_unix_ns = event.t_ns + offset_ns
+        self._add_clock(event.t_ns, clock)
+        t_unix_ns = event.t_ns + self._current.offset_ns
         self._current.file.add(schema.input_topic(source), t_unix_ns, t_unix_ns, schema.input_json(event))
 
     def _add_experiment(
-        self, name: str, attached: tuple[AttachedFile, ...], notes: Mapping[str, str], t_unix_ns: int
+        self, name: str, attached: tuple[AttachedFile, ...], notes: Mapping[str, str], now_ns: int
     ) -> None:
         current = self._current
+        t_unix_ns = now_ns + current.offset_ns
         current.experiment, self._experiment_runs = name, True
         current.file.add_metadata(schema.EXPERIMENT_METADATA, {**notes, "name": name, "t_unix_ns": str(t_unix_ns)})
         for one in attached:
             if one not in self._identity.attached:
                 current.file.attach(one.name, one.media_type, one.data, t_unix_ns)
 
-    def _add_clock(self, now_ns: int, offset_ns: int) -> None:
-        if offset_ns == self._current.offset_ns:
+    def _add_clock(self, now_ns: int, clock: ClockReading) -> None:
+        current = self._current
+        if clock == current.clock:
             return
-        self._current.offset_ns = offset_ns
-        data = schema.as_json({"t_mono_ns": now_ns, "offset_ns": offset_ns})
-        self._current.file.add(schema.CLOCK_TOPIC, now_ns + offset_ns, now_ns + offset_ns, data)
+        current.clock = clock
+        entry = {"t_mono_ns": now_ns, "offset_ns": clock.offset_ns, schema.SUSPENDED: clock.suspended_ns}
+        t_unix_ns = now_ns + current.offset_ns
+        current.file.add(schema.CLOCK_TOPIC, t_unix_ns, t_unix_ns, schema.as_json(entry))

@@ -1,11 +1,12 @@
 """The format of a recording: topics, JSON schemas, metadata, and messages as JSON.
 
 A recording is an MCAP file (mcap.dev) that any MCAP tool can show. Log times are Unix nanoseconds: for a message the
-time of its measurement (for a frame the middle of its acquisition), for a raw input its arrival.
+time of its measurement (for a frame the middle of its acquisition), for a raw input its arrival. All Unix times of a
+file are the monotonic clock's plus one offset, CLOCK_OFFSET, so a wall clock that is set does not change their order.
 
 Topics have the names of the live messages. Topics that each fingertip sends end in the source: `eit.frame.right`.
 `input.SOURCE` holds the raw input of a parser as Latin-1 text, so that each byte is one character. `input.clock` holds
-the offset between the monotonic clock and Unix time. Replay needs only these two.
+each change of the offset between the monotonic clock and Unix time. Replay needs only these two.
 
 The schemas use the part of JSON Schema that Foxglove supports: each key has one type, every object lists its
 properties. A key without a value is therefore left out instead of null.
@@ -36,6 +37,8 @@ INPUT = "input"
 CLOCK_TOPIC = f"{INPUT}.clock"
 # MCAP metadata record of every recording: format, software, channel table.
 METADATA = "shearloop"
+# Its key of the offset: all Unix times of a daemon's recording minus CLOCK_MONOTONIC, in ns.
+CLOCK_OFFSET = "clock_offset_ns"
 # One metadata record for each experiment, and one at the end of a closed recording.
 EXPERIMENT_METADATA = "shearloop.experiment"
 END_METADATA = "shearloop.end"
@@ -45,6 +48,7 @@ CONFIGURATION = "configuration.json"
 # The numbers of k and sigma of a heatmap; other arrays have one dimension.
 SCORES_SHAPE = "scores_shape"
 ARRIVAL = "arrival_unix_ns"
+SUSPENDED = "suspended_ns"
 # The keys of an imported message, which has no source.
 IMPORTED_KEYS: Mapping[str, tuple[str, ...]] = {FRAME_TOPIC: (ARRIVAL, "line"), LOAD_TOPIC: ("torque_nm",)}
 SIDES = ("right", "left")
@@ -129,16 +133,23 @@ def schemas() -> Mapping[str, dict[str, Any]]:
         CLOCK_TOPIC: {
             "t_mono_ns": _TIME,
             "offset_ns": {"type": "integer", "description": "Unix time minus CLOCK_MONOTONIC in ns, from now on"},
+            SUSPENDED: {"type": "integer", "description": "CLOCK_BOOTTIME minus CLOCK_MONOTONIC in ns"},
         },
     }
     return {
-        **{name: _object(name, properties, list(properties)) for name, properties in raw.items()},
+        **{
+            name: _object(name, properties, [key for key in properties if key not in optional_keys(name)])
+            for name, properties in raw.items()
+        },
         **{topic: _message_schema(topic) for topic in TOPICS},
     }
 
 
 def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> bytes:
-    """Return a message's map as JSON: float32 arrays or their bytes as flat lists, without keys that have no value."""
+    """Return a message's map as JSON: float32 arrays or their bytes as flat lists, without keys that have no value.
+
+    Its Unix times are those of the monotonic stamp plus offset_ns.
+    """
     plain: dict[str, Any] = {}
     for key, value in content.items():
         if isinstance(value, float):
@@ -149,9 +160,15 @@ def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> byte
             plain[key] = np.round(np.frombuffer(value, "<f4").astype(np.float64), 6).tolist()
         elif value is not None and (not key.endswith("_shape") or key == SCORES_SHAPE):
             plain[key] = value
-    if topic == EitFrame.topic:
-        plain[ARRIVAL] = content["t_mono_ns"] + round(content["age_s"] * 1e9) + offset_ns
-    return as_json(plain)
+    return as_json({**plain, **unix_times(topic, content, content["t_mono_ns"] + offset_ns)})
+
+
+def unix_times(topic: str, content: Mapping[str, Any], t_unix_ns: int) -> dict[str, Any]:
+    """Return the keys of a live message that are Unix times, for one that was measured at t_unix_ns."""
+    times: dict[str, Any] = {"timestamp": t_unix_ns / 1e9}
+    if topic == EitFrame.topic and content["age_s"] is not None:
+        times[ARRIVAL] = t_unix_ns + round(content["age_s"] * 1e9)
+    return times
 
 
 def input_json(event: RawEvent) -> bytes:
@@ -180,7 +197,9 @@ def _mapping_as_dict(value: Any) -> Any:
 
 @cache
 def optional_keys(topic: str) -> tuple[str, ...]:
-    """Return the keys that a message leaves out if they have no finite value."""
+    """Return the keys that a message, or an entry of `input.clock`, may leave out, as if they had no finite value."""
+    if topic not in TOPICS:
+        return (SUSPENDED,) if topic == CLOCK_TOPIC else ()
     hints = typing.get_type_hints(TOPICS[topic])
     names = (item.name for item in dataclasses.fields(TOPICS[topic]))
     return tuple(name for name in names if hints[name] is float or type(None) in typing.get_args(hints[name]))

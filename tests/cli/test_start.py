@@ -87,7 +87,7 @@ def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys)
         async with aiohttp.ClientSession() as http, http.get(url) as page:
             return page.status
 
-    with demo.page(config):
+    with demo.page(config, 0):
         url = capsys.readouterr().out.rsplit(" ", 1)[1].strip()
         assert asyncio.run(status(url)) == 200
     with pytest.raises(aiohttp.ClientConnectorError):
@@ -110,5 +110,5 @@ def test_the_demo_refuses_a_recording_that_is_not_there_at_once(tmp_path, mistak
 
 def test_the_demo_without_aiohttp_says_what_the_page_needs(monkeypatch, capsys):
     monkeypatch.setattr(demo, "find_spec", lambda _: None)
-    with demo.page(DaemonConfig(fingertips={"right": {"device": {"path": "/dev/null"}}})):
+    with demo.page(DaemonConfig(fingertips={"right": {"device": {"path": "/dev/null"}}}), 0):
         assert "pip install 'shearloop[view]'" in capsys.readouterr().out

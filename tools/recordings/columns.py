@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from pydantic_core import from_json
 
-from shearloop.daemon.messaging.messages import TOPICS, EitHeatmap
+from shearloop.daemon.messaging.messages import EitHeatmap
 from shearloop.daemon.recorder import schema
 from shearloop.drivers.serial_sensor import InputKind
 
@@ -40,7 +40,7 @@ class Column(NamedTuple):
 @cache
 def columns(name: str) -> Mapping[str, Column]:
     """Return the columns of a schema by their names, in its order."""
-    optional = schema.optional_keys(name) if name in TOPICS else ()
+    optional = schema.optional_keys(name)
     described = schema.schemas()[name]["properties"].items()
     return {key: Column(key, one["type"], key in optional) for key, one in described}
 

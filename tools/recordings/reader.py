@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any
 
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from pydantic_core import from_json
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
+from shearloop.daemon.clock import ClockReading, ClockStep
 from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL, new_writer
@@ -38,11 +40,20 @@ from shearloop.tools.recordings.intact_records import (
     check_magic,
     check_size,
 )
+from shearloop.tools.recordings.one_clock import Messages, OneClock, by_one_clock, is_one_clock
 
 _NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
 _OTHER_PROGRAM = "another program made or changed this recording: record or import it again"
 # Metadata of every recording; the other keys are notes of this one.
-_IDENTITY_KEYS = ("format_version", "channel_table_hash", "electrodes", "injection", "software", "code_sha256")
+_IDENTITY_KEYS = (
+    "format_version",
+    "channel_table_hash",
+    "electrodes",
+    "injection",
+    "software",
+    "code_sha256",
+    schema.CLOCK_OFFSET,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,12 +124,20 @@ class OpenRecording:
         """Return the attached files by name."""
         return {one.name: one.data for one in self._reader.iter_attachments()}
 
-    def messages(
-        self, topics: Iterable[str] | None = None, *, by_time: bool = True
-    ) -> Iterator[tuple[Channel, Message]]:
-        """Return the messages of some topics or of all, by log time or in the order of the file."""
-        found = self._reader.iter_messages(topics, log_time_order=by_time)
-        return ((channel, message) for _, channel, message in found)
+    def messages(self, topics: Iterable[str] | None = None, *, by_time: bool = True) -> Messages:
+        """Return the messages of some topics or of all, by time or in the order of the file.
+
+        By time, log times are those of the monotonic stamps, so that a wall clock that was set changes nothing.
+        """
+        wanted = None if topics is None else [*topics]
+        if by_time and self.counts.get(schema.CLOCK_TOPIC) and not is_one_clock(self.identity):
+            first = next(self._found([schema.CLOCK_TOPIC], by_log_time=False))
+            return by_one_clock(first, lambda: self._found(wanted, by_log_time=False))
+        return self._found(wanted, by_log_time=by_time)
+
+    def _found(self, topics: list[str] | None, *, by_log_time: bool) -> Messages:
+        messages = self._reader.iter_messages(topics, log_time_order=by_log_time)
+        return ((channel, message) for _, channel, message in messages)
 
     def content(self, channel: Channel, message: Message) -> dict[str, Any]:
         """Return a message's content by the names of its topic; raises ContentError and UnknownTopicError."""
@@ -129,6 +148,9 @@ class OpenRecording:
             imported = "source" not in content
             if imported != self._imported.setdefault(channel.topic, imported):
                 raise ContentError("it has other keys than the first one")
+            if "timestamp" in content and not is_one_clock(self.identity):
+                content |= schema.unix_times(schema.schema_name(channel.topic), content, message.log_time)
+                check_time(schema.ARRIVAL, content.get(schema.ARRIVAL) or 0)
         except ContentError as error:
             raise type(error)(f"{channel.topic}, number {message.sequence}: {error}") from error
         return content
@@ -188,7 +210,7 @@ def refusing_content(path: Path, topic: str) -> Iterator[None]:
 def read_messages(
     path: Path, topics: Iterable[str], progress: Progress = lambda _: None
 ) -> Iterator[tuple[str, dict[str, Any], Message]]:
-    """Yield topic, content and message by log time, None for keys without a value; raises UserError.
+    """Yield topic, content and message by time, None for keys without a value; raises UserError.
 
     `progress` receives the number of messages so far.
     """
@@ -292,6 +314,13 @@ class TopicSummary:
 
 
 @dataclass(frozen=True, slots=True)
+class RecordedStep(ClockStep):
+    """A step of the clock, and how long after the first message the daemon noticed it."""
+
+    after_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class ListedRecording:
     """One recording of a folder, times in Unix ns; the keys of `recording list --json`."""
 
@@ -367,6 +396,8 @@ class RecordingSummary(FileCondition):
     metadata: dict[str, str]
     attachments: list[str]
     topics: dict[str, TopicSummary]
+    # Where the wall clock was set or the computer was suspended; no time of a recording depends on it.
+    clock_steps: list[RecordedStep]
 
 
 def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSummary:
@@ -376,10 +407,14 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
     spans: dict[str, tuple[int, int]] = {}
     named: dict[str, list[dict[str, str]]] = {}
     attachments = []
+    clock, readings = OneClock(), list[tuple[int, ClockReading]]()
     for record in records:
         match record:
             case Message():
-                name, t_ns = records.channels[record.channel_id].topic, record.log_time
+                channel = records.channels[record.channel_id]
+                name, t_ns = channel.topic, clock.time_ns(channel, record)
+                if name == schema.CLOCK_TOPIC and (reading_now := _clock_reading(record)) is not None:
+                    readings.append((t_ns, reading_now))
                 topic = topics.setdefault(name, TopicSummary())
                 topic.messages += 1
                 first_ns, last_ns = spans.get(name, (t_ns, t_ns))
@@ -414,7 +449,21 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         metadata=metadata,
         attachments=attachments,
         topics=dict(sorted(topics.items())),
+        clock_steps=[
+            RecordedStep(step.set_s, step.suspended_s, (t_ns - (first_unix_ns or 0)) / 1e9)
+            for (_, before), (t_ns, after) in pairwise(readings)
+            if (step := ClockStep.between(before, after)) is not None
+        ],
     )
+
+
+def _clock_reading(message: Message) -> ClockReading | None:
+    """Return the reading of an entry of `input.clock`, or None for one that another program changed."""
+    try:
+        content = read_content(schema.CLOCK_TOPIC, message.data)
+    except ContentError:
+        return None
+    return ClockReading(content["offset_ns"], content[schema.SUSPENDED] or 0)
 
 
 @dataclass(frozen=True, slots=True)

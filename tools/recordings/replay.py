@@ -19,7 +19,7 @@ import numpy as np
 import structlog
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.clock import Clock
+from shearloop.daemon.clock import Clock, ClockReading
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
 from shearloop.daemon.messaging import messages
@@ -162,7 +162,7 @@ class ReplayClock(Clock):
 
     def __init__(self) -> None:
         """Start at zero until the first event sets the time."""
-        self._offset_ns = 0
+        self._reading = ClockReading(0, 0)
         self._now_ns = 0
 
     def now_ns(self) -> int:
@@ -173,7 +173,7 @@ class ReplayClock(Clock):
         """Set the time, and the offset to Unix time if it is given."""
         self._now_ns = now_ns
         if offset_ns is not None:
-            self._offset_ns = offset_ns
+            self._reading = ClockReading(offset_ns, 0)
 
 
 @dataclass(slots=True)

@@ -34,6 +34,8 @@ RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 _LINES = ("clipped_data", "clipped_data_hom")
 # Recordings are of this century.
 _EARLIEST_S, _LATEST_S = 946_684_800.0, 4_102_444_800.0
+# A line that is stamped late may seem to come after the next one.
+_LARGEST_DELAY_S = 2.0
 _LONGEST_ELAPSED_S = 31 * 86_400.0
 # Boards send a line every 0.02 to 5 s: the load cell's every 0.09 s, fingertips' every 0.54 s.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
@@ -133,13 +135,14 @@ def _fits(times: FloatArray, time_format: str) -> bool:
 def _check_times(path: Path, times: FloatArray, time_format: str) -> None:
     """Raise UserError, with what was found and the cure, unless times (n,) are of the format and do not fall."""
     steps = np.diff(times)
-    if len(steps) and steps.min() < 0:
-        row = int(np.argmax(steps < 0)) + 2
-        raise UserError(
-            f"{path}: the time in row {row}, {times[row - 1]:.10g}, is before that of row {row - 1}, "
-            f"{times[row - 2]:.10g}: the clock was set back; import the rows before and after in two files"
-        )
     if _fits(times, time_format):
+        steps_s = steps * TIME_FORMATS[time_format].unit_s
+        if len(steps_s) and steps_s.min() < -_LARGEST_DELAY_S:
+            row = int(np.argmin(steps_s)) + 2
+            raise UserError(
+                f"{path}: the time in row {row} is {-steps_s.min():.1f} s before that of row {row - 1}: the clock was "
+                "set back; import the rows before and after as two recordings"
+            )
         return
     found = f"the times begin with {times[0]:.10g}"
     if len(steps):

@@ -1,4 +1,4 @@
-"""Reads matrices and structs of MATLAB files of version 5 to 7.2.
+"""Reads matrices and structs of MATLAB files of version 5 to 7.2, and skips other variables.
 
 The format is MathWorks' "MAT-File Format" (level 5). scipy's reader trusts sizes and types in the file, so some damaged
 files end its process with a segmentation fault (docs/decisions/0040).
@@ -18,7 +18,7 @@ _HEADER_BYTES = 128
 _COMPRESSED, _MATRIX, _INT8, _INT32, _UINT32 = 15, 14, 1, 5, 6
 # The stored type of numbers is often narrower than their class.
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_STRUCT, _NUMBER_CLASSES = 2, range(6, 16)
+_STRUCT, _OPAQUE, _NUMBER_CLASSES = 2, 17, range(6, 16)
 _OTHER_CLASSES = {1: "cell array", 3: "object", 4: "text", 5: "sparse matrix", 16: "function"}
 _COMPLEX_FLAG = 0x0800
 # Of structs within structs.
@@ -60,6 +60,9 @@ def read_variables(content: bytes) -> dict[str, Variable]:
         if kind != _MATRIX:
             raise MatFileError(f"it has an element of type {kind} where a variable is expected")
         name, variable = _variable(_Elements(data, order))
+        if not name:
+            # MATLAB keeps the content of all objects of a file in a variable without a name.
+            continue
         if name in variables:
             raise MatFileError(f"it has the variable {name!r} twice")
         variables[name] = variable
@@ -103,6 +106,8 @@ class _Elements:
 
 def _variable(parts: _Elements, depth: int = 0) -> tuple[str, Variable]:
     flags = parts.numbers({_UINT32: "u4"})
+    if len(flags) == 2 and int(flags[0]) & 0xFF == _OPAQUE:
+        return _opaque(parts)
     shape = tuple(map(int, parts.numbers({_INT32: "i4"})))
     kind, name_bytes = parts.next_element()
     if len(flags) != 2 or len(shape) < 2 or min(shape) < 0 or kind != _INT8 or not name_bytes.tobytes().isascii():
@@ -120,6 +125,15 @@ def _variable(parts: _Elements, depth: int = 0) -> tuple[str, Variable]:
     if len(values) != math.prod(shape):
         raise MatFileError(f"{name} has {len(values)} numbers for a matrix of {size}")
     return name, values.reshape(shape, order="F")
+
+
+def _opaque(parts: _Elements) -> tuple[str, str]:
+    """Return name and description of an object, such as a datetime or a table, which has no shape here."""
+    texts = [parts.next_element() for _ in range(3)]
+    if any(kind != _INT8 or not text.tobytes().isascii() for kind, text in texts):
+        raise MatFileError("it has an object without proper names of itself and its class")
+    name, _, class_name = (text.tobytes().decode("ascii") for _, text in texts)
+    return name, f"an object of the class {class_name}"
 
 
 def _structs(parts: _Elements, count: int, depth: int) -> Struct:

@@ -77,9 +77,9 @@ def run(args: argparse.Namespace) -> int:
             "and `shearloop demo` writes it anew"
         )
     if args.play is not None:
-        from shearloop.tools.recordings.matlab_import import read_stream
+        from shearloop.tools.recordings.matlab_import import read_lines
 
-        read_stream(args.play)
+        read_lines(args.play)
     print("The demo starts …", flush=True)
     # In a process of its own: the daemon would keep the memory of the fits.
     with running([*SHEARLOOP, "demo", "--prepare", "--folder", str(args.folder), *played]) as process:

@@ -22,6 +22,7 @@ from shearloop.cli.options import (
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError
 from shearloop.tools.outputs import check_overwrite, progress_bar, writing
+from shearloop.tools.recordings.time_formats import DATENUM, TIME_FORMATS
 from shearloop.words import counted
 
 if TYPE_CHECKING:
@@ -64,6 +65,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     mat = add_action(formats, "mat", "import the paper's MATLAB streams", _import)
     add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
     add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
+    formats_text = "; ".join(f"{name}: {form.words}" for name, form in TIME_FORMATS.items())
+    text = f"what the first column's times are (default: %(default)s). {formats_text}"
+    mat.add_argument("--time-format", choices=tuple(TIME_FORMATS), default=DATENUM, help=text)
     add_json(mat)
 
 
@@ -205,7 +209,7 @@ def _import(args: argparse.Namespace) -> int:
     from shearloop.tools.recordings.matlab_import import import_mat
 
     check_overwrite(args.out, "a recording", MCAP0_MAGIC)
-    imported = import_mat(args.sources, args.out)
+    imported = import_mat(args.sources, args.out, args.time_format)
     counts = [f"{counted(count, 'frame')} of the {side} side" for side, count in imported.frames.items()]
     sentence = f"{args.out}: {', '.join(counts)}, {counted(imported.torques, 'torque')}."
     return print_result({"path": str(args.out), **asdict(imported)}, [sentence, *imported.remarks], as_json=args.json)

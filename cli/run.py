@@ -149,14 +149,14 @@ def _config(args: argparse.Namespace) -> "DaemonConfig":
     config = load_daemon_config(args.config, dict(args.set))
     options = check_emulators(config.emulators, args.config)
     if args.play is not None:
-        from shearloop.tools.recordings.matlab_import import read_stream
+        from shearloop.tools.recordings.matlab_import import read_lines
 
         boards = [given for given in options if given.device == "eit-kit"]
         if not boards:
             raise UserError(f"{args.config} has no eit-kit among its `emulators` that --play {args.play} could use")
         for given in boards:
             # Without its frames the daemon would wait forever.
-            read_stream(args.play, given.side)
+            read_lines(args.play, given.side)
     if args.record is not None:
         config = config.model_copy(update={"recording": RecordingConfig(folder=args.record)})
     return config

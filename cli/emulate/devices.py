@@ -78,9 +78,9 @@ def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.f
         if args.once:
             raise UserError("--once is for a recording; synthetic frames have no end")
         return _synthetic(args, period_s)
-    from shearloop.tools.recordings.matlab_import import read_stream
+    from shearloop.tools.recordings.matlab_import import read_lines
 
-    lines = read_stream(args.recording, args.side).values
+    lines = read_lines(args.recording, args.side)
     return iter(lines) if args.once else cycle(lines)
 
 

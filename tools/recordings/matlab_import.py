@@ -20,6 +20,7 @@ from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import measured_delay
 from shearloop.estimation.values import LARGEST_TORQUE_NM
 from shearloop.files import open_file
+from shearloop.tools.recordings.time_formats import DATENUM, TIME_FORMATS
 from shearloop.words import counted
 
 # The recording scripts changed these names over time.
@@ -31,9 +32,13 @@ _STREAMS = {
 TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
 RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 _LINES = ("clipped_data", "clipped_data_hom")
-# MATLAB counts days from the year 0; this is its number for 1970-01-01.
-_DATENUM_OF_UNIX_EPOCH = 719529
-_SECONDS_PER_DAY = 86400.0
+# Recordings are of this century.
+_EARLIEST_S, _LATEST_S = 946_684_800.0, 4_102_444_800.0
+# A line that is stamped late may seem to come after the next one.
+_LARGEST_DELAY_S = 2.0
+_LONGEST_ELAPSED_S = 31 * 86_400.0
+# Boards send a line every 0.02 to 5 s: the load cell's every 0.09 s, fingertips' every 0.54 s.
+_SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 # Among this many frames on either side, at least one should have been read without delay.
@@ -86,16 +91,76 @@ def find_streams(path: Path) -> tuple[str, ...]:
     return found
 
 
-def read_stream(path: Path, name: str | None = None) -> Stream:
+def read_stream(path: Path, name: str | None = None, time_format: str = DATENUM) -> Stream:
     """Return the stream "right", "left" or "load", by default the only fingertip's.
 
-    Raises UserError for a file that cannot be read or holds no such stream.
+    `time_format` is one of TIME_FORMATS. Raises UserError for a file that cannot be read or holds no such stream, and
+    for times that are not of this format.
     """
+    table = _table(path, name)
+    _check_times(path, table[:, 0], time_format)
+    return Stream(_unix_s(table[:, 0], time_format), np.ascontiguousarray(table[:, 1:]))
+
+
+def read_lines(path: Path, side: str | None = None) -> FloatArray:
+    """Return the lines (n, 1024) in volts of a fingertip's stream, whose times may be in any format.
+
+    Raises UserError as `read_stream` does.
+    """
+    return np.ascontiguousarray(_table(path, side)[:, 1:])
+
+
+def _table(path: Path, name: str | None) -> FloatArray:
     names = _STREAMS[name] if name is not None else (*_STREAMS["right"], *_STREAMS["left"])
     table, width = _one_of(path, _load(path), names), 1 if name == "load" else PAPER_TABLE.n_line_values
     if table.shape[1] != width + 1 or len(table) == 0:
         raise UserError(f"{path}: expected rows of one time and {counted(width, 'value')}, found {_size(table)}")
-    return Stream((table[:, 0] - _DATENUM_OF_UNIX_EPOCH) * _SECONDS_PER_DAY, np.ascontiguousarray(table[:, 1:]))
+    return table
+
+
+def _unix_s(times: FloatArray, time_format: str) -> FloatArray:
+    form = TIME_FORMATS[time_format]
+    return (times - form.epoch) * form.unit_s
+
+
+def _fits(times: FloatArray, time_format: str) -> bool:
+    """Return whether times (n,) in a format are plausible: of this century, or near 0, and about a line apart."""
+    form, t_s = TIME_FORMATS[time_format], _unix_s(times, time_format)
+    earliest_s, latest_s = (_EARLIEST_S, _LATEST_S) if form.has_date else (0.0, _LONGEST_ELAPSED_S)
+    if not (t_s.min() >= earliest_s and t_s.max() <= latest_s):
+        return False
+    return len(t_s) == 1 or _SHORTEST_STEP_S <= float(np.median(np.diff(t_s))) <= _LONGEST_STEP_S
+
+
+def _check_times(path: Path, times: FloatArray, time_format: str) -> None:
+    """Raise UserError, with what was found and the cure, unless times (n,) are of the format and do not fall."""
+    steps = np.diff(times)
+    if _fits(times, time_format):
+        steps_s = steps * TIME_FORMATS[time_format].unit_s
+        if len(steps_s) and steps_s.min() < -_LARGEST_DELAY_S:
+            row = int(np.argmin(steps_s)) + 2
+            raise UserError(
+                f"{path}: the time in row {row} is {-steps_s.min():.1f} s before that of row {row - 1}: the clock was "
+                "set back; import the rows before and after as two recordings"
+            )
+        return
+    found = f"the times begin with {times[0]:.10g}"
+    if len(steps):
+        found += f" and rise by {float(np.median(steps)):.3g} from row to row"
+    wrong = f"{path}: {found}, which is not {time_format}, {TIME_FORMATS[time_format].words}"
+    distinct = len(np.unique(times))
+    if len(steps) and np.median(steps) == 0:
+        single = ": they were saved in single precision" if np.array_equal(times, times.astype(np.float32)) else ""
+        raise UserError(
+            f"{path}: {counted(len(times), 'row')} have {counted(distinct, 'different time')}{single}; "
+            "save the times again as doubles"
+        )
+    fitting = [name for name in TIME_FORMATS if _fits(times, name)]
+    if fitting:
+        raise UserError(f"{wrong}; give --time-format {' or '.join(fitting)}")
+    raise UserError(
+        f"{wrong}, with a row every {_SHORTEST_STEP_S:g} to {_LONGEST_STEP_S:g} s; correct the first column"
+    )
 
 
 def read_line(path: Path) -> FloatArray:
@@ -189,11 +254,12 @@ class ImportResult:
     remarks: tuple[str, ...]
 
 
-def import_mat(sources: Sequence[Path], out: Path) -> ImportResult:
+def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -> ImportResult:
     """Write the streams of MATLAB files, or of folders of them, into one recording.
 
-    Time stamps are corrected, and damaged load values are left out. Raises UserError for a file without a stream, for
-    two streams of one side, and if there are no frames.
+    The times in the files are of `time_format`, one of TIME_FORMATS. Time stamps are corrected, and damaged load values
+    are left out. Raises UserError for a file without a stream, for two streams of one side, for other times, and if
+    there are no frames.
     """
     files = _mat_files(sources)
     streams: dict[str, Stream] = {}
@@ -201,11 +267,13 @@ def import_mat(sources: Sequence[Path], out: Path) -> ImportResult:
         for name in find_streams(path):
             if name in streams:
                 raise UserError(f"{path} is a second stream of {name}; import one recording at a time")
-            streams[name] = read_stream(path, name)
+            streams[name] = read_stream(path, name, time_format)
     load = streams.pop("load", None)
     if not streams:
         raise UserError("the files hold no frames of a fingertip; name those of the right or left side as well")
     remarks: list[str] = []
+    if not TIME_FORMATS[time_format].has_date:
+        remarks.append("The files name no date, so the recording's times begin on 1970-01-02.")
     notes: dict[str, str] = {}
     sure = True
     if load is None:

@@ -13,8 +13,18 @@ from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat, savemat
 
 from shearloop.bank.matlab_file import MatFileError, read_variables
+from shearloop.cli import main
+from shearloop.daemon.recorder.writer import new_recording
 from shearloop.errors import UserError
-from shearloop.tools.recordings.matlab_import import read_diameter_slices, read_line, read_stream, read_torque_slices
+from shearloop.tools.recordings.matlab_import import (
+    import_mat,
+    read_diameter_slices,
+    read_line,
+    read_stream,
+    read_torque_slices,
+)
+from shearloop.tools.recordings.reader import summarise
+from shearloop.tools.recordings.time_formats import TIME_FORMATS
 
 # 2024-12-03 16:09:38 on MATLAB's count of days.
 DATENUM = 739589 + (16 * 3600 + 9 * 60 + 38) / 86400
@@ -224,6 +234,122 @@ def test_matrices_round_trip(variables, compressed):
         matrix = found[name]
         assert matrix.shape == values.shape
         np.testing.assert_array_equal(matrix, values.astype(np.float64))
+
+
+def opaque(name: bytes, class_name: bytes, order: str) -> bytes:
+    """An object as MATLAB saves it: a reference into the file's nameless last variable."""
+    reference = element(6, struct.pack(f"{order}II", 13, 0), order) + element(5, struct.pack(f"{order}ii", 1, 1), order)
+    reference += element(1, b"", order) + element(6, struct.pack(f"{order}I", 0xDD000000), order)
+    inside = element(6, struct.pack(f"{order}II", 17, 0), order)
+    inside += element(1, name, order) + element(1, b"MCOS", order) + element(1, class_name, order)
+    return element(14, inside + element(14, reference, order), order)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_an_object_beside_the_data_is_skipped(order):
+    content = written_by_hand(order, 3, struct.pack(f"{order}4h", 1, 2, 3, 4)) + opaque(b"when", b"datetime", order)
+    nameless = element(6, struct.pack(f"{order}II", 9, 0), order) + element(5, struct.pack(f"{order}ii", 1, 8), order)
+    content += element(14, nameless + element(1, b"", order) + element(2, bytes(8), order), order)
+    found = read_variables(content)
+    np.testing.assert_array_equal(found["x"], loadmat(io.BytesIO(content))["x"])
+    assert found["when"] == "an object of the class datetime"
+    assert found.keys() == {"x", "when"}
+
+
+def test_an_object_without_names_is_damage():
+    damaged = opaque(b"when", b"date\xff\xff\xff\xff", "<")
+    with pytest.raises(MatFileError, match="an object without proper names"):
+        read_variables(saved({})[:128] + damaged)
+
+
+# 2024-12-03 16:09:38 in seconds since 1970.
+UNIX_S = (DATENUM - 719529) * 86400
+WRITTEN = {
+    "datenum": lambda t_s: (UNIX_S + t_s) / 86400 + 719529,
+    "unix": lambda t_s: UNIX_S + t_s,
+    "unix-ms": lambda t_s: 1e3 * (UNIX_S + t_s),
+    "excel": lambda t_s: (UNIX_S + t_s) / 86400 + 25569,
+    "elapsed": lambda t_s: t_s,
+    "elapsed-ms": lambda t_s: 1e3 * t_s,
+}
+
+
+def save_times(path, times) -> None:
+    savemat(path, {"Load_Data": np.column_stack([times, np.zeros(len(times))]).astype(times.dtype)})
+
+
+@pytest.mark.parametrize("form", TIME_FORMATS)
+@pytest.mark.parametrize("step_s", [0.0916, 0.54])
+def test_times_of_every_format_are_read_and_named_where_they_are_not_datenum(tmp_path, form, step_s):
+    t_s = step_s * np.arange(50)
+    save_times(tmp_path / "a.mat", WRITTEN[form](t_s))
+    began_s = UNIX_S if TIME_FORMATS[form].has_date else 86400.0
+    stream = read_load_stream(tmp_path / "a.mat", time_format=form)
+    np.testing.assert_allclose(stream.unix_s, began_s + t_s, atol=2e-5)
+    for other in TIME_FORMATS.keys() - {form}:
+        with pytest.raises(UserError) as refusal:
+            read_load_stream(tmp_path / "a.mat", time_format=other)
+        said = str(refusal.value)
+        assert f"a.mat: the times begin with {WRITTEN[form](0.0):.10g} and rise by" in said
+        assert f"which is not {other}, " in said
+        assert said.endswith(f"; give --time-format {form}")
+
+
+@pytest.mark.parametrize("form", ["datenum", "unix", "unix-ms", "excel"])
+def test_times_in_single_precision_are_refused(tmp_path, form):
+    save_times(tmp_path / "a.mat", WRITTEN[form](0.54 * np.arange(301)).astype(np.float32))
+    for read_as in TIME_FORMATS:
+        with pytest.raises(
+            UserError, match=r"301 rows have \d different times?: they were saved in single precision; save"
+        ):
+            read_load_stream(tmp_path / "a.mat", time_format=read_as)
+
+
+@pytest.mark.parametrize(
+    ("times", "says"),
+    [
+        (np.arange(9.0) + 20241203, r"not datenum, .*; correct the first column"),
+        (
+            WRITTEN["datenum"](np.array([0, 0.5, 1.0, -4.0, -3.5])),
+            "the time in row 4 is 5.0 s before that of row 3: the clock was set back",
+        ),
+        (np.full(9, WRITTEN["unix"](0.3)), "9 rows have 1 different time; save the times again as doubles"),
+    ],
+)
+def test_other_times_are_refused(tmp_path, times, says):
+    save_times(tmp_path / "a.mat", times)
+    with pytest.raises(UserError, match=says):
+        read_load_stream(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("form", TIME_FORMATS)
+def test_a_recording_of_every_format_is_imported(tmp_path, form):
+    times = WRITTEN[form](0.54 * np.arange(30))
+    savemat(tmp_path / "right.mat", {"Right_Data": np.column_stack([times, np.ones((30, 1024))])})
+    imported = import_mat([tmp_path / "right.mat"], tmp_path / "a.mcap", form)
+    assert imported.frames == {"right": 30}
+    assert any("no date" in remark for remark in imported.remarks) is not TIME_FORMATS[form].has_date
+    summary = summarise(tmp_path / "a.mcap")
+    assert summary.topics["eit.frame.right"].rate_hz == pytest.approx(1 / 0.54, rel=0.01)
+    assert main(["import", "mat", str(tmp_path), "--out", str(tmp_path / "b.mcap"), "--time-format", form]) == 0
+
+
+def test_a_recording_longer_than_a_day_is_whole(tmp_path, capsys):
+    """No command says that it is damaged, because a repair would change nothing."""
+    path = tmp_path / "a.mcap"
+    with new_recording(path, "a test") as file:
+        for hour in (0, 25, 50):
+            t_ns = round(1e9 * (UNIX_S + 3600 * hour))
+            file.add_frame("right", t_ns, t_ns + 10**8, np.ones(1024))
+            file.add_torque(t_ns, 0.1)
+    assert main(["recording", "info", str(path)]) == 0
+    for form in ("csv", "parquet", "mat"):
+        assert main(["recording", "export", str(path), "--format", form, "--out", str(tmp_path / form)]) == 0
+    assert main(["recording", "export", str(path), "--format", "lerobot", "--out", str(tmp_path / "dataset")]) == 2
+    said = capsys.readouterr()
+    assert "messages span 25 hours, and a dataset holds 24 at most; export it with --format parquet" in said.err
+    assert "repair" not in said.out + said.err
+    assert "damaged" not in said.out + said.err
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

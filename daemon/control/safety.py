@@ -123,7 +123,7 @@ class FaultCode(Enum):
     DEVICE_LOST = Rule(
         _KEEP,
         "a device that the experiment needs is gone: {detail}.",
-        "Plug it in again; it is found automatically. Then the experiment can begin.",
+        "Plug it in again; it is found automatically. Then `shearloop command unlock`, and the experiment can begin.",
     )
     ROBOT_LOST = Rule(
         _KEEP,

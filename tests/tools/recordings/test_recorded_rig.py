@@ -62,6 +62,8 @@ async def test_a_full_disk_refuses_only_the_next_experiment(recorded_rig, tiny_b
             "robot.state", lambda state: state["seq"] > seq + 5 and state["wrist_speed_rad_per_s"] > 0.005
         )
         assert (await command("stop"))["stopped"] == "test"
+        while not (await command("unlock"))["ok"]:
+            pass
         refused = await command("start", experiment=path)
         assert not refused["ok"]
         assert FaultCode.RECORDING_FAILED.value.kind in refused["reason"]

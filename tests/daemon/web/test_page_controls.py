@@ -159,12 +159,12 @@ def test_a_refusal_goes_after_some_seconds(browsed):
 def test_a_phone_shows_the_chart_on_its_first_screen(browsed):
     page = browsed.open(token=True)
     page.set_viewport_size({"width": 390, "height": 844})
-    page.wait_for_function("() => document.querySelector('#torque').nextElementSibling.id === 'controls'")
+    page.wait_for_function("() => document.querySelector('#torque').nextElementSibling?.id === 'controls'")
     page.wait_for_selector("#torque-chart canvas")
     page.evaluate("window.scrollTo(0, 0)")
     box = page.locator("#torque-chart").bounding_box()
     page.set_viewport_size({"width": 1024, "height": 700})
-    page.wait_for_function("() => document.querySelector('#lead').nextElementSibling.id === 'controls'")
+    page.wait_for_function("() => document.querySelector('#lead').nextElementSibling?.id === 'controls'")
     assert box["y"] + box["height"] <= 700
     assert box["height"] >= 200
 

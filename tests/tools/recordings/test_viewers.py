@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import io
 import json
+import os
 import re
 import struct
 from pathlib import Path
@@ -200,6 +201,12 @@ def test_a_missing_extra_is_named(form, extra, tmp_path, mistake, monkeypatch):
     assert "pip install 'shearloop[foxglove]'" in mistake("view", "--foxglove", "0")
 
 
+def open_sockets() -> int:
+    """Return the number of sockets of this process."""
+    links = [Path(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd")]
+    return sum(link.is_socket() for link in links)
+
+
 @pytest.mark.usefixtures("foxglove_runtime")
 async def test_foxglove_gets_the_schema_and_each_message():
     """By the WebSocket protocol of Foxglove: a channel with its schema, then time and payload of each message."""
@@ -208,6 +215,7 @@ async def test_foxglove_gets_the_schema_and_each_message():
 
     message = sample(TOPICS["eit.heatmap"], source="right", t_mono_ns=10**9)
     content = decode(encode(wire_map(message, 1.5, 7)))
+    sockets_before = open_sockets()
     with FoxgloveServer(0) as server:
         with pytest.raises(UserError, match=r"--foxglove"):
             FoxgloveServer(server.port)
@@ -232,6 +240,10 @@ async def test_foxglove_gets_the_schema_and_each_message():
                 server.publish("eit.heatmap", content)
                 with contextlib.suppress(TimeoutError):
                     received = await socket.receive_bytes(timeout=0.2)
+    async with asyncio.timeout(20):
+        # The server's own thread closes its connections.
+        while open_sockets() > sockets_before:  # noqa: ASYNC110 - no event tells of it
+            await asyncio.sleep(0.01)
     code, subscribed, t_ns = struct.unpack_from("<BIQ", received)
     assert (code, subscribed, t_ns) == (1, 1, 1_500_000_000)
     assert json.loads(received[13:])["scores_shape"] == [2, 3]

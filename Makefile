@@ -42,10 +42,10 @@ system-packages:
 	command -v chromium >/dev/null || missing="$$missing chromium fonts-dejavu-core"; \
 	[ -z "$$missing" ] || { apt-get update -qq -o Acquire::Retries=2 -o Acquire::http::Timeout=30 && apt-get install -y -qq --no-install-recommends $$missing; }
 
-# A stop, Ctrl-C and an end on request (3, 130, 143) are no errors of make: the demo has said what happened.
+# A person's stop (4), Ctrl-C (130) and an end on request (143) are no errors of make; a fault's stop is: the demo has said what happened.
 # The whole emulated rig; with RECORDING=FILE one fingertip that plays a recorded stream (.mat).
 demo: demo-python $(VENV)/.installed
-	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--play '$(RECORDING)') || case $$? in 3|130|143) ;; *) exit 1 ;; esac
+	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--play '$(RECORDING)') || case $$? in 4|130|143) ;; *) exit 1 ;; esac
 
 # Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards, by themselves,
 # because a robot stops when its computer is busy; they may be repeated twice, and the summary names them. Status 5:

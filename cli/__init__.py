@@ -79,8 +79,8 @@ OTHER_SPELLINGS = {"replay": ("recording", "replay"), "import": ("recording", "i
 # What may move the rig: no other word is taken for one of these.
 MOVING = frozenset({"start", "resume", "unlock", "release", "commission"})
 EXIT_OK, EXIT_USAGE = 0, 2
-# Of `run`: the experiment of `stop_when_done` did not finish.
-EXIT_UNFINISHED = 3
+# Of `run`, whose experiment of `stop_when_done` did not finish: it was stopped by a fault, or by a person.
+EXIT_UNFINISHED, EXIT_STOPPED = 3, 4
 
 _FIRST_STEPS = """First steps without devices: `shearloop demo`.
 With your own: `shearloop init DIR` writes a configuration, `shearloop ports` shows the devices' names,

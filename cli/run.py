@@ -44,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Ends at Ctrl-C, SIGTERM, a closed terminal, `shearloop command stop`, or with the experiment if the "
         "configuration says stop_when_done. Exit status: 0 it ended as requested, 2 it could not run (and why), "
-        "3 the experiment of stop_when_done was stopped before its end."
+        "3 a fault stopped the experiment of stop_when_done, 4 a person stopped it."
     )
 
 
@@ -101,7 +101,7 @@ def _run_config(
 ) -> int:
     import structlog
 
-    from shearloop.cli import EXIT_OK, EXIT_UNFINISHED
+    from shearloop.cli import EXIT_OK, EXIT_STOPPED, EXIT_UNFINISHED
     from shearloop.cli.emulator_processes import EmulatedDevices
     from shearloop.cli.terminal import StatusLine, print_estimate
     from shearloop.daemon.app import run_daemon
@@ -138,7 +138,9 @@ def _run_config(
         finally:
             if at_end and summary.text:
                 at_end.write(f"\n{printable(summary.text)}\n\n")
-    return EXIT_OK if finished else EXIT_UNFINISHED
+    if finished:
+        return EXIT_OK
+    return EXIT_STOPPED if summary.ended_as_asked else EXIT_UNFINISHED
 
 
 def _config(args: argparse.Namespace) -> "DaemonConfig":

@@ -113,6 +113,8 @@ class RunSummary:
         """Take the output for each summary, if any, an emulated rig, which adds its true torque, and a first line."""
         self._heading = heading
         self.text = ""
+        # Whether no experiment has been stopped by anything but a person.
+        self.ended_as_asked = True
         self._out = out
         self._emulated = emulated
         self._run: _Run | None = None
@@ -135,6 +137,7 @@ class RunSummary:
         _update(run, content)
         if phase in _ENDS:
             self._run = None
+            self.ended_as_asked = phase == "done" or _was_asked_for(content)
             rig = self._emulated
             lines = list(_lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent))
             if rig is not None and phase != "done" and _LATE_FAULTS.intersection(_codes(content)):
@@ -148,6 +151,11 @@ class RunSummary:
         self.text = f"{self.text}\n{text}".lstrip("\n")
         if self._out is not None:
             self._out.write(f"\n{printable(text)}\n\n")
+
+
+def _was_asked_for(content: Mapping[str, Any]) -> bool:
+    """Return whether a person stopped the experiment of a `loop.state`."""
+    return bool(_ASKED_FOR.intersection(_codes(content)[:1]))
 
 
 def _codes(content: Mapping[str, Any]) -> list[str]:
@@ -202,7 +210,7 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
 
 def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[str]:
     done = run.last["phase"] == "done"
-    took_s, asked_for = _elapsed_s(run.first, run.last), bool(_ASKED_FOR.intersection(_codes(run.last)[:1]))
+    took_s, asked_for = _elapsed_s(run.first, run.last), _was_asked_for(run.last)
     ended = "done" if done else "stopped as asked" if asked_for else "STOPPED before its end"
     yield f"What happened: {run.first['experiment']!r} was {ended}, after {took_s:.0f} s."
     if not done:

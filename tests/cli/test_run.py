@@ -225,7 +225,7 @@ def waiting_config(ur_rtde, config, tmp_path) -> Path:  # noqa: ARG001 - it skip
 
 
 @pytest.mark.usefixtures("default_signals")
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 3), (signal.SIGHUP, 0)])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 4), (signal.SIGHUP, 0)])
 async def test_an_unfinished_experiment_sets_the_exit_status(number, status, waiting_config):
     async with shearloop("run", str(waiting_config)) as daemon:
         while b"waiting to start" not in (line := await daemon.stderr.readline()):

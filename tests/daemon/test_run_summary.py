@@ -183,6 +183,23 @@ def test_a_stop_that_was_asked_for_is_no_error(code):
     assert "STOPPED" not in text
 
 
+@pytest.mark.parametrize(
+    ("phase", "code", "as_asked"),
+    [
+        ("done", "", True),
+        ("stopped", FaultCode.OPERATOR_STOP.text, True),
+        ("stopped", FaultCode.TORQUE_LIMIT.text, False),
+        ("stopped", f"{FaultCode.TORQUE_LIMIT.text}, {FaultCode.OPERATOR_STOP.text}", False),
+    ],
+)
+def test_the_summary_tells_a_persons_stop_from_a_faults(phase, code, as_asked):
+    summary = RunSummary()
+    assert summary.ended_as_asked
+    for content in (loop_state(0), loop_state(5, phase=phase, faults=code)):
+        summary("loop.state", content)
+    assert summary.ended_as_asked is as_asked
+
+
 def test_the_times_of_a_stop_follow_the_summary():
     times = {"decided_after_s": 0.004, "sent_after_s": 0.006, "stands_after_s": None}
     stop = {"source": "stop", "t_mono_ns": 5 * S, **times}

@@ -104,8 +104,8 @@ def test_what_the_robot_slows_down_is_said(tmp_path, ran):
     steps = ({"do": "turn_to", "angle_rad": 1, "speed_rad_per_s": 3}, {"do": "approach", "along_tool_m": 0.1,
              "speed_m_per_s": 0.5})  # fmt: skip
     said = ran("check", written(tmp_path, *steps), "--config", rig(tmp_path)).out
-    assert "the robot's limit allows 0.5 rad/s" in said
-    assert "the robot's limit allows 0.1 m/s" in said
+    assert "the robot's limit allows 0.2 rad/s" in said
+    assert "the robot's limit allows 0.05 m/s" in said
 
 
 def test_an_option_for_experiments_is_refused_for_a_configuration(tmp_path, mistake):

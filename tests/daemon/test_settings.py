@@ -119,7 +119,7 @@ def test_no_default_stands_twice():
 @pytest.mark.parametrize("where", ["loop", "robot"])
 def test_the_wrists_acceleration_reaches_controller_identification_and_robot(where, tmp_path):
     """The lower one of loop and robot counts; half of it is planned with, the robot may use all."""
-    settings = yaml.safe_load(Path("config/ur.yaml").read_text())
+    settings = yaml.safe_load(Path("config/demo_ur.yaml").read_text())
     if where == "robot":
         settings["limits"]["wrist_acceleration_rad_per_s2"]["inner"] = 1.5
     (tmp_path / "ur.yaml").write_text(yaml.safe_dump(settings))

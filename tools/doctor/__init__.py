@@ -7,12 +7,15 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import missing_library
+from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 from shearloop.tools.check import CheckEmulators, check_parts
 from shearloop.tools.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
@@ -47,6 +50,8 @@ def examine(
     yield good("configuration", f"{config_path} is in order")
     yield check_disk(Path() if config.recording is None else config.recording.folder)
     yield from check_files(config, config_path, check_emulators, geometry)
+    if config.robot is not None and not config.emulated:
+        yield from check_robot_values(config.robot)
     tasks = daemon_tasks(config.commands)
     if tasks is not None:
         yield good("daemon", f"answers at {config.commands}; it holds the devices and reports on them")
@@ -154,6 +159,31 @@ def check_files(
         if name != "keys" and finding.found not in [one.found for one in banks]:
             yield finding
     yield check_keys(config.curve, config.network_addresses)
+
+
+def check_robot_values(path: Path) -> Iterator[Finding]:
+    """Name what the robot's settings in `path` still have from `shearloop init`, or leave open."""
+    with resources.as_file(resources.files("shearloop") / "config" / "ur.yaml") as delivered:
+        initial = read_settings(delivered)
+    try:
+        settings = read_settings(path)
+    except DriverError:
+        # The mistakes are among the findings on files.
+        return
+    subject = "robot's settings"
+    if settings.limits.workspace == initial.limits.workspace:
+        means = "the arm may reach whatever stands within it"
+        yield note(
+            subject, f"{path}: limits.workspace is as `init` wrote it", means, "enter the free space of your cell"
+        )
+    if settings.tool.payload_kg is None:
+        means = "a wrong payload or tool centre point on the pendant is not noticed"
+        yield note(
+            subject,
+            f"{path}: there is no `tool.payload_kg`",
+            means,
+            "enter the pendant's payload and tool centre point",
+        )
 
 
 def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = None) -> Finding:

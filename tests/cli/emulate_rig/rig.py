@@ -86,7 +86,7 @@ def kit_at(rig: RigProcess, side: str) -> EitKit:
 @asynccontextmanager
 async def arm_at(rig: RigProcess) -> AsyncIterator[UrRobot]:
     pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
-    settings = read_settings(Path(__file__).parents[3] / "config" / "ur.yaml")
+    settings = read_settings(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
     arm = UrRobot(dataclasses.replace(settings, host=rig.host), LinkMonitor())
     async with running(arm.run()):
         await until(arm, lambda state: state.program_running and not state.recovering)

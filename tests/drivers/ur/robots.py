@@ -19,7 +19,7 @@ from shearloop.emulators.ur_robot import Robot
 ROOT = Path(__file__).parents[3]
 
 
-DELIVERED = read_settings(ROOT / "config" / "ur.yaml")
+DELIVERED = read_settings(ROOT / "config" / "demo_ur.yaml")
 # Controllers whose scripts differ.
 VERSIONS = [(3, 10), (5, 4), (5, 17), (5, 25), (10, 10)]
 # The commands of ur-rtde's script, and the cycle of its controller.

@@ -45,19 +45,24 @@ def replace_file(path: Path) -> Iterator[BinaryIO]:
 
     Raises OSError where it cannot be written; `path` is then unchanged, but for a folder that the disk cannot flush.
     """
+    with replaced_path(path) as written, written.open("wb") as file:
+        yield file
+
+
+@contextmanager
+def replaced_path(path: Path) -> Iterator[Path]:
+    """Yield the path of a file to write, as `replace_file` does, for a library that opens it itself."""
     if path.exists() and not path.is_file():
         # A pipe or /dev/stdout is written to, not replaced; a folder raises OSError.
-        with path.open("wb") as there:
-            yield there
+        yield path
         return
     # The target of a link is replaced, and the link stays.
     path = path.resolve()
     # A fixed name: the next writer reuses the file of one that was killed.
     temporary = path.with_name(f"{path.name}.tmp")
     try:
-        with temporary.open("wb") as file:
-            yield file
-            file.flush()
+        yield temporary
+        with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
         sync_directory(path.parent)

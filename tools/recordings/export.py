@@ -1,10 +1,11 @@
 """Exports topics of a recording as tables: CSV or Parquet, a file per topic, or MATLAB, all topics in a file."""
 
+import io
 import re
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from pydantic_core import to_json
@@ -12,6 +13,7 @@ from scipy.io import savemat
 
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
+from shearloop.files import replace_file
 from shearloop.tools.recordings.columns import columns
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import read_messages
@@ -33,7 +35,7 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
 
     For csv and parquet `out` is a folder. For mat it is a file; a large recording continues in NAME_2.mat, NAME_3.mat,
     and so on, which must not exist. `progress` receives the number of messages so far. Raises UserError for a recording
-    that cannot be read, and OSError for files that cannot be written.
+    that cannot be read, and OSError for files that cannot be written; then no file is new or changed.
     """
     if form == "mat":
         return _export_mat(path, out, topics, progress)
@@ -44,30 +46,39 @@ def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) ->
     def part(number: int) -> Path:
         return out.with_name(f"{out.stem}_{number}{out.suffix}") if number > 1 else out
 
-    if part(2).exists():
-        raise UserError(f"{part(2)} exists and would look like a part of this export; remove it, or use another --out")
+    def check_new(target: Path) -> None:
+        if target.exists():
+            raise UserError(
+                f"{target} exists and would look like a part of this export; remove it, or use another --out"
+            )
+
+    check_new(part(2))
     written: list[Path] = []
     names = _struct_names(topics)
     waiting: dict[str, Rows] = {topic: [] for topic in topics}
     size = 0
 
-    def write() -> None:
-        structs = {name: arrays(waiting[topic]) for topic, name in names.items() if waiting[topic]}
-        target = part(len(written) + 1)
-        # savemat changes names and hides the reason if it opens the file itself.
-        with target.open("xb" if written else "wb") as file:
+    with ExitStack() as files:
+
+        def write() -> None:
+            structs = {name: arrays(waiting[topic]) for topic, name in names.items() if waiting[topic]}
+            target = part(len(written) + 1)
+            if written:
+                check_new(target)
+            # savemat changes names and hides the reason if it opens the file itself.
+            file = files.enter_context(replace_file(target))
             # The stubs allow only names.
             savemat(file, structs, long_field_names=True, oned_as="column")  # type: ignore[arg-type]
-        written.append(target)
+            written.append(target)
 
-    for topic, row in read_rows(path, topics, progress):
-        waiting[topic].append(row)
-        size += sum(value.size if isinstance(value, np.ndarray) else _KEY_SIZE for value in row.values())
-        if size >= _MAT_SIZE:
+        for topic, row in read_rows(path, topics, progress):
+            waiting[topic].append(row)
+            size += sum(value.size if isinstance(value, np.ndarray) else _KEY_SIZE for value in row.values())
+            if size >= _MAT_SIZE:
+                write()
+                waiting, size = {topic: [] for topic in topics}, 0
+        if size or not written:
             write()
-            waiting, size = {topic: [] for topic in topics}, 0
-    if size or not written:
-        write()
     return written
 
 
@@ -88,28 +99,30 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
     if form == "parquet":
         require("pyarrow", "export", "Parquet")
     out.mkdir(parents=True, exist_ok=True)
-    files = {topic: out / f"{topic}.{form}" for topic in topics}
+    paths = {topic: out / f"{topic}.{form}" for topic in topics}
     tables: dict[str, _CsvTable | _ParquetTable] = {}
-    with ExitStack() as stack:
+    # Every table ends before the first file is replaced.
+    with ExitStack() as files, ExitStack() as ends:
         for topic, content, message in read_messages(path, topics, progress):
             row = row_of(content, message.log_time)
             if topic not in tables:
-                made = _CsvTable(files[topic], row) if form == "csv" else _ParquetTable(files[topic], topic, row)
-                stack.callback(made.close)
+                file = files.enter_context(replace_file(paths[topic]))
+                made = _CsvTable(paths[topic], file, row) if form == "csv" else _ParquetTable(file, topic, row)
+                ends.callback(made.close)
                 tables[topic] = made
             tables[topic].add(row)
-    return list(files.values())
+    return list(paths.values())
 
 
 class _CsvTable:
     """A table with one column per array element, after the other columns: channels_0, channels_1, …"""
 
-    def __init__(self, path: Path, first: dict[str, Any]) -> None:
-        """Write the names of the columns, as in the first row."""
+    def __init__(self, path: Path, file: BinaryIO, first: dict[str, Any]) -> None:
+        """Write the names of the columns, as in the first row; `path` is for messages."""
         self._path = path
         self._scalars = [key for key, value in first.items() if not isinstance(value, list)]
         self._lengths = {key: len(value) for key, value in first.items() if isinstance(value, list)}
-        self._file = path.open("w", newline="", encoding="utf-8")
+        self._file = io.TextIOWrapper(file, newline="", encoding="utf-8")
         elements = [f"{key}_{i}" for key, length in self._lengths.items() for i in range(length)]
         self._file.write(",".join([*self._scalars, *elements]) + "\r\n")
 
@@ -127,8 +140,8 @@ class _CsvTable:
         self._file.write(",".join(cells) + "\r\n")
 
     def close(self) -> None:
-        """End the file."""
-        self._file.close()
+        """Write what waits; the file stays open."""
+        self._file.detach()
 
 
 def _csv_cell(value: Any) -> str:
@@ -142,7 +155,7 @@ def _csv_cell(value: Any) -> str:
 class _ParquetTable:
     """A table with the types of the topic's schema, written in batches; missing elements of arrays are NaN."""
 
-    def __init__(self, path: Path, topic: str, first: dict[str, Any]) -> None:
+    def __init__(self, file: BinaryIO, topic: str, first: dict[str, Any]) -> None:
         """Begin the file with the columns of the first row."""
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -156,7 +169,7 @@ class _ParquetTable:
         self._arrays = [field.name for field in self._schema if field.type == pa.list_(pa.float64())]
         scalars = [field.name for field in self._schema if not pa.types.is_list(field.type)]
         # Measured values seldom repeat: a dictionary of them would only cost time, and so would limits of arrays.
-        self._writer = pq.ParquetWriter(path, self._schema, use_dictionary=False, write_statistics=scalars)
+        self._writer = pq.ParquetWriter(file, self._schema, use_dictionary=False, write_statistics=scalars)
         self._rows: Rows = []
         self._rows_at_once = 1 + _BATCH // sum(len(value) if isinstance(value, list) else 1 for value in first.values())
 
@@ -169,7 +182,7 @@ class _ParquetTable:
             self._write()
 
     def close(self) -> None:
-        """Write what waits, and end the file."""
+        """Write what waits, and end the table."""
         if self._rows:
             self._write()
         self._writer.close()

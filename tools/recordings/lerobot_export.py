@@ -6,9 +6,10 @@ policy could have used it. Missing values are NaN, and `valid` is 1 or 0.
 
 import heapq
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from shearloop.daemon.messaging.messages import (
 )
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
+from shearloop.files import replace_file
 from shearloop.tools.recordings.columns import ContentError, check_length
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
@@ -128,7 +130,7 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
     """Write topics of a recording as a dataset in the folder `out` and return its files; others are left out.
 
     Raises OSError for files that cannot be written, and UserError without pyarrow, for a recording that cannot be
-    read, and for one without a topic of a dataset.
+    read, for one of more than 24 hours, and for one without a topic of a dataset; then no file is new or changed.
     """
     require("pyarrow", "export", "a LeRobot dataset")
     with open_recording(path) as recording:
@@ -140,21 +142,43 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
             raise ContentError(f"the attachment {schema.CONFIGURATION} is not JSON ({error})") from error
     if not held:
         raise UserError(f"{path}: nothing to export; a dataset needs one of the topics {', '.join(_FEATURES)}")
-    dataset = _Dataset(out, held)
-    dataset.write_rows(path, progress)
+    _check_span(path, held)
     experiment = recording.metadata.get(schema.EXPERIMENT_METADATA, {}).get("name", "no experiment")
     about = {"recording": path.name, "identity": recording.identity, "configuration": configuration}
-    return dataset.finish(experiment, about, attachments)
+    with ExitStack() as files:
+        dataset = _Dataset(out, held, files)
+        dataset.write_rows(path, progress)
+        return dataset.finish(experiment, about, attachments)
+
+
+def _check_span(path: Path, topics: Iterable[str]) -> None:
+    """Raise UserError for a recording that is too long, before a row of it is computed."""
+    first_ns: int | None = None
+    with open_recording(path) as recording:
+        for _, message in recording.messages(topics):
+            first_ns = message.log_time if first_ns is None else first_ns
+            _check_length(path, first_ns, max(message.publish_time, message.log_time))
+
+
+def _check_length(path: Path, first_ns: int, known_ns: int) -> None:
+    if known_ns - first_ns > _LONGEST_NS:
+        hours = (known_ns - first_ns) / 3.6e12
+        raise UserError(
+            f"{path}: its messages span {hours:.0f} hours, and a dataset holds 24 at most; export it with "
+            "--format parquet"
+        )
 
 
 class _Dataset:
     """The files of a dataset of one episode."""
 
-    def __init__(self, out: Path, held: Mapping[str, _Held]) -> None:
+    def __init__(self, out: Path, held: Mapping[str, _Held], replaced: ExitStack) -> None:
+        """Take the folder, and what replaces its files at the end."""
         import pyarrow as pa
 
         self._out = out
         self._files: list[Path] = []
+        self._replaced = replaced
         self._held = held
         vectors = {one.feature: ("float32", one.names) for one in held.values()}
         vectors[_AGE] = ("float32", [one.feature.removeprefix("observation.") for one in held.values()])
@@ -198,7 +222,7 @@ class _Dataset:
         self._write_json("meta/shearloop.json", {**about, "started_unix_ns": self._started_ns})
         for name, data in attachments.items():
             parts = [part for part in Path(name).parts if part not in ("/", "..")]
-            self._new("/".join(("meta/attachments", *parts))).write_bytes(data)
+            self._new("/".join(("meta/attachments", *parts))).write(data)
         self._write_tasks(task)
         files = dict.fromkeys(("data/chunk_index", "data/file_index"), 0)
         files |= dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), 0)
@@ -215,12 +239,8 @@ class _Dataset:
             if number == 0:
                 self._started_ns = message.log_time
             known_ns = max(message.publish_time, message.log_time, content.get(schema.ARRIVAL) or 0)
-            if known_ns - self._started_ns > _LONGEST_NS:
-                hours = (known_ns - self._started_ns) / 3.6e12
-                raise UserError(
-                    f"{path}: its messages span {hours:.0f} hours, and a dataset holds 24 at most; export it with "
-                    "--format parquet"
-                )
+            # An arrival has its own time.
+            _check_length(path, self._started_ns, known_ns)
             heapq.heappush(waiting, (known_ns, number, topic, content, message.log_time))
             while waiting[0][0] < message.log_time:
                 yield heapq.heappop(waiting)
@@ -278,11 +298,11 @@ class _Dataset:
         pq.write_table(table.replace_schema_metadata(metadata), self._new(name))
 
     def _write_json(self, name: str, content: Any) -> None:
-        self._new(name).write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+        self._new(name).write(json.dumps(content, indent=1, ensure_ascii=False).encode())
 
-    def _new(self, name: str) -> Path:
-        """Return the path of a file in the dataset, in a folder that exists."""
+    def _new(self, name: str) -> BinaryIO:
+        """Return a new file of the dataset, which stands in its place at the end."""
         path = self._out / name
         path.parent.mkdir(parents=True, exist_ok=True)
         self._files.append(path)
-        return path
+        return self._replaced.enter_context(replace_file(path))

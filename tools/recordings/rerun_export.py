@@ -1,6 +1,7 @@
 """Writes a recording for the Rerun viewer: scalars with their intervals, images of the bank's match, and the robot."""
 
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatma
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.web.message_store import conductivity_profile
 from shearloop.errors import require
+from shearloop.files import replaced_path
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import read_messages
 
@@ -144,10 +146,10 @@ def export_rerun(
     Raises OSError for a file that cannot be written, UserError without rerun-sdk and for an unreadable recording.
     """
     require("rerun", "rerun", "a file for Rerun")
-    # The SDK's own error is a sentence of its internals.
-    out.open("wb").close()
-    file = _RerunFile(out, fingertip)
-    for topic, content, message in read_messages(path, topics, progress):
-        file.add(topic, content, message.log_time)
-    file.close()
+    with replaced_path(out) as written:
+        # The SDK's own error is a sentence of its internals.
+        written.open("wb").close()
+        with closing(_RerunFile(written, fingertip)) as file:
+            for topic, content, message in read_messages(path, topics, progress):
+                file.add(topic, content, message.log_time)
     return out

@@ -52,30 +52,30 @@ def export_slices(
     """Write the slices of a recorded experiment with the key `slices` into folders of `out`.
 
     Returns the files, and how many holds have no slice by the reason. Existing slices stay. Raises OSError for files
-    that cannot be written, and UserError for a recording that cannot be read or has no such hold.
+    that cannot be written, and UserError, before the first file, for a recording that cannot be read or has no such
+    hold.
     """
     with open_recording(path) as recording:
         table = recording.table
-    sweep, written, missed = _Sweep(table), list[Path](), Counter[str]()
-    largest: _Slice | None = None
+    sweep, slices, missed = _Sweep(table), list[_Slice](), Counter[str]()
     # Only a control loop holds angles; imported recordings have none.
     used = [topic for topic in topics if schema.schema_name(topic) in _TOPICS] if LoopState.topic in topics else []
     for topic, content, _ in read_messages(path, used, progress):
         with refusing_content(path, topic):
             found = sweep.add(schema.schema_name(topic), content)
         if isinstance(found, _Slice):
-            written.append(_save_slice(out, found))
-            if found.diameter_mm is None and (largest is None or abs(found.torque_nm) > abs(largest.torque_nm)):
-                largest = found
+            slices.append(found)
         elif found is not None:
             missed[found] += 1
-    if not written and not missed:
+    if not slices and not missed:
         raise UserError(
             f"{path}: nothing to export; slices need an experiment with the key `slices` that holds angles, as "
             "config/experiments/torque_sweep.yaml"
         )
-    if largest is not None:
-        written += _save_raw(out / TORQUE_FOLDER, largest)
+    written = [_save_slice(out, one) for one in slices]
+    torques = [one for one in slices if one.diameter_mm is None]
+    if torques:
+        written += _save_raw(out / TORQUE_FOLDER, max(torques, key=lambda one: abs(one.torque_nm)))
     return written, missed
 
 

@@ -1,4 +1,5 @@
 import io
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -6,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.daemon.messaging.messages import TOPICS, wire_map
+from shearloop.daemon.messaging.messages import TOPICS, Message, wire_map
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import McapFile
 from shearloop.errors import UserError
@@ -60,11 +61,22 @@ class Sweep:
         written, missed = export_slices(self.path, out, list(RecordedTopics(self.path).counts))
         return [path.name for path in written], missed
 
+    def end_with(self, topic: str, **changes: Any) -> Path:
+        """Add a message with any keys, end the recording, and return it."""
+        self.t_s += PERIOD_S
+        kind = TOPICS[schema.schema_name(topic)]
+        content = json.loads(self._message_json(kind, {"source": "right"}))
+        self._file.add(topic, round(self.t_s * S), round(self.t_s * S), json.dumps({**content, **changes}).encode())
+        self._file.close(self.path)
+        return self.path
+
     def _add(self, topic: str, content: dict[str, Any]) -> None:
         t_ns = round(self.t_s * S)
-        kind = TOPICS[schema.schema_name(topic)]
-        wire = wire_map(sample(kind, t_mono_ns=t_ns, **content), t_ns / S, 0)
-        self._file.add(topic, t_ns, t_ns, schema.message_json(kind.topic, wire, 0))
+        self._file.add(topic, t_ns, t_ns, self._message_json(TOPICS[schema.schema_name(topic)], content))
+
+    def _message_json(self, kind: type[Message], content: dict[str, Any]) -> bytes:
+        t_ns = round(self.t_s * S)
+        return schema.message_json(kind.topic, wire_map(sample(kind, t_mono_ns=t_ns, **content), t_ns / S, 0), 0)
 
 
 def test_each_hold_becomes_a_slice_for_reproduce(tmp_path):

@@ -1,0 +1,74 @@
+"""An export that a later message ends leaves no file of its own, and changes none that was there."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shearloop.tools.recordings import export, lerobot_export
+from tests.tools.recordings.test_matlab_slices import Sweep
+
+pytestmark = pytest.mark.usefixtures("rerun_runtime")
+FORMS = ("csv", "parquet", "mat", "rrd", "lerobot", "slices")
+# Each key is one that slices use.
+STRANGE: list[tuple[str, dict[str, Any], str]] = [
+    ("load.torque", {"other": 1}, "it has the unknown key 'other'"),
+    ("eit.frame.right", {"line": [[1.0], 2.0]}, "line is [[1.0], 2.0]"),
+    ("gripper.state", {"diameter_mm": "wide"}, "diameter_mm is 'wide', not a number"),
+    ("loop.state", {"hold": 1.5}, "hold is 1.5"),
+]
+# A dataset has no states of the loop.
+CASES = [(form, *one) for form in FORMS for one in STRANGE if (form, one[0]) != ("lerobot", "loop.state")]
+
+
+def sweep(folder: Path) -> Sweep:
+    """Begin a recording of two held angles."""
+    folder.mkdir()
+    begun = Sweep(folder)
+    begun.gripped(20.0)
+    begun.hold(1, 0.1)
+    begun.hold(2, 0.2)
+    return begun
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(("form", "topic", "changes", "problem"), CASES, ids=[" ".join(case[:2]) for case in CASES])
+def test_the_last_message_is_strange(form, topic, changes, problem, tmp_path, ran, mistake, monkeypatch):
+    if form in ("parquet", "lerobot"):
+        pytest.importorskip("pyarrow", reason="needs the extra `export`")
+    # Several batches of rows, and several MATLAB files.
+    monkeypatch.setattr(export, "_BATCH", 8000)
+    monkeypatch.setattr(export, "_MAT_SIZE", 40_000)
+    monkeypatch.setattr(lerobot_export, "_BATCH", 100)
+    whole = sweep(tmp_path / "whole").end_with("load.torque")
+    spoilt = sweep(tmp_path / "spoilt").end_with(topic, **changes)
+    for was_there in (False, True):
+        folder = tmp_path / f"out {was_there}"
+        folder.mkdir()
+        arguments = ("--format", form, "--out", folder / "x")
+        before = {}
+        if was_there:
+            ran("recording", "export", whole, *arguments)
+            before = files(folder)
+            assert before
+            # A second MATLAB file is refused at once.
+            for part in folder.glob("x_*"):
+                del before[part.name]
+                part.unlink()
+        said = mistake("recording", "export", spoilt, *arguments)
+        assert f"{spoilt}: a message cannot be used: {topic}" in said
+        assert problem in said
+        assert files(folder) == before
+
+
+def test_a_later_matlab_file_is_not_overwritten(tmp_path, mistake, monkeypatch):
+    monkeypatch.setattr(export, "_MAT_SIZE", 20_000)
+    whole = sweep(tmp_path / "whole").end_with("load.torque")
+    (tmp_path / "x_3.mat").write_bytes(b"mine")
+    said = mistake("recording", "export", whole, "--format", "mat", "--out", tmp_path / "x.mat")
+    assert f"{tmp_path}/x_3.mat exists and would look like a part of this export" in said
+    assert [path.name for path in tmp_path.glob("x*")] == ["x_3.mat"]
+    assert (tmp_path / "x_3.mat").read_bytes() == b"mine"

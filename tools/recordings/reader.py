@@ -337,7 +337,8 @@ class ListedRecording:
 def list_recordings(folder: Path) -> list[ListedRecording]:
     """Return the recordings in a folder and below it, those of a known beginning first and by it.
 
-    Reads the indices only. Raises UserError for a folder that is none.
+    Reads the indices only, but for recordings with log times of a wall clock, which are read whole. Raises UserError
+    for a folder that is none.
     """
     if not folder.is_dir():
         raise UserError(f"{folder} is no folder; `shearloop recording info FILE` shows one recording")
@@ -357,10 +358,17 @@ def _listed(path: Path) -> ListedRecording:
                 return ListedRecording(str(path), size, closed=False)
             counts = summary.statistics
             experiments = [one for one in reader.iter_metadata() if one.name == schema.EXPERIMENT_METADATA]
+            follows_wall_clock = any(
+                channel.topic == schema.CLOCK_TOPIC and not is_one_clock(channel.metadata)
+                for channel in summary.channels.values()
+            )
+            whole = summarise(path) if follows_wall_clock else None
     except UserError as error:
         return ListedRecording(str(path), size, closed=True, unreadable=str(error))
     first_ns = counts.message_start_time if counts.message_count else None
     duration_s = (counts.message_end_time - counts.message_start_time) / 1e9
+    if whole is not None:
+        first_ns, duration_s = whole.first_unix_ns, whole.duration_s
     names = tuple(one.metadata.get("name", "") for one in experiments)
     return ListedRecording(
         str(path), size, closed=True, first_unix_ns=first_ns, duration_s=duration_s, experiments=names

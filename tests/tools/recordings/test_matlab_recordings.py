@@ -16,6 +16,7 @@ from shearloop.bank.matlab_file import MatFileError, read_variables
 from shearloop.cli import main
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.errors import UserError
+from shearloop.tools.recordings import lerobot_export
 from shearloop.tools.recordings.matlab_import import (
     import_mat,
     read_diameter_slices,
@@ -350,6 +351,20 @@ def test_a_recording_longer_than_a_day_is_whole(tmp_path, capsys):
     assert "messages span 25 hours, and a dataset holds 24 at most; export it with --format parquet" in said.err
     assert "repair" not in said.out + said.err
     assert "damaged" not in said.out + said.err
+
+
+def test_a_dataset_of_more_than_a_day_is_refused_before_its_first_row(tmp_path, mistake, monkeypatch):
+    pytest.importorskip("pyarrow", reason="needs the extra `export`")
+    computed: list[int] = []
+    monkeypatch.setattr(lerobot_export._Dataset, "_row", lambda _, now_ns: computed.append(now_ns))
+    path = tmp_path / "a.mcap"
+    with new_recording(path, "a test") as file:
+        for minute in (0, 1, 2, 23 * 60, 25 * 60):
+            file.add_torque(round(1e9 * (UNIX_S + 60 * minute)), 0.1)
+    said = mistake("recording", "export", path, "--format", "lerobot", "--out", tmp_path / "dataset")
+    assert "its messages span 25 hours, and a dataset holds 24 at most" in said
+    assert computed == []
+    assert not (tmp_path / "dataset").exists()
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

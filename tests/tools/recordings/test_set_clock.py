@@ -1,6 +1,7 @@
 """A wall clock that is set during a recording, or a suspended computer, changes nothing that is read from it."""
 
 import asyncio
+import csv
 import io
 import json
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import zmq
 from mcap.reader import make_reader
+from scipy.io import loadmat
 from structlog.testing import capture_logs
 
 from shearloop.bank.channels import PAPER_TABLE
@@ -30,7 +32,8 @@ from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recorder.writer import McapFile
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.tools.frame_series import read_series
-from shearloop.tools.recordings.reader import read_messages, read_recording, repair, summarise
+from shearloop.tools.recordings.reader import list_recordings, read_messages, read_recording, repair, summarise
+from shearloop.tools.recordings.tables import read
 from tests.running import running
 from tests.sample_messages import sample
 
@@ -187,6 +190,13 @@ def test_info_has_the_same_rates_and_reports_the_step(plain, stepped, ran):
     assert "damaged" not in printed
 
 
+def test_a_list_has_the_times_of_info(plain, stepped):
+    (listed,) = (one for one in list_recordings(stepped.parent) if one.path == str(stepped))
+    truth = summarise(plain)
+    assert (listed.first_unix_ns, listed.duration_s) == (truth.first_unix_ns, truth.duration_s)
+    assert listed.experiments == ("twist",)
+
+
 def test_a_topic_that_begins_after_the_step_has_the_same_offset(plain, stepped):
     """What is read does not depend on which topics are read with it."""
     truth, found = ([one for _, one, _ in read_messages(path, [LATE_TOPIC])] for path in (plain, stepped))
@@ -198,6 +208,44 @@ def test_a_repaired_copy_has_the_same_times(plain, stepped, tmp_path):
     copy = repair(stepped, tmp_path / "copy.mcap").path
     np.testing.assert_array_equal(read_recording(copy).torque_t_ns, read_recording(plain).torque_t_ns)
     assert len(summarise(copy).clock_steps) == 1
+
+
+@pytest.mark.parametrize("age", ["new", "old"])
+@pytest.mark.parametrize("set_s", [-5.0, -2e-9], ids=["a step back", "a reading of the clocks"])
+def test_bunched_readings_keep_their_places_in_every_table(set_s, age, tmp_path, ran):
+    """Readings of one read of the port are a nanosecond apart, and the Unix stamps of some are reversed."""
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    clock = SetClock(set_s)
+    recorder = Recorder(tmp_path / "new", IDENTITY, clock)
+    recorder.record_experiment("twist")
+    recorder.input_recorder("load_cell").record(RawEvent(InputKind.DATA, 0, b"1"))
+    # The clock is set between two of them.
+    times = [STEP_AT_MS * MS + number for number in range(-4, 5)]
+    wall_ns = []
+    for number, clock.t_ns in enumerate(times):
+        clock.synchronise()
+        wall_ns.append(clock.t_ns + clock.offset_ns)
+        message = sample(LoadTorque, source="load_cell", t_mono_ns=clock.t_ns, torque_nm=number / 1000)
+        recorder.record_message(message.topic, wire_map(message, clock.unix_s(clock.t_ns), number))
+    recorder.close()
+    assert wall_ns != sorted(wall_ns)
+    (path,) = recorder.closed_files
+    path = by_the_wall_clock(path) if age == "old" else path
+    for form in ("csv", "parquet", "mat"):
+        ran("recording", "export", path, "--format", form, "--topic", "load.torque", "--out", tmp_path / form)
+    with (tmp_path / "csv" / "load.torque.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    struct = loadmat(tmp_path / "mat", squeeze_me=True)["load_torque"]
+    tables = {
+        "csv": {key: [row[key] for row in rows] for key in rows[0]},
+        "parquet": parquet.read_table(tmp_path / "parquet" / "load.torque.parquet").to_pydict(),
+        "mat": {key: struct[key].item() for key in struct.dtype.names},
+        "read": read(path)["load.torque"],
+    }
+    for name, table in tables.items():
+        assert [int(one) for one in table["t_mono_ns"]] == times, name
+        assert [float(one) for one in table["torque_nm"]] == [number / 1000 for number in range(9)], name
+        assert np.diff([int(one) for one in table["log_time_ns"]]).tolist() == [1] * 8, name
 
 
 def test_a_suspend_is_reported_and_changes_nothing_else(plain, tmp_path):

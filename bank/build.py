@@ -37,7 +37,7 @@ class RowSolver:
         (self.homogeneous,) = self._forward.voltages(np.ones((1, len(mesh.triangles))))
 
     def solve(self, row: int) -> BankRow:
-        """Return the cells of the k at `row`. A cell whose conductivity is not positive is not solved."""
+        """Return the cells of the k at `row`. A cell with a conductivity that is not positive is not solved."""
         k, sigmas = float(self._definition.k_grid[row]), self._definition.sigma_grid
         cells, smallest, n_solved = np.empty((len(sigmas), len(self._mesh.triangles))), np.empty(len(sigmas)), 0
         for cell, sigma in enumerate(sigmas.tolist()):

@@ -59,7 +59,7 @@ class ChannelTable:
 
     @cached_property
     def zero_slots(self) -> BoolArray:
-        """(L²,) True at the values of a line whose pair touches a driven electrode."""
+        """(L²,) True at the values of a line with a pair that touches a driven electrode."""
         pairs = self._pairs()
         return _read_only((pairs[:, :2, None] == pairs[:, None, 2:]).any(axis=(1, 2)))
 

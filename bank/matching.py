@@ -50,7 +50,7 @@ class Matcher(ABC):
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Take (K, S, n) difference signals, (K, S) validity, and the (K,) and (S,) grids.
 
-        Signals are not copied; those of invalid cells are never read. Raises MatchingError when no cell is valid, or a
+        Signals are not copied; invalid cells' signals are never read. Raises MatchingError when no cell is valid, or a
         valid cell has no signal.
         """
         if not valid.any():

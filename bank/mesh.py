@@ -1,4 +1,4 @@
-"""The geometry of a sensor: a triangle mesh whose boundary edges carry electrodes."""
+"""The geometry of a sensor: a triangle mesh with electrodes on its boundary edges."""
 
 import hashlib
 from dataclasses import dataclass

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 _SUBDIVISIONS = 5
-# Of a height, in shares of the fingertip's, in which two triangles are alike.
+# Equal triangles share these digits of their heights, each a fraction of the fingertip's height.
 _DIGITS = 12
 
 
@@ -110,7 +110,7 @@ def conductivity(mesh: "Mesh", model: str, k: float, sigma: float) -> FloatArray
 def _averaged_heights(mesh: "Mesh") -> tuple[FloatArray, IntArray, float]:
     """Return the heights (15, h) of the averaging points, the number (T,) of each triangle's, and the middle height.
 
-    Triangles whose corners have the same heights share theirs.
+    Triangles with the same heights of corners share theirs.
     """
     y = mesh.nodes[:, 1]
     # A triangle's mean does not depend on the order of its corners, nor on rounding.

@@ -11,7 +11,7 @@ orthogonal to it and ‖d‖ = ρ. For a frame y with g = Φᵀ y and t = ‖y �
 and for all cells with c within a radius e of a centre m, b·y ≤ m·g + e ‖g‖ + ρ t. The first direction of Φ is the mean
 signal. It is nowhere negative, and neither are the frames, so g₁ ≥ 0. With the largest c₁ of the cells in place of m₁,
 e and ‖g‖ need only cover the other directions, where a frame is far shorter. A bound is the product of a row (m, e, ρ)
-and a column (g, ‖g‖, t), so many bounds are one matrix product in float32.
+and a column (g, ‖g‖, t): one matrix product in float32 gives many bounds.
 """
 
 import heapq

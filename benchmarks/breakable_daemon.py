@@ -1,7 +1,7 @@
 """A daemon that breaks on request, for `benchmarks.stop_times`: `python -m benchmarks.breakable_daemon run CONFIG`.
 
-SIGUSR1 blocks its event loop for `BLOCKED_S`. SIGUSR2 makes the pipe to the robot's process lose what is written. Each
-writes its time in ns into the pipe `cause` beside the configuration.
+SIGUSR1 blocks its event loop for `BLOCKED_S`. SIGUSR2 makes the pipe to the robot's process lose each write. Each
+writes its time in ns into the pipe `cause` in the configuration's folder.
 """
 
 import gc

@@ -44,7 +44,7 @@ from shearloop.estimation.estimator_names import DEFAULT
 from shearloop.tools.calibrate import calibrate
 
 PACKAGE = Path(shearloop.__file__).resolve().parent
-# The rooms are links to folders beside each other.
+# The rooms are links to neighbouring folders.
 ROOMS = (PACKAGE, *(path.resolve() for path in PACKAGE.iterdir() if path.is_symlink()))
 SIDE = "right"
 TRACED = 5

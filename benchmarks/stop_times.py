@@ -84,7 +84,7 @@ ENDINGS = (
     Cause("protective stop", command="protective-stop"),
     Cause("emergency stop", command="emergency-stop"),
     Cause("RTDE lost", command="drop-rtde"),
-    # What the robot sends is lost; what it is sent arrives.
+    # Data from the robot is lost; data to the robot arrives.
     Cause("link open one way", command="silence robot 3"),
 )
 DEVICES = (
@@ -288,7 +288,7 @@ def measure(causes: Sequence[Cause], repeats: int, busy: int) -> dict[str, list[
 
 
 def draw(causes: Sequence[Cause], found: Mapping[str, Sequence[float]], busy: int, out: Path) -> None:
-    """Draw the times of each cause beside its promise, and write them."""
+    """Draw the times of each cause with its promise, and write the figure."""
     from shearloop.tools import drawing
 
     made = drawing.figure(8.0, 0.8 + 0.32 * len(causes))

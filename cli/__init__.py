@@ -79,7 +79,7 @@ OTHER_SPELLINGS = {"replay": ("recording", "replay"), "import": ("recording", "i
 # What may move the rig: no other word is taken for one of these.
 MOVING = frozenset({"start", "resume", "unlock", "release", "commission"})
 EXIT_OK, EXIT_USAGE = 0, 2
-# Of `run`, whose experiment of `stop_when_done` did not finish: it was stopped by a fault, or by a person.
+# Exit statuses of `run` with `stop_when_done`: a fault, or a person, stopped the experiment.
 EXIT_UNFINISHED, EXIT_STOPPED = 3, 4
 
 _FIRST_STEPS = """First steps without devices: `shearloop demo`.

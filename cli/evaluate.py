@@ -136,7 +136,7 @@ def _refuse_recipe(args: argparse.Namespace) -> None:
 
 
 def _leave_out(args: argparse.Namespace) -> int:
-    """Judge a recipe by what is left out of it, and print."""
+    """Judge a recipe on the blocks left out of each fit, and print the figures."""
     from shearloop.tools.calibrate import read_parts
     from shearloop.tools.evaluate import figures_by_load, figures_of, invalid_reasons, write_estimates
     from shearloop.tools.leave_out import Recipe, judge_left_out, sentences_of

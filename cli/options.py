@@ -117,7 +117,7 @@ def add_json(parser: argparse._ActionsContainer) -> None:
 
 
 def add_recipe(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how a calibration is made, besides `--bank`; `check_recipe` checks them."""
+    """Add the options that say how a calibration is made, except `--bank`; `check_recipe` checks them."""
     text = "estimator to calibrate (default: %(default)s)"
     parser.add_argument("--estimator", choices=ESTIMATORS, default=DEFAULT, help=text)
     add_option(parser, "--mesh", Path, "FILE", "a mesh, which the estimator reconstruction needs")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig, FingertipConfig
     from shearloop.drivers.ur.settings import UrSettings
 
-# The first of these addresses of this computer whose ports of robot and gripper are free plays them.
+# Robot and gripper are emulated on the first of these local addresses with free ports.
 LOOPBACKS = tuple(f"127.0.0.{number}" for number in range(1, 255))
 # Control cycles per second: twice the states that the daemon asks for, and gentle to this computer.
 EMULATED_RATE_HZ = "250"
@@ -23,7 +23,7 @@ ROBOT_PORTS = (29999, 30003, 30004)
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """The configuration to run, and the sentences that say what stands in for which device."""
+    """The configuration to run, and the sentences that name the emulator of each device."""
 
     config: "DaemonConfig"
     sentences: tuple[str, ...]
@@ -31,7 +31,7 @@ class Rehearsal:
 
 @contextlib.contextmanager
 def rehearsal(config: "DaemonConfig", path: Path) -> Iterator[Rehearsal]:
-    """Give the configuration whose devices are emulated; its ports and settings are in a temporary folder.
+    """Yield the configuration with emulated devices; its ports and settings are in a temporary folder.
 
     Every port, address and serial number of the configuration is replaced: none of the real devices is opened.
 
@@ -240,7 +240,7 @@ def _bank(name: str, fingertip: "FingertipConfig", path: Path) -> str:
 
 
 def _free_loopback() -> str:
-    """Return an address of this computer whose ports of robot and gripper are free."""
+    """Return an address of this computer with free ports for robot and gripper."""
     from shearloop.drivers.defaults import URCAP_PORT
 
     for host in LOOPBACKS:

@@ -94,7 +94,7 @@ class Daemon:
                     config.experiment, self._rig, autostart=config.autostart, daemon_end=daemon_end
                 )
             self.commands = Commands(
-                self._rig, self.sensors, self._experiment, self.health, self._end, partial(self._tell, clock)
+                self._rig, self.sensors, self._experiment, self.health, self._end, partial(self._report, clock)
             )
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)
@@ -158,11 +158,11 @@ class Daemon:
         """End `run` as soon as the tasks have ended."""
         self._end.set()
 
-    def _tell(self, clock: Clock, answered: Answered) -> None:
+    def _report(self, clock: Clock, answered: Answered) -> None:
         """Publish a command and its answer."""
         name, request, refusal = answered
         subject = request.get("experiment") or request.get("source")
-        told = DaemonCommand(
+        answer = DaemonCommand(
             source="daemon",
             t_mono_ns=clock.now_ns(),
             command=name,
@@ -171,7 +171,7 @@ class Daemon:
             accepted=refusal is None,
             reason=refusal or "",
         )
-        self.publisher.publish(told)
+        self.publisher.publish(answer)
 
     def _log_recordings(self) -> None:
         if self.recorder is None:

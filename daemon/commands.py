@@ -44,21 +44,21 @@ class Commands:
     experiment: ConfiguredExperiment | None
     health: HealthReporter
     daemon_end: asyncio.Event
-    # Takes each command that was answered, but for questions.
-    tell: Callable[["Answered"], None] = lambda _: None
+    # Receives each answered command, except questions.
+    report: Callable[["Answered"], None] = lambda _: None
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
         asking = {STATUS: self._status, EXPERIMENTS: self._experiments}
-        return asking | {name: partial(self._told, name, handler) for name, handler in self._acting().items()}
+        return asking | {name: partial(self._reported, name, handler) for name, handler in self._acting().items()}
 
     def _acting(self) -> Mapping[str, Handler]:
         named: dict[str, Handler] = {"tare": self._tare, STOP: self._stop, "start": self._start}
         named |= {"pause": self._pause, "resume": self._resume, "unlock": self._unlock}
         return {**named, "release": self._release}
 
-    async def _told(self, name: str, handler: Handler, request: Request) -> Reply:
-        """Carry out a command, and tell what came of it."""
+    async def _reported(self, name: str, handler: Handler, request: Request) -> Reply:
+        """Carry out a command, and report its result."""
         refusal = None
         try:
             return await handler(request)
@@ -67,7 +67,7 @@ class Commands:
             raise
         finally:
             if not request.get("ask"):
-                self.tell(Answered(name, request, refusal))
+                self.report(Answered(name, request, refusal))
 
     async def _experiments(self, _request: Request) -> Reply:
         """Return the experiments that `start` may name, and the one that it runs if it names none."""

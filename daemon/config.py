@@ -289,7 +289,7 @@ class DaemonConfig(ConfigModel):
 
     @property
     def experiment_folders(self) -> tuple[Path, ...]:
-        """The folders of the experiments that a request may name: the configured ones, and that of `experiment`."""
+        """The folders of the experiments that a request may name: the configured ones and `experiment`'s."""
         return (*self.experiments, *((self.experiment.parent,) if self.experiment is not None else ()))
 
     @model_validator(mode="after")
@@ -313,7 +313,7 @@ class DaemonConfig(ConfigModel):
             raise ValueError("an experiment needs a robot: add `robot: ur.yaml`, or take `experiment` out")
         if self.autostart and not self.emulated:
             raise ValueError(
-                "`autostart` moves a robot that nobody has just asked to move: it needs `emulated: true`; "
+                "`autostart` moves the robot without a command: it needs `emulated: true`; "
                 "on a real rig take it out, and send `shearloop command start`"
             )
         if self.autostart and self.experiment is None:
@@ -357,7 +357,7 @@ class DaemonConfig(ConfigModel):
 
 
 def _is_hardware(port: Path) -> bool:
-    """Return whether a port is in /dev, but no pseudo-terminal; one that is not there yet is none."""
+    """Return whether a port is in /dev, but no pseudo-terminal; a missing port counts as no port in /dev."""
     return port.is_relative_to("/dev") and not port.is_relative_to("/dev/pts")
 
 

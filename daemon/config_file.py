@@ -33,7 +33,7 @@ class ConfigModel(BaseModel):
             raise ValueError(f"{value:g} is too small for mm; did you mean {1000 * value:g}, the thousandfold?")
         if isinstance(value, Path) and (value == Path() or "\0" in str(value)):
             raise ValueError(f"must be the path of a file, not {str(value)!r}")
-        # Without a file the paths are those of the computer that wrote them, such as a recording's.
+        # Without a file, the paths belong to the computer that wrote them, such as a recording's.
         if not info.context:
             return value
         if isinstance(value, tuple):

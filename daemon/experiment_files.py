@@ -53,7 +53,7 @@ def read_document(path: Path) -> Document:
 
 
 def without_mistakes(document: Document, mistakes: Sequence[Mistake]) -> ExperimentFile:
-    """Return the experiment of a file; raises UserError with these mistakes, and with those of its keys and values."""
+    """Return the experiment of a file; raises UserError with these mistakes and the mistakes of its keys and values."""
     lines: list[str] = []
     try:
         file = document.model(ExperimentFile)
@@ -111,9 +111,9 @@ class ExperimentFiles:
                 cure = "copy it to a local drive"
                 raise UserError(f"{what}: the experiment was not read within {READ_WITHIN_S:g} s; {cure}")
         finally:
-            # Nobody waits for what comes later.
+            # A later result has no receiver.
             result.cancel()
-        # Nothing is left for it to do.
+        # Its work is done.
         reading.join()
         return result.result()
 
@@ -124,7 +124,7 @@ class ExperimentFiles:
             # A link may lead elsewhere.
             paths = (path for path in own.rglob("*.yaml") if path.is_file() and path.resolve().is_relative_to(own))
             for path in sorted(islice(paths, MOST_LISTED)):
-                # Configurations lie beside experiments; what `start` would refuse is not offered.
+                # Configurations share the folder with experiments. The list has only the files that `start` accepts.
                 with suppress(UserError, OSError):
                     document = Document.parse(path, read_file(path, MOST_BYTES), UserError, ExperimentFile.what)
                     if isinstance(document.content, dict) and "steps" in document.content:
@@ -157,7 +157,7 @@ class ExperimentFiles:
 
 
 def _run(read: Callable[[], Found], loop: asyncio.AbstractEventLoop, result: "asyncio.Future[Found]") -> None:
-    """Read in a thread, and hand the result or the error to the event loop, if it still waits for it."""
+    """Read in a thread, and give the result or the error to the event loop, if it still waits."""
     try:
         found, error = read(), None
     except Exception as raised:  # noqa: BLE001 - it is raised in the event loop

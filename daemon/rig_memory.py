@@ -18,7 +18,7 @@ from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.errors import UserError
 
 VERSION = 1
-# The file follows the loop's state at this interval, besides the start of each experiment.
+# The file is written at this interval, and at the start of each experiment.
 FOLLOWS_S = 0.1
 
 
@@ -42,7 +42,7 @@ class Remembered:
         return cls(running, stop, *loop.grip)
 
     def restore(self, loop: ControlLoop) -> None:
-        """Make a new control loop remember; a stop keeps the grip, whatever it did when it began."""
+        """Give the stored state to a new control loop; a restored stop keeps the grip, even if it had opened it."""
         for name, detail in self.stop:
             known = name in FaultCode.__members__
             loop.safety.stop(Fault(FaultCode[name], detail) if known else Fault(FaultCode.DAEMON_ENDED, detail))

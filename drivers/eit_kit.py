@@ -81,7 +81,7 @@ class FrameErrorKind(Enum):
 class FrameError:
     """A rejected line: the reason, its beginning or its first bad value, and that one's position, counted from 0.
 
-    `count` tells how many values there are.
+    `count` is the number of values.
     """
 
     kind: FrameErrorKind

@@ -17,8 +17,8 @@ from shearloop.drivers.refused_lines import BoardKind, refusal_sentence, shown
 # Opening the port resets an Uno; its boot loader waits before it starts the sketch.
 BOOT_S = 4.0
 SILENT_PERIODS = 8
-# A board that was waited for in vain is waited for twice as long, up to this factor: its period may be longer than
-# configured. So many values in time end that.
+# After a wait in vain, the next wait is twice as long, up to this factor: the board's period can be longer than
+# configured. This many values in time end that.
 LONGEST_PATIENCE, PROMPT_VALUES = 16, 20
 # Values in a row that agree with each other and become the new level.
 SETTLE_VALUES = 3
@@ -50,7 +50,7 @@ class RawEvent:
 
 
 class Parser(Protocol[ValueT_co]):
-    """Turns events into values, and knows what it refused."""
+    """Turns events into values, and counts the refused ones."""
 
     @property
     def refused(self) -> int:
@@ -73,7 +73,7 @@ class InputRecorder(Protocol):
 
     @property
     def wants_state(self) -> bool:
-        """Whether what it keeps begins in the middle of a run, and has no state yet."""
+        """Whether its events begin in the middle of a run, and it has no state yet."""
 
     def record(self, event: RawEvent) -> None:
         """Keep the next input; never blocks."""

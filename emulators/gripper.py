@@ -161,7 +161,7 @@ class Gripper:
     def _approach(self, target: float, speed_mm_s: float, dt_s: float) -> bool:
         """Move towards a position; return whether the fingers have stopped, there or at an object."""
         fingers = self.fingers
-        # The makers' speed is that of the whole stroke.
+        # The manual gives the speed of the whole stroke.
         travel = speed_mm_s * dt_s * (fingers.closed_counts - fingers.open_counts) / fingers.model.stroke_mm
         closing = target > self._position
         # The fingers' own stops count as the target: a real gripper that closes on air reports no object.

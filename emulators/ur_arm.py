@@ -60,7 +60,7 @@ def joints_within(
     upper_m: Sequence[float],
     tcp_offset: Sequence[float],
 ) -> Vector | None:
-    """Return joints (6,) near HOME_RAD whose tool centre point lies inside a box; None if the arm reaches none.
+    """Return joints (6,) near HOME_RAD with the tool centre point inside a box; None if the arm cannot reach it.
 
     The tool keeps its direction. The point keeps a quarter of the box from each face, or as far as HOME_RAD is.
     """

@@ -95,7 +95,7 @@ class Controller:
                 yield event
 
     def command(self, line: str) -> None:
-        """Carry out a fault, as `protective-stop` or `silence 2`; ValueError where the line is none."""
+        """Carry out a fault, as `protective-stop` or `silence 2`; ValueError for another line."""
         match line.split():
             case ["protective-stop"]:
                 self.robot.protective_stop("requested by hand")
@@ -179,7 +179,7 @@ class Controller:
     async def _stream_states(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> AsyncIterator[bytes]:
         """Yield what a client sends, and send it a state in each cycle.
 
-        One thread does both: a client that does not read is not heard once its buffers are full.
+        One thread does both: a client that does not read is not read from once its buffers are full.
         """
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNREAD_BYTES)
         writer.transport.set_write_buffer_limits(0)

@@ -88,7 +88,7 @@ class RtdeSession:
 
     robot: Robot
     rate_hz: float
-    # Names of faults, of which `refuse-protocol` and `registers-in-use` concern this connection.
+    # Names of faults; `refuse-protocol` and `registers-in-use` concern this connection.
     faults: set[str]
     _buffer: bytearray = field(default_factory=bytearray)
     _inputs: list[list[str]] = field(default_factory=list)

@@ -67,7 +67,7 @@ class _Expressions(ast.NodeTransformer):
         return ast.copy_location(ast.YieldFrom(node), node) if waits else node
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
-        """Tell a pose, `p[x, y, z, rx, ry, rz]`, from an entry of a variable p."""
+        """Distinguish a pose, `p[x, y, z, rx, ry, rz]`, from an entry of a variable p."""
         self.generic_visit(node)
         if isinstance(node.value, ast.Name) and node.value.id == "p" and isinstance(node.slice, ast.Tuple):
             return ast.copy_location(ast.List(node.slice.elts, ast.Load()), node)
@@ -111,7 +111,7 @@ def _statement(line: str) -> str:
 
 
 def _opening(line: str, declared: set[str]) -> list[str]:
-    """Return the statements with which the block begins that `line` opens."""
+    """Return the first statements of the block that `line` opens."""
     if line.startswith("while"):
         return ["count_loop()"]
     if not line.startswith(("def ", "thread ")):
@@ -213,7 +213,7 @@ class Program:
         raise ProgramEndedError("it has halted itself")
 
     def count_loop(self) -> None:
-        """End a program whose loop uses up no cycle."""
+        """End a program with a loop that takes no cycle."""
         self._loops += 1
         if self._loops > MOST_LOOPS:
             raise ProgramEndedError("a loop without sync() does not end")

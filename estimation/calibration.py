@@ -305,7 +305,7 @@ def _from_plain(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]
 
 
 def _checked(array: NDArray[Any], kind: Any, name: str) -> NDArray[Any]:
-    """Return the array, read-only; raises ValueError where its numbers are not those of the type `kind`."""
+    """Return the array, read-only; raises ValueError where its numbers do not have the type `kind`."""
     expected = kind
     while arguments := get_args(expected):  # NDArray, and its dtype before NumPy 2.5
         expected = arguments[-1]

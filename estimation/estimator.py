@@ -1,4 +1,4 @@
-"""What an estimator is: what it needs, its features of a frame, and its fit; and the estimators that read one frame.
+"""The estimators' contract: requirements, features of a frame, and fit; and the estimators that read one frame.
 
 An estimator is a subclass of `Estimator`, and a line in `bank/estimator_names.py`. It must have `name` and `features`.
 """
@@ -94,7 +94,7 @@ class Reading:
 
     @classmethod
     def of(cls, frame: ProcessedFrame, t_s: float, matcher: BankMatcher | None) -> Self:
-        """Return the reading of a frame; the matcher is that of the estimator's bank, None without one."""
+        """Return the reading of a frame; the matcher belongs to the estimator's bank, None without one."""
         return cls(frame, t_s, () if matcher is None else tuple(map(matcher.match, frame.difference)))
 
 
@@ -208,7 +208,7 @@ class Estimator(ABC):
         return np.array([features[:, 0].min(), features[:, 0].max()]) if self.needs == "bank" else np.zeros(0)
 
     def slices_fits(self, _quantity: Quantity, _values: FloatArray) -> tuple[RegressorFit, RegressorFit]:
-        """Return the fit to slices of (n,) values, and that of a line, which reads values beyond these.
+        """Return the fit to slices of (n,) values, and the fit of a line, which reads values beyond these.
 
         Raises CalibrationError where the values do not determine the fit.
         """
@@ -237,7 +237,7 @@ class Estimator(ABC):
         return self, regressor, 0.0
 
     def feature_width(self, quantity: Quantity) -> int | None:  # noqa: ARG002 - estimators with a known width use it
-        """Return the number of inputs of a quantity's regressor, None if the estimator does not tell."""
+        """Return the number of inputs of a quantity's regressor, None if the estimator does not say."""
         return None
 
     def side_of_features(self, n_features: int) -> IntArray:
@@ -326,7 +326,7 @@ class BankEstimator(_OnBank):
         return RefinedMatcher(bank, self.numbering)
 
     def features(self, reading: Reading) -> FloatArray:
-        """Return those of each side's match."""
+        """Return the features of each side's match."""
         return np.concatenate([one.features for one in reading.matches])
 
 

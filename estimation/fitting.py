@@ -212,7 +212,7 @@ def adapt(
     """Return a calibration with the gain of each fingertip corrected by recordings of known torque, and the correction.
 
     `source` describes them in words. Twists count from each recording's frame of `first_frames` on. The correction is
-    shrunk by how much these can tell. Raises CalibrationError for recordings without a torque estimate under load, and
+    shrunk by their uncertainty. Raises CalibrationError for recordings without a torque estimate under load, and
     for a calibration without such a gain.
     """
     if len(tools := _tools_of(recordings)) > 1:

@@ -287,7 +287,7 @@ class ToolLaw:
 
 
 def find_twists(torque_nm: FloatArray, largest_nm: float | None = None) -> list[IntArray]:
-    """Return the rows of each stretch of loaded frames in (n,) torques, whose largest one is given or found."""
+    """Return the rows of each stretch of loaded frames in (n,) torques; the largest torque is given or found."""
     largest_nm = float(np.abs(torque_nm).max(initial=0.0)) if largest_nm is None else largest_nm
     rows = np.flatnonzero(np.abs(torque_nm) > LOADED_SHARE * largest_nm)
     return [one for one in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(one)]

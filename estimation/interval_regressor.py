@@ -278,7 +278,7 @@ class IntervalRegressor:
         return value, min(below, max(value - span.lowest, 0.0)), min(above, max(span.highest - value, 0.0))
 
     def scaled(self, factor: float, spread: float) -> "IntervalRegressor":
-        """Return the regressor of values larger by a factor, whose gain and zero have this spread."""
+        """Return the regressor of values larger by a factor; its gain and zero have this spread."""
         if isinstance(self.point, CurveMean):
             raise CalibrationError("a curve of slices has no gain")
         return replace(

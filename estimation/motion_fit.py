@@ -27,11 +27,11 @@ MOST_DIRECTIONS = 3
 _DIRECTIONS, _STEPS, _PENALTIES = (1, 2, 3), (10, 12), (1e-5, 1e-4)
 # Where the gel holds its position, that position shows a long twist, and the shortest memory serves.
 _STEPS_WITH_POSITION = (8,)
-# Fits whose left-out error is within this factor of the least one are averaged.
+# Fits with a left-out error within this factor of the minimum are averaged.
 _NEARLY_AS_GOOD = 1.25
 # Fewest twists that are left out one by one, and most parts; with more twists, neighbours are left out together.
 _LEAST_TWISTS, _MOST_PARTS = 3, 10
-# Where loads are rarer than this share of the frames, few twists are left out by so many frames.
+# Below this fraction of loaded frames, the frames left out hold few twists.
 _RARE_LOAD, _FRAMES_OF_FEW_TWISTS = 0.5, 2
 # The slope is divided out where left-out loads err by less than this share: a poor estimate has no sure slope. On the
 # recorded stream both fingertips have 0.08, right 0.11, left 0.25.
@@ -69,7 +69,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionFit:
-    """The chosen candidates, whose mean is the fit; its slope on frames left out; and its mean squared error there."""
+    """The chosen candidates; the slope of their mean, the fit, on frames left out; and its mean squared error there."""
 
     layout: Layout
     fit_one: LinearFit
@@ -114,7 +114,7 @@ class MotionFit:
 
 
 def mean_ridge(members: Sequence[Ridge]) -> Ridge:
-    """Return the linear map whose prediction is the mean of the members' predictions."""
+    """Return the linear map that predicts the mean of the members' predictions."""
     centre = np.mean([one.mean for one in members], axis=0)
     weights = np.mean([one.weights for one in members], axis=0)
     offset = float(np.mean([one.offset + (centre - one.mean) @ one.weights for one in members]))
@@ -154,7 +154,7 @@ def choose_motion(
     """Return the fit of (n, d) features, with all of the layout's columns, to (n,) torques."""
     twists = find_twists(torque_nm)
     loaded = np.concatenate(twists)
-    # A single twist cannot tell which fit another one needs: one direction is the safest.
+    # A single twist does not show which fit another one needs: one direction is the safest.
     can_choose = len(twists) >= _LEAST_TWISTS or len(loaded) > _RARE_LOAD * len(torque_nm)
     directions, steps = _DIRECTIONS if can_choose else (1,), _STEPS_WITH_POSITION if position else _STEPS
     candidates = tuple(itertools.starmap(Candidate, itertools.product(directions, steps, _PENALTIES)))

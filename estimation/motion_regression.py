@@ -53,7 +53,7 @@ from shearloop.estimation.novelty import fitted_parts
 from shearloop.estimation.regressors import CurveMean, left_out_blocks
 from shearloop.estimation.session_state import Motion
 
-# The directions are those of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err
+# The directions of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err
 # more, over 12 frames later twists do (docs/decisions/0044).
 _DIRECTION_FRAMES = 8
 # An estimate needs this many frames of the grip before its own, 6.5 s. An older part of the memory counts as the oldest
@@ -71,7 +71,7 @@ _N_NUISANCE, _MOST_FRAMES = 16, 500
 _CLEAR, _LEAST_SHARE = 2.0, 0.2
 # Centred positions have one direction less than their number; the last one is rounding.
 _ROUNDING = 1e-9
-# Inverse calibration over torque and over diameter: degrees whose curves are averaged, directions of drift, trend. The
+# Inverse calibration over torque and over diameter: degrees of the averaged curves, directions of drift, trend. The
 # torque's have the least mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones) with and
 # without the judged level of torque (docs/decisions/0045).
 _CURVES: dict[Quantity, tuple[tuple[int, ...], int, bool]] = {

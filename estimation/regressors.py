@@ -161,7 +161,7 @@ def _slope_penalty(frames: FloatArray, columns: FloatArray, penalties: FloatArra
     """Return the penalty of the slopes of (n, q) frames over the second of (n, p) columns (empirical Bayes).
 
     The channels that correlate best have slopes that are too steep by chance. The penalty is the variance of the noise
-    over that of the true slopes.
+    over the variance of the true slopes.
     """
     inverse = np.linalg.inv(columns.T @ columns + penalties)
     coefficients = inverse @ columns.T @ frames

@@ -79,7 +79,7 @@ class _Corrected:
     tool: Measured | None
 
     def for_tool(self, tool: Measured | None, whole: Calibration) -> OutputModel:
-        """Return the model for a tool that is measured anew, by the law of the tools in the `whole` calibration.
+        """Return the model for a newly measured tool, by the law of the tools in the `whole` calibration.
 
         The correction is the fingertip's, and the law the tool's: a torque on another diameter is as much larger as
         without the correction. A diameter within the uncertainty of the earlier one is the same tool's.
@@ -174,7 +174,7 @@ class EstimatorSession:
 
     @property
     def grip_t_s(self) -> FloatArray:
-        """The times (n,) of this grip's frames, whose torques `adapt` takes."""
+        """The times (n,) of this grip's frames; `adapt` takes their torques."""
         return np.array([t_s for t_s, _ in self._grip.frames])
 
     def adapt(self, torque_nm: FloatArray) -> Adaptation:

@@ -95,7 +95,7 @@ class Motion:
     ) -> FloatArray:
         """Return the motion (m, c) since the last frame, or since the idle one, with unusable channels imputed.
 
-        Here the estimator imputes those of a motion since the idle frame.
+        Here the estimator imputes the channels of a motion since the idle frame.
         """
         return moved if from_idle else np.where(usable, moved, 0.0)
 

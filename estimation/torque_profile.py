@@ -1,6 +1,6 @@
 """What the torque would be without any sensor: the mean twist of the calibration at the same phase of the motion.
 
-A program that repeats its twists knows much of the torque from its clock alone. A sensor is worth what it adds to that.
+A program that repeats its twists predicts much of the torque from its clock alone. A sensor must beat that.
 The profile is given the moment of each judged twist, so it is a stopwatch that starts at the right time.
 """
 

@@ -16,7 +16,7 @@ from shearloop.words import counted
 # "raw": volts as the board sends them. "difference": slices, |frame − idle frame| smoothed over time.
 Kind = Literal["raw", "difference"]
 
-# Metadata of a dataclass's field: in the calibration's file its fields stand beside the others of the dataclass.
+# Metadata of a dataclass's field: in the calibration's file its fields join the other fields of the dataclass.
 INLINE = {"inline": True}
 # Load cells on a lever bear some N·m; larger readings come from a damaged line.
 LARGEST_TORQUE_NM = 20.0

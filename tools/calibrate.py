@@ -147,7 +147,7 @@ def read_parts(
         parts = [replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s) for one in parts]
     timing = TRUSTED if load_cell_delay_s is not None else measure_timing(parts, [one for _, one in others])
     if all_live:
-        # One clock stamped frames and torques as they arrived, whatever the motion shows.
+        # One clock stamped frames and torques at their arrival; the motion's delay does not count.
         timing = replace(timing, uncertainty_s=0.0)
     named = [*((path.name, one) for path, one in chosen), *others]
     warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]

@@ -1,4 +1,4 @@
-"""What each part of a configuration is, or what is wrong with it; every file that it names is opened."""
+"""Describes each part of a configuration, or its mistake; opens every file that it names."""
 
 import math
 import os
@@ -77,7 +77,7 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
             parts.texts["skin"] = _skin(config.skin)
     robot = _check_rig(config, parts)
     _check_paths(config, parts)
-    # What cannot be opened yet counts as what it is configured to be.
+    # A device that cannot be opened yet counts as configured.
     files = {name: fingertip.calibration for name, fingertip in config.fingertips.items()}
     files |= {COMBINED: config.combined.calibration} if config.combined is not None else {}
     unopened = {
@@ -126,7 +126,7 @@ def _add_plan(
     gripper: "GripperModel | None" = None,
     warm_up_s: float = 0.0,
 ) -> None:
-    """Add the plan of an experiment whose keys and values are valid."""
+    """Add the plan of an experiment with valid keys and values."""
     from shearloop.daemon.control.experiment_schema import ExperimentFile
     from shearloop.daemon.control.plan import plan_of
 
@@ -169,7 +169,7 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "UrSettings | None":
 
 
 def _check_paths(config: "DaemonConfig", parts: Parts) -> None:
-    """Check that ports are none of files, and the recordings' folder no file; what does not exist may come."""
+    """Check that no port is a file, and that the recordings' folder is no file; a missing path is accepted."""
     from shearloop.daemon.config import SerialDevice
 
     for key, section in config.walk():

@@ -1,4 +1,4 @@
-"""Judges a recipe for a calibration by what is left out of it: each grip, twist, tool or level of torque in turn.
+"""Judges a recipe for a calibration by leave-one-out: each grip, twist, tool or level of torque in turn.
 
 A recipe is fitted to the rest, and judged on the block that it has not seen. Neither frames nor torques of a block
 take part in its fit. Only the load cell's timing is measured on everything: it belongs to the load cell.
@@ -41,7 +41,7 @@ _LEAST_COVERAGE = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a calibration is made: estimator, files of bank and mesh, and what is known of torques and their times."""
+    """How a calibration is made: estimator, files of bank and mesh, and the known facts of torques and their times."""
 
     estimator: EstimatorName
     bank: Path | None = None
@@ -71,7 +71,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """What is left out at once: its name, the rows (n,) of each recording that are fitted, and the judged spans.
+    """One block left out: its name, the rows (n,) of each recording that are fitted, and the judged spans.
 
     `timed` are the rows that the stopwatch knows, where these are others.
     """
@@ -97,7 +97,7 @@ class LeftOut:
         return [one for tracks in self.tracks for one in tracks]
 
     def figures(self, loaded_nm: float = LOADED_NM) -> dict[str, object]:
-        """Return the figures by the names of `shearloop evaluate`, and those of each block's loaded frames."""
+        """Return the figures by the names of `shearloop evaluate`, and the figures of each block's loaded frames."""
         blocks = [
             {"name": name, **figures_by_load(tracks, loaded_nm)["loaded"]}
             for name, tracks in zip(self.names, self.tracks, strict=True)
@@ -268,7 +268,7 @@ def _rows_of(recordings: Sequence[FrameSeries], rows: BoolArray) -> tuple[BoolAr
 
 
 def _kept(recordings: Sequence[FrameSeries], rows: Sequence[BoolArray]) -> list[FrameSeries]:
-    """Return the recordings with these rows only, without those of none, and with the torques nearest to these rows."""
+    """Return the recordings with only these rows and the torques nearest to them; drop recordings without rows."""
     found: list[FrameSeries] = []
     for one, own in zip(recordings, rows, strict=True):
         if not own.any():
@@ -309,7 +309,7 @@ _COUNTS = {1: "One grip", 2: "Two grips"}
 
 
 def sentences_of(result: LeftOut, loaded_nm: float = LOADED_NM) -> list[str]:
-    """Return the loaded frames' figures beside those without a sensor, and the advice."""
+    """Return the loaded frames' figures, the figures without a sensor, and the advice."""
     loaded = figures_by_load(result.all_tracks, loaded_nm)["loaded"]
     blocks = f"{result.kind.capitalize()} left out in turn ({len(result.names)} fits)"
     if loaded["rmse_nm"] is None:

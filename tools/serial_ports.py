@@ -93,14 +93,14 @@ def access_cure(group: str, mode: int, *, joined: bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class HiddenBoard:
-    """A USB board that has no serial port: its numbers, as 1a86:7523, and what it likely is."""
+    """A USB board without a serial port: its numbers, as 1a86:7523, and its likely kind."""
 
     usb: str
     likely: str
 
 
 def list_hidden_boards(devices: Path = USB_DEVICES) -> list[HiddenBoard]:
-    """Return the boards on the USB bus for which the system has no serial port."""
+    """Return the boards on the USB bus without a serial port."""
     found = []
     for device in sorted(devices.iterdir()) if devices.is_dir() else []:
         try:

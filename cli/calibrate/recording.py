@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from shearloop.estimation.interval_regressor import IntervalRegressor
     from shearloop.tools.calibrate import CalibrationResult
 
-# Refits for what is left out take no longer than about this, by the time of the fit.
+# The refits without each block may take about this long, estimated from the time of one fit.
 LEFT_OUT_WITHIN_S = 20.0
 
 
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _judge_left_out(args: argparse.Namespace, result: "CalibrationResult") -> tuple[dict[str, object], list[str]]:
-    """Return the figures of what is left out, and what the user should know of them.
+    """Return the figures of the blocks left out, and the advice for the user.
 
     Where the refits would take longer than some seconds, that is the command; without two blocks, it is why.
     """

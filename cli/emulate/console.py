@@ -75,7 +75,7 @@ def add_seed_and_speed(parser: argparse._ActionsContainer, pace: str) -> None:
 
 
 def add_sigma(parser: argparse._ActionsContainer) -> None:
-    """Add `--sigma`, by default that of the paper's screwdriver."""
+    """Add `--sigma`; the default is the value of the paper's screwdriver."""
     text = "sigma at no torque and at 0.14 N·m (default: 1.85 1.25)"
     add_option(parser, "--sigma", float, ("REST", "LARGEST"), text, nargs=2, default=(1.85, 1.25))
 

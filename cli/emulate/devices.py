@@ -104,7 +104,7 @@ def add_load_cell(parser: argparse.ArgumentParser) -> None:
 
 
 def load_cell_sketch(calibration: Path, noise_nm: float) -> "Sketch":
-    """Return the board whose counts a calibration file turns into the torque."""
+    """Return the board that sends the counts of a torque by a calibration file."""
     from shearloop.drivers.calibration_files import load_device_calibration
     from shearloop.drivers.load_cell import LoadCalibration
     from shearloop.emulators.boards import Sketch

@@ -53,7 +53,7 @@ class Tareable(Protocol):
 
 @runtime_checkable
 class Adaptable(Protocol):
-    """A sensor whose gain can be corrected by another sensor's torque."""
+    """A sensor that another sensor's torque can correct."""
 
     async def adapt(self, reference: str) -> None:
         """Correct the gain by this source's torque during this grip; raises ActionError."""
@@ -113,7 +113,7 @@ class ActionExecutor:
         if self.unlocking:
             raise ActionError(UNLOCKING)
         task = self._unlocking = asyncio.create_task(act(), name=command)
-        # Nobody asks for a failure that comes after the caller was cancelled.
+        # After the caller is cancelled, a failure has no receiver.
         task.add_done_callback(lambda done: done.cancelled() or done.exception())
         await asyncio.wait([task])
         if task.cancelled():

@@ -1,4 +1,4 @@
-"""Sends wrist speeds and stops to the robot's process, and tells the control loop what was sent."""
+"""Sends wrist speeds and stops to the robot's process, and reports the sent speeds to the control loop."""
 
 import asyncio
 from dataclasses import dataclass

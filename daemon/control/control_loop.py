@@ -26,7 +26,7 @@ from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.daemon.loop_config import LoopConfig
 
-# A zero that drifted by less than this is taken anew without a question.
+# A torque below this counts as drift: a tare needs no confirmation.
 LOADED_NM = 0.05
 # An `adapt` step compares the fingertip with the torques of this time.
 ADAPTED_OVER_S = 600.0
@@ -193,7 +193,7 @@ class ControlLoop:
 
     @property
     def grip(self) -> tuple[float | None, float | None]:
-        """The wrist's angle in rad at the present grip, and its largest force in N; None for what is unknown."""
+        """The wrist's angle in rad at the present grip, and its largest force in N; None for an unknown value."""
         return self._gripped.origin_rad, self._gripped.force_n
 
     def restore_grip(self, origin_rad: float | None, force_n: float | None) -> None:
@@ -202,7 +202,7 @@ class ControlLoop:
 
     @property
     def held(self) -> str | None:
-        """What is between the fingers, with its width and the force of the grip, or None."""
+        """The object between the fingers, with its width and the force of the grip, or None."""
         gripper, force_n = self.inputs.gripper, self._gripped.force_n
         if "gripper" not in self._watched.required or gripper is None or not gripper.holding:
             return None
@@ -248,7 +248,7 @@ class ControlLoop:
 
     def _loaded(self) -> str | None:
         """Return which sensor measures a load that does not come from its drift, or None."""
-        # Fingers that are known to be empty load no fingertip: what it measures is its drift.
+        # Fingers that are known to be empty do not load a fingertip: its torque is drift.
         empty = "gripper" in self._watched.required and self.inputs.gripper is not None
         for name, latest in self.inputs.torques.items():
             source = self._sources[name]
@@ -258,7 +258,7 @@ class ControlLoop:
         return None
 
     def start_refusal(self) -> str | None:
-        """Return why no experiment can begin, whichever it is, or None."""
+        """Return why no experiment at all can begin, or None."""
         if (running := self.running) is not None:
             return f"the experiment {running.file.name!r} is still running; stop it first"
         if self.safety.stopped:
@@ -305,7 +305,7 @@ class ControlLoop:
             release_error=before.release_error,
         )
         self.runs += 1
-        # Until the first tick, nobody takes the end of the run before for the end of this one.
+        # Until the first tick, the status must not show the end of the previous run.
         self.status = LoopStatus(self.experiment.phase.value, "", WristCommand(), SafetyDecision(Response.NOTE))
         return None
 
@@ -442,7 +442,7 @@ class ControlLoop:
         return f"waiting for the first torque of {', '.join(awaited)}{f': {reason}' if reason else ''}"
 
     def _fail(self, experiment: Experiment, reason: str) -> None:
-        """End an experiment whose step cannot be done; the stop waits for the operator as every other."""
+        """End an experiment with a step that cannot be done; the stop waits for the operator, as each stop does."""
         experiment.fail(reason)
         self.safety.stop(Fault(FaultCode.STEP_FAILED, experiment.stop_reason))
 

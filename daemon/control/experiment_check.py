@@ -1,4 +1,4 @@
-"""Checks of an experiment: what its steps turn, and which of them its limits or its devices do not allow. No I/O."""
+"""Checks of an experiment: the steps that turn the tool, and the steps that limits or devices do not allow. No I/O."""
 
 import math
 from collections.abc import Iterator
@@ -158,7 +158,7 @@ def _undoing(file: ExperimentFile) -> Iterator[Mistake]:
 
 
 def check_devices(file: ExperimentFile, robot: UrLimits | None, gripper: GripperModel | None) -> Iterator[Mistake]:
-    """Yield each step whose pose, angle, torque or grip lies outside what the configured devices allow.
+    """Yield each step with a pose, angle, torque or grip that the configured devices do not allow.
 
     Nothing of these is clipped, because another pose than the written one may be anywhere.
     """

@@ -283,7 +283,7 @@ def motion_of(step: Step) -> str | None:
             return None
 
 
-# A location in an experiment's file, and what is wrong there.
+# A location in an experiment's file, and the mistake there.
 Mistake = tuple[tuple[int | str, ...], str]
 _STEP: TypeAdapter[Step] = TypeAdapter(Step)
 STEP_KINDS: dict[str, Any] = {

@@ -110,7 +110,7 @@ class _Fit:
 
 
 def identify(record: Record, window_s: float, stiffness_share: float = _WORST_STIFFNESS_SHARE) -> ToolModel:
-    """Return the tool model of a record whose torques are means over `window_s`.
+    """Return the tool model of a record of torques, each a mean over `window_s`.
 
     For every lag of a grid, the torques are fitted by least squares to the mean angles of their windows, with an offset
     and a small drift. The lag with the smallest residual wins, refined by a parabola; the curvature gives its standard
@@ -313,7 +313,7 @@ class StiffnessExcitation:
         if self._angles and elapsed_s <= 0.0:
             return self._speed
         self._angles.append((now_s, wrist_angle_rad))
-        # A leg that ends now identifies from the record with this angle, at which the wrist rests.
+        # A leg that ends here identifies from the record with this angle, where the wrist rests.
         self._speeds.append(0.0)
         self._speed = self._towards(self._goal_rad() - wrist_angle_rad, now_s, min(elapsed_s, 0.05))
         self._speeds[-1] = self._speed

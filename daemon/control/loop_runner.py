@@ -141,7 +141,7 @@ class ControlLoopRunner:
         return self._stop_count
 
     def start_refusal(self) -> str | None:
-        """Return why no experiment can begin, whichever it is, or None."""
+        """Return why no experiment at all can begin, or None."""
         if self._closed:
             return ENDING
         if self._actions.unlocking:

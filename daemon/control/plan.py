@@ -14,7 +14,7 @@ from shearloop.drivers.ur.settings import UrLimits
 
 @dataclass(frozen=True, slots=True)
 class StepPlan:
-    """One step: what it does in words, its largest values, and what is limited, reversed or refused."""
+    """One step: its action in words, its largest values, and its limits, reversals and refusals."""
 
     number: int
     do: str
@@ -38,7 +38,7 @@ class StepPlan:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """An experiment's steps in order, what it reaches at most, and what is not known."""
+    """An experiment's steps in order, its largest values, and its unknown values."""
 
     name: str
     torque_source: str

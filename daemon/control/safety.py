@@ -282,7 +282,7 @@ class SafetyMonitor:
         if response is Response.HOLD and self._wrist_ns > self._patience * HELD_AT_MOST_S * 1e9:
             active = (*active, Fault(FaultCode.HELD_TOO_LONG, self._hold_report()))
             response = TABLE[FaultCode.HELD_TOO_LONG].response
-        # What stops comes before what holds: it is the cause that is told first.
+        # Faults that stop come before faults that hold: the message begins with the cause of the stop.
         active = tuple(sorted(active, key=self._response, reverse=True))
         decision = SafetyDecision(response, self._explained(active, _explaining(active)))
         if response >= Response.STOP_AND_KEEP_GRIP and (self._stop is None or response > self._stop.response):

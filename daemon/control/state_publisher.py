@@ -26,7 +26,7 @@ class StatePublisher:
     publisher: Publisher
     control_loop: ControlLoop
     changed: asyncio.Event = field(default_factory=asyncio.Event)
-    # The experiment whose end was published last.
+    # The experiment of the last published end.
     ended: Experiment | None = None
     _block: int = -1
     _key: tuple[object, ...] = ()

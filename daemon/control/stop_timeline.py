@@ -8,7 +8,7 @@ from shearloop.drivers.ur.messages import RobotState
 
 # A standstill that has not been measured by then stays unknown.
 LONGEST_NS = 5_000_000_000
-# The reply to the command is awaited for so long after the decision, if the arm stands earlier.
+# The loop waits this long after the decision for the reply to the command, if the arm stands earlier.
 REPLY_NS = 500_000_000
 
 
@@ -75,7 +75,7 @@ class StopTimeline:
         return self.end() if known or now_ns - self._decided_ns > LONGEST_NS else None
 
     def end(self) -> LoopStop | None:
-        """Return what is known of a stop whose standstill is not awaited any longer."""
+        """Return the known times of a stop after the wait for its standstill."""
         stop, self._stop = self._stop, None
         if stop is None or self._stands_ns is None:
             return stop

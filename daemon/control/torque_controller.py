@@ -16,7 +16,7 @@ all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). 
   angles, and p the sum of the squared weights. s² is the variance of the filtered torque at θ.
 - After a jump, which two CUSUM tests of ν detect, d restarts from the mean of the measurements since then. The jump
   began where its likelihood is greatest (Willsky & Jones, IEEE Trans. Automatic Control 21, 1976).
-- The wrist is driven to the angle at which the expected torque equals the ramp r: speed = bandwidth·(r − torque)/K,
+- The wrist is driven to the angle where the expected torque equals the ramp r: speed = bandwidth·(r − torque)/K,
   with feed-forward of the ramp, ṙ/K.
 
 Wind-up: the expectation uses the measured angle, so d does not wind up while a command is clipped (the observer form of
@@ -185,7 +185,7 @@ class TorqueFilter:
         self.origin_rad = angle_rad
         self._settings = settings
         self._reference_nm = torque_nm
-        # The offset is a weighted mean of measurements: its variance in that of one, and the mean of their angles.
+        # The offset is a weighted mean of measurements: its variance relative to one measurement, and their mean angle.
         self._mean = 1.0 / max(known_measurements, _UNKNOWN), angle_rad
         self._jumps = JumpDetector()
         self._t_mid_ns = t_ns
@@ -309,7 +309,7 @@ class TorqueController:
             self.ramp_nm = self.filter.expected_nm(self._angle_rad)
 
     def resume(self) -> None:
-        """Continue after a hold, in which nothing was commanded; the ramp restarts at the present torque."""
+        """Continue after a hold without commands; the ramp restarts at the present torque."""
         self.filter.restart()
         self._rest()
 

@@ -79,7 +79,7 @@ def needs_keys(address: str) -> bool:
 def probe(path: str) -> int:
     """Return the error number of a connection to a Unix socket, 0 where a program listens."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-        # A listener whose queue is full must not block.
+        # A listener with a full queue must not block.
         client.setblocking(False)
         error = client.connect_ex(path)
     return 0 if error == errno.EAGAIN else error

@@ -38,7 +38,7 @@ _EVENT = struct.Struct("=HI")
 # Numbers of the events' addresses. libzmq frees an address some time after its socket is closed, so none is used twice.
 _MONITORS = itertools.count()
 EVENTS_AT_ONCE = 100
-# socket(7) and linux/filter.h: a program of the one instruction "return 0", with which the kernel drops every packet.
+# socket(7) and linux/filter.h: the kernel drops every packet by a program of the one instruction "return 0".
 _SO_ATTACH_FILTER, _SO_DETACH_FILTER = 26, 27
 _DROP_ALL = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0))
 _FILTER = struct.pack("HP", 1, ctypes.addressof(_DROP_ALL))

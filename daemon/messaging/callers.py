@@ -1,4 +1,4 @@
-"""Who sends a command, by the client's own word. Nobody checks it, so it is for the log and the list of events."""
+"""Who sends a command, as the client says. It is not checked, so it serves only the log and the list of events."""
 
 import os
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from shearloop.printable import printable
 
 # Of a name in messages.
 _LONGEST = 80
-UNKNOWN = "somebody"
+UNKNOWN = "an unnamed client"
 
 
 def caller(program: str) -> str:

@@ -50,7 +50,7 @@ class RateLimit:
 
     def __init__(self) -> None:
         self._total = TokenBucket(TOTAL_BURST, TOTAL_PER_S)
-        # Of the clients that were last heard.
+        # The number of remembered clients; the oldest are forgotten.
         self._bucket_of = lru_cache(MAX_CLIENTS)(lambda _client: TokenBucket(CLIENT_BURST, CLIENT_PER_S))
 
     def allow(self, client: bytes, t_ns: int) -> bool:

@@ -251,7 +251,7 @@ class DaemonCommand(Message):
 
     command: str = column("", "name of the command")
     subject: str = column("", "file of the experiment, or the sensor; empty without one")
-    by: str = column("", "who sent it, as they say themselves; nobody checks it")
+    by: str = column("", "the sender, as the client says; it is not checked")
     accepted: bool = column("", "whether it was carried out")
     reason: str = column("", "why it was refused, in sentences; empty when it was accepted")
 

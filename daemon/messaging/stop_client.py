@@ -30,7 +30,7 @@ class StopSocketTakenError(UserError):
 
 
 def owners(address: str) -> set[int]:
-    """Return the users whose reply counts: this one, root, and who listens at the command address."""
+    """Return the users with a trusted reply: this one, root, and the owner of the command address."""
     found = {os.getuid(), 0}
     if address.startswith("ipc://"):
         with suppress(OSError):
@@ -56,7 +56,7 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         client.settimeout(timeout_s)
-        # With each datagram the kernel tells who sent it (unix(7)): any user may have taken the daemon's name first.
+        # The kernel names the sender of each datagram (unix(7)): another user can take the daemon's name first.
         client.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
         # The kernel chooses an abstract name.
         client.bind("")
@@ -65,8 +65,8 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
             client.sendto(msgpack.packb(content), stop_name(address))
         except ConnectionError:
             return None
-        data, told, _, _ = client.recvmsg(_LARGEST_REPLY_BYTES, socket.CMSG_SPACE(_CREDENTIALS.size))
-    for level, kind, credentials in told:
+        data, ancillary, _, _ = client.recvmsg(_LARGEST_REPLY_BYTES, socket.CMSG_SPACE(_CREDENTIALS.size))
+    for level, kind, credentials in ancillary:
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS):
             _, uid, _ = _CREDENTIALS.unpack(credentials)
             if uid not in owners(address):
@@ -75,7 +75,7 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
                     "stopped by it; `sudo ss -xlp` names the process, end it and restart the daemon"
                 )
     try:
-        # It has no arrays, for which `messages.decode` imports numpy.
+        # It has no arrays; `messages.decode` would import numpy.
         return dict(msgpack.unpackb(data))
     except (TypeError, ValueError) as error:
         raise foreign_reply(address, error) from error

@@ -42,7 +42,7 @@ CLOCK_OFFSET = "clock_offset_ns"
 # One metadata record for each experiment, and one at the end of a closed recording.
 EXPERIMENT_METADATA = "shearloop.experiment"
 END_METADATA = "shearloop.end"
-# In a recording that begins in the middle of a run: the sources whose state follows as an input.
+# For a recording that begins in the middle of a run: the sources with a state that follows as an input.
 CONTINUED_METADATA = "shearloop.continued"
 CONFIGURATION = "configuration.json"
 # The numbers of k and sigma of a heatmap; other arrays have one dimension.
@@ -148,7 +148,7 @@ def schemas() -> Mapping[str, dict[str, Any]]:
 def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> bytes:
     """Return a message's map as JSON: float32 arrays or their bytes as flat lists, without keys that have no value.
 
-    Its Unix times are those of the monotonic stamp plus offset_ns.
+    Its Unix times are its monotonic stamps plus offset_ns.
     """
     plain: dict[str, Any] = {}
     for key, value in content.items():

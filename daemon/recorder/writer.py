@@ -178,7 +178,7 @@ class McapFile:
             sync_directory(path.parent)
 
     def is_removed(self) -> bool:
-        """Return whether another program removed, moved or replaced the file: what is written is lost."""
+        """Return whether another program removed, moved or replaced the file: further writes are lost."""
         try:
             return not os.path.samestat(os.fstat(self._file.fileno()), self.partial.stat())
         except OSError:
@@ -208,7 +208,7 @@ class McapFile:
 def new_recording(
     path: Path, source: str, notes: Mapping[str, str] | None = None, table: ChannelTable = PAPER_TABLE
 ) -> Iterator[McapFile]:
-    """Yield the file of a recording whose data is from `source`; after an error it keeps the name NAME.partial.
+    """Yield the file of a recording of data from `source`; after an error it keeps the name NAME.partial.
 
     Raises UserError where it cannot be written.
     """

@@ -67,7 +67,7 @@ class FramePairing:
 
 
 class _Tare:
-    """A tare of one estimator: when it begins, whether it is done, and what its frames were refused for."""
+    """A tare of one estimator: when it begins, whether it is done, and why its frames were refused."""
 
     def __init__(self) -> None:
         # The tare begins with the first frame acquired after this.
@@ -264,7 +264,7 @@ class FingertipStates:
     """
 
     def __init__(self, clock: Clock, combined: CombinedFingertips | None = None) -> None:
-        """Begin without a fingertip; those of a pair are in `combined`."""
+        """Begin without a fingertip; the fingertips of a pair are in `combined`."""
         self._clock = clock
         self._combined = combined
         self._boards: list[tuple[EitKit, FingertipPipeline]] = []

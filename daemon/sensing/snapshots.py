@@ -18,7 +18,7 @@ import structlog
 
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
-# Whose objects have a state. The bank's are large, and follow from the configuration.
+# Objects of these rooms have a state. The bank's are large, and follow from the configuration.
 _ROOMS = ("shearloop.bank.", "shearloop.estimation.", "shearloop.drivers.", "shearloop.daemon.sensing.")
 _PLAIN = (bool, int, float, str, type(None))
 _CONTAINERS = (list, dict, tuple, deque, Counter)
@@ -155,7 +155,7 @@ class _Encoder:
 
 
 class _Decoder:
-    """Turns JSON into values, in the order in which they were met."""
+    """Turns JSON into values, in their order."""
 
     def __init__(self, fixed: Mapping[str, object]) -> None:
         self._fixed = fixed

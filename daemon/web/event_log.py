@@ -1,4 +1,4 @@
-"""What happened, in lines: steps, holds, faults, stops, commands and by whom. No I/O: it is told each message."""
+"""The events of a daemon as lines: steps, holds, faults, stops, commands and their senders. No I/O."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -7,7 +7,7 @@ from typing import Any
 
 from shearloop.daemon.messaging.messages import DaemonEnd
 
-# A page shows no more.
+# The page shows at most this many.
 MAX_EVENTS = 200
 ACTIVE = frozenset({"running", "paused", "held"})
 
@@ -17,19 +17,19 @@ class EventLog:
     """The latest events of a daemon, each a map of number, timestamp (Unix s), kind and text."""
 
     events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
-    # The latest message of each topic that tells events by its changes.
+    # The latest message of each topic with events.
     _before: dict[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def add(self, topic: str, content: Mapping[str, Any], number: int) -> None:
-        """Take a message, and keep what happened since the one before it; `number` is the message's."""
-        tell = _TELLERS.get(topic)
-        if tell is None:
+        """Add the events between the previous message of `topic` and this one; `number` is the message's."""
+        events_of = _EVENTS_OF.get(topic)
+        if events_of is None:
             return
         before = self._before.get(topic, {})
         if topic != DaemonEnd.topic:
             self._before.pop(DaemonEnd.topic, None)
         self._before[topic] = content
-        for kind, text in tell(before, content):
+        for kind, text in events_of(before, content):
             self.events.append({"number": number, "timestamp": content["timestamp"], "kind": kind, "text": text})
 
     def after(self, number: int) -> list[dict[str, Any]]:
@@ -37,10 +37,10 @@ class EventLog:
         return [event for event in self.events if event["number"] > number]
 
 
-Told = Iterator[tuple[str, str]]
+Events = Iterator[tuple[str, str]]
 
 
-def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
     phase, was = now.get("phase"), before.get("phase")
     experiment, reasons = now.get("experiment", ""), str(now.get("reasons") or "")
     begun = phase in ACTIVE and (was not in ACTIVE or before.get("run") != now.get("run"))
@@ -55,7 +55,7 @@ def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
     elif phase == "paused":
         yield "hold", "paused"
     elif phase == "running" and was in ("held", "paused"):
-        yield "step", "goes on"
+        yield "step", "continues"
     elif phase == "stopped":
         yield "stop", f"STOPPED, {now.get('response')}: {reasons or now.get('activity')}"
     elif phase == "done":
@@ -64,7 +64,7 @@ def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
         yield "step", "the stop is acknowledged"
 
 
-def _stop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+def _stop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
     if all(before.get(key, ...) == now.get(key) for key in ("experiment", "decided_after_s", "stands_after_s")):
         return
 
@@ -79,13 +79,13 @@ def _stop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
     )
 
 
-def _command(_before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+def _command(_before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
     subject = f" {now['subject']}" if now.get("subject") else ""
     answer = "" if now.get("accepted") else f", REFUSED: {now.get('reason')}"
     yield "command" if now.get("accepted") else "refusal", f"{now.get('command')}{subject}, by {now.get('by')}{answer}"
 
 
-def _health(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+def _health(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
     earlier = before.get("tasks") or {}
     for name, facts in (now.get("tasks") or {}).items():
         was = earlier.get(name, {})
@@ -102,22 +102,22 @@ def _dead(facts: Mapping[str, Any]) -> bool:
     return facts.get("alive") is False and not facts.get("done")
 
 
-def _text_of(key: str) -> Callable[[Mapping[str, Any], Mapping[str, Any]], Told]:
-    """Return what tells a sentence that appears in a key."""
+def _text_of(key: str) -> Callable[[Mapping[str, Any], Mapping[str, Any]], Events]:
+    """Return a function that yields the sentence of `key` when it appears."""
 
-    def tell(before: Mapping[str, Any], now: Mapping[str, Any]) -> Told:
+    def appears(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
         if now.get(key) and not before.get(key):
             yield "fault", str(now[key])
 
-    return tell
+    return appears
 
 
-def _end(before: Mapping[str, Any], _now: Mapping[str, Any]) -> Told:
+def _end(before: Mapping[str, Any], _now: Mapping[str, Any]) -> Events:
     if not before:
         yield "stop", "the daemon has ended"
 
 
-_TELLERS: Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], Told]] = {
+_EVENTS_OF: Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], Events]] = {
     "loop.state": _loop,
     "loop.stop": _stop,
     "daemon.command": _command,

@@ -35,7 +35,7 @@ HEIGHT_MARKS: Mapping[str, tuple[Mapping[str, float], str]] = {
     "linear": ({"k": 0.0}, "k is the height without change"),
     "gaussian_derivative": (
         {"k": 0.0, "k−σ": -1.0, "k+σ": 1.0},
-        "k is the height without change, k−σ and k+σ are those of the largest rise and fall",
+        "k is the height without change, k−σ and k+σ have the largest rise and fall",
     ),
 }
 

@@ -44,7 +44,7 @@ TOKEN_LENGTHS = range(32, 201)
 SHUTDOWN_S = 1.0
 # A daemon that ends together with the viewer is still shown as ended.
 LAST_MESSAGES_S = 0.1
-# Who sends the page's commands, besides the user who serves it.
+# Names the page as the sender of its commands, together with the viewer's user.
 PROGRAM = "the live page"
 # Commands that move something, or change what moves it.
 NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock", "release")

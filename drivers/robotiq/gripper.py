@@ -30,7 +30,7 @@ RobotiqClient: TypeAlias = "SocketClient | ModbusClient"
 COUNTS_MAX = 255
 # Without a calibration, the width of a gripper of unknown fingertips.
 _NOMINAL_STD_MM = 3.0
-# So many diameters over this fraction of the stroke show whether the width bows.
+# This many diameters over this fraction of the stroke show whether the width bows.
 _BOW_GAUGES, _BOW_SPREAD = 4, 0.5
 POLL_S = 0.1
 # The pause between reset and activation that Robotiq's own clients keep.
@@ -95,7 +95,7 @@ class WidthCalibration(CalibrationModel):
         spread_mm = max(diameters) - min(diameters)
         found, unseen_mm = line, 0.0
         if len(diameters) < _BOW_GAUGES or spread_mm < _BOW_SPREAD * own.stroke_mm:
-            # The error of a line between gauges, of which nobody knows the bow.
+            # The error of a line between gauges with an unknown bow.
             unseen_mm = own.bow_mm * (spread_mm / own.stroke_mm) ** 2
         elif (bowed := cls._bowed(counts, widths, own)) is not None and bowed.std_mm < line.std_mm:
             found = bowed
@@ -197,7 +197,7 @@ class RobotiqGripper:
 
     @property
     def model(self) -> GripperModel:
-        """The gripper's model, whose widths the calibration has."""
+        """The gripper's model, for the widths of the calibration."""
         return MODELS[self.calibration.model]
 
     def diagnostics(self) -> Diagnostics:

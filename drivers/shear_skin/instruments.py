@@ -330,7 +330,7 @@ class Keithley6430(PolledInstrument[SourceReading]):
             # Twice: an interrupted command may have left its beginning on the line.
             await self._send(":OUTP OFF", ":OUTP OFF")
             async with asyncio.timeout(SWITCH_OFF_S):
-                # The first answer may be that of a reading in progress.
+                # The first answer can belong to a reading in progress.
                 while (await self._ask(OUTPUT)).text != "0":
                     pass
             self._may_be_on = False

@@ -187,7 +187,7 @@ class SampleValidator:
 class SampleAverager:
     """Averages samples in blocks, as the paper's DAQ did over 1 s. No I/O.
 
-    A sample with faults passes at once. It and a gap end the block before them, whose readings count as missing.
+    A sample with faults passes at once. It and a gap end the block before them; that block's readings count as missing.
     """
 
     def __init__(self, size: int) -> None:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 _RETRY_S = 1.0
 # A program without heartbeats has ended by its watchdog after this time.
 ENDS_ITSELF_S = 2.0
-# A program that does not play so long after its first upload does not start with this worker.
+# A program that does not play within this time after its first upload does not start with this worker.
 STARTS_WITHIN_S = 2.0
 
 NOT_ENABLED = "Motion has not been enabled since the robot's process was started: enable it when the arm may move."
@@ -264,7 +264,7 @@ class CommandHandler:
         return "" if self._arm.zero_wrench() else "The robot did not zero its force-torque sensor."
 
     def tick(self, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
-        """Run one cycle: check the sample and send what is due; return the reply to an `Unlock` that has ended."""
+        """Run one cycle: check the sample and send the due command; return the reply to an `Unlock` that has ended."""
         self._executor.watch(sample, now_ns)
         if sample.program_paused:
             # Resumed at the pendant, it would go on with its last motion until the deadline.

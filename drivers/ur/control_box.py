@@ -23,7 +23,7 @@ from shearloop.drivers.ur.settings import GENERATIONS, UrSettings
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # The services behind the ports, as PolyScope's menu names them.
 SERVICES: Final = {RTDE_PORT: "RTDE", SCRIPT_PORT: "Real-Time Client", DASHBOARD_PORT: "Dashboard Server"}
-# From this version on an e-Series serves only what is enabled.
+# From this version on an e-Series opens only the enabled interfaces.
 FIRST_WITH_SERVICES: Final = (5, 10)
 SERVICES_MENU: Final = "Settings → Security → Services"
 REMOTE_CURE: Final = (
@@ -48,7 +48,7 @@ _PROTOCOL, _CONTROLLER_VERSION, _OUTPUTS, _INPUTS, _START, _DATA = b"VvOISU"
 OLDEST: Final = {3: (3, 10), 5: (5, 4)}
 NEWEST_TESTED: Final = {3: (3, 15, 8), 5: (5, 17, 3)}
 _OTHER_PACKAGES = 20
-# A peer that acknowledges nothing for so long is gone.
+# A peer that acknowledges nothing for this time is gone.
 _PEER_GONE_S = 3
 _LONGEST_LINE = 1024
 # The command registers of ur-rtde's control script, and ours.
@@ -212,7 +212,7 @@ def probe_ports(host: str, timeout_s: float) -> dict[int, str]:
             with socket.create_connection((host, port), timeout_s):
                 found[port] = ""
         except TimeoutError:
-            # Nobody is there; each further port would take as long.
+            # No controller answers; each further port would take as long.
             return {**dict.fromkeys(SERVICES, "no answer"), **found}
         except OSError as error:
             found[port] = system_reason(error)
@@ -242,7 +242,7 @@ def closed_ports_sentence(host: str, closed: Sequence[int], version: tuple[int, 
 
 
 def _known_version(host: str, timeout_s: float) -> tuple[int, ...]:
-    """Return the major and minor version that the dashboard server or RTDE tells; empty where neither does."""
+    """Return the major and minor version from the dashboard server or RTDE; empty if neither reports it."""
     with suppress(DriverError):
         (answer,) = ask_dashboard(host, timeout_s, ("PolyscopeVersion",))
         if found := re.search(r"(\d+)\.(\d+)", answer):

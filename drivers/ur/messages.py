@@ -174,7 +174,7 @@ class RtdeOutputs:
     script_state: int
     script_ticks: int
     script_step_s: float
-    # What is set at the pendant, at the flange; NaN where the controller does not report it.
+    # The pendant's setting, at the flange; NaN where the controller does not report it.
     payload_kg: float
     payload_cog_m: Three
     tcp_offset: Six

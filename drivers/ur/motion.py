@@ -42,7 +42,7 @@ ACCELERATION_S = 0.04
 PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
 # A straight move goes on for this fraction of `silence_timeout_s` after a cycle of the worker.
 LEASE_SHARE = 0.3
-# A motion has ended after so many samples at rest, one after the other.
+# A motion has ended after this number of successive samples at rest.
 REST_SAMPLES = 3
 # The time allowed for a motion to end: nominal time × factor + constant.
 MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
@@ -447,7 +447,7 @@ class Accelerations:
         self._samples: deque[RtdeSample] = deque()
 
     def add(self, sample: RtdeSample) -> None:
-        """Take a sample; one without a later timestamp begins anew, unless it is the latest again."""
+        """Take a sample; a sample without a later timestamp starts again, unless it is the latest one."""
         samples = self._samples
         if samples and sample.timestamp_s <= samples[-1].timestamp_s:
             if sample.timestamp_s == samples[-1].timestamp_s:

@@ -17,7 +17,7 @@ from shearloop.drivers.hosts import why_no_host
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
 
-# For so long the arm may move without its daemon.
+# The arm can move this long without its daemon.
 _Deadline = Annotated[float, Field(gt=0, le=1)]
 # The wrist stands this long after the last decision (docs/safety.md).
 _PROMISED_S = 0.2
@@ -240,7 +240,7 @@ class UrSettings(_Checked):
     """Delay until a commanded speed takes effect; distances to the joint limits include it."""
 
     def __post_init__(self) -> None:
-        """Refuse a host that is none."""
+        """Refuse an invalid host."""
         if reason := why_no_host(self.host):
             raise ValueError(f"host {reason}; give the robot's address")
         facts = self.facts
@@ -256,7 +256,7 @@ class UrSettings(_Checked):
 
     @property
     def facts(self) -> GenerationFacts:
-        """What is particular to the controller's generation."""
+        """The particular settings of a controller's generation."""
         return GENERATIONS[self.generation]
 
     @property

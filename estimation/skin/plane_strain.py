@@ -288,7 +288,7 @@ def gauge_strains(skin: CondensedSkin, states: Iterable[ContactState]) -> FloatA
 
 
 def gauge_depth_mm(section: Section, slack_ratio: float) -> float | None:
-    """Return the depth (mm, outwards from mid-thickness) at which the slack gauge reads this share of the other one.
+    """Return the depth (mm, outwards from mid-thickness) where the slack gauge reads this fraction of the other one.
 
     The slack side bends, so the share rises outwards. None where no depth within the skin has this share.
     """

@@ -1,4 +1,4 @@
-"""Public faces of packages, whose names are imported when they are first used: the command line answers at once."""
+"""Public faces of packages. A name is imported at its first use, so that the command line answers at once."""
 
 import importlib
 from collections.abc import Callable, Mapping

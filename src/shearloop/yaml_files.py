@@ -1,6 +1,6 @@
 """YAML files: read with unique keys, checked by pydantic, and replaced at once when written.
 
-Each caller names the exception to raise. Its message has a line for each mistake: `file:line: key: what is wrong;
+Each caller names the exception to raise. Its message has a line for each mistake: `file:line: key: the mistake;
 allowed: …; did you mean …?`.
 """
 

@@ -106,7 +106,7 @@ class SheetSkin:
         return work
 
     def _mean_strain(self, side: int) -> FloatArray:
-        """Return the (dofs,) weights of a gauge's mean strain; the slack one's is that of the bent ring's tension."""
+        """Return the (dofs,) weights of a gauge's mean strain; the slack gauge's comes from the ring's tension."""
         section = self.section
         ends = section.mid_radius_mm * np.radians([section.gauge_from_deg, section.gauge_to_deg])
         if side == 1:
@@ -122,6 +122,6 @@ class SheetSkin:
 
 
 def _stretches(ends: list[float], counts: tuple[int, ...], finer: int) -> FloatArray:
-    """Return the points that cut each stretch between neighbouring ends into so many parts; empty stretches vanish."""
+    """Return the points that cut each stretch between neighbouring ends into equal parts; empty stretches vanish."""
     parts = [np.linspace(a, b, finer * n + 1) for a, b, n in zip(ends[:-1], ends[1:], counts, strict=True)]
     return np.unique(np.concatenate(parts))

@@ -90,7 +90,7 @@ def fingertip(**changes: Any) -> dict[str, Any]:
         ),
         (
             {"autostart": True, "experiment": "one.yaml", "robot": "ur.yaml"},
-            ["`autostart` moves a robot that nobody has"],
+            ["`autostart` moves the robot without a command"],
         ),
         ({"autostart": True, "emulated": True}, ["`autostart` starts no experiment"]),
         ({"experiment": "", "robot": "ur.yaml"}, ["experiment: must be the path of a file, not '.'"]),

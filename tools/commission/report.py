@@ -23,7 +23,7 @@ class _Record(BaseModel):
 
 
 class Line(_Record):
-    """One measured or noted value: what it is, its limit, how often it was measured, and the promise it checks."""
+    """One measured or noted value: its name, its limit, the number of measurements, and the promise it checks."""
 
     what: str
     value: str
@@ -107,7 +107,7 @@ def sha256(path: Path) -> str:
 
 
 def open_report(path: Path, begun: Report) -> Report:
-    """Return the report in a file, to be continued, or `begun` where there is none.
+    """Return the report in a file, to continue it, or `begun` if the file does not exist.
 
     Raises UserError for a file that is no report, or one of another rig or of other settings.
     """
@@ -128,7 +128,7 @@ def open_report(path: Path, begun: Report) -> Report:
 
 
 def save_report(path: Path, report: Report) -> Path:
-    """Write the report and its page beside it; return the page's path."""
+    """Write the report, and its page into the same folder; return the page's path."""
     save_yaml(path, report.model_dump(mode="json"), UserError)
     page = path.with_suffix(".html")
     try:

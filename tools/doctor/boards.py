@@ -1,4 +1,4 @@
-"""Checks of the boards on serial ports, from what they send while the doctor listens."""
+"""Checks of the boards on serial ports, from their data while the doctor listens."""
 
 import os
 import time
@@ -27,9 +27,9 @@ from shearloop.words import counted
 
 # A larger relative difference between measured and configured rate is reported.
 RATE_TOLERANCE = 0.1
-# In recordings at most a third of an electrode's channels stand still for so many frames.
+# In recordings at most a third of an electrode's channels stand still for this many frames.
 STILL_FRAMES = 10
-# A live converter never sends one value so many times.
+# A live converter never sends one value this many times.
 STUCK_SAMPLES = 10
 # What `--seconds` takes.
 LONGEST_S: Final = 600.0
@@ -38,7 +38,7 @@ ValueT = TypeVar("ValueT")
 
 
 @dataclass(slots=True)
-class Heard(Generic[ValueT]):
+class Received(Generic[ValueT]):
     """What a board sent while the doctor listened: its values, and its lines with the times of their arrival."""
 
     seconds: float
@@ -47,7 +47,7 @@ class Heard(Generic[ValueT]):
     lines: list[tuple[int, int]] = field(default_factory=list)
     refused: int = 0
     refusal: str = ""
-    # What came of a line that did not end.
+    # The beginning of a line that did not end.
     unfinished: bytes = b""
     # Why the port was lost while listening; empty where it was not.
     loss: str = ""
@@ -60,13 +60,13 @@ class Heard(Generic[ValueT]):
         return after * 1e9 / (end_ns - begin_ns) if end_ns > begin_ns else None
 
 
-async def listen(path: str, parser: Parser[ValueT], seconds: float, greeting: bytes = b"") -> Heard[ValueT]:
+async def listen(path: str, parser: Parser[ValueT], seconds: float, greeting: bytes = b"") -> Received[ValueT]:
     """Open a port once, send the greeting, and return what comes within `seconds`.
 
     Raises DriverError for a port that cannot be opened. A driver would connect again after a silence, which depends on
     the configured rate.
     """
-    heard = Heard[ValueT](seconds)
+    received = Received[ValueT](seconds)
     with SerialPort(path) as port:
         parser.handle(RawEvent(InputKind.OPENED, time.monotonic_ns()))
         until_s = time.monotonic() + seconds
@@ -74,18 +74,18 @@ async def listen(path: str, parser: Parser[ValueT], seconds: float, greeting: by
             if greeting:
                 await port.write(greeting)
             while (left_s := until_s - time.monotonic()) > 0:
-                received = await port.read(left_s)
-                if received is None:
+                chunk = await port.read(left_s)
+                if chunk is None:
                     break
                 before = parser.refused
-                values = parser.handle(RawEvent(InputKind.DATA, received.t_arrival_ns, received.data))
-                heard.values += values
+                values = parser.handle(RawEvent(InputKind.DATA, chunk.t_arrival_ns, chunk.data))
+                received.values += values
                 if count := len(values) + parser.refused - before:
-                    heard.lines.append((received.t_arrival_ns, count))
+                    received.lines.append((chunk.t_arrival_ns, count))
         except DriverError as error:
-            heard.loss = str(error)
-    heard.refused, heard.refusal, heard.unfinished = parser.refused, parser.refusal, parser.unfinished
-    return heard
+            received.loss = str(error)
+    received.refused, received.refusal, received.unfinished = parser.refused, parser.refusal, parser.unfinished
+    return received
 
 
 def check_port(name: str, device: SerialDevice) -> Finding:
@@ -108,13 +108,13 @@ async def check_fingertip(name: str, config: FingertipConfig, seconds: float) ->
     """Check a fingertip's port, lines, rate and channels."""
     table = fingertip_table(config)
     parser = FrameParser(table.zero_slots, nominal_period_ns=round(config.frame_period_s * 1e9))
-    findings, heard = await _hear(name, config.device, parser, seconds, START)
-    if heard is None:
+    findings, received = await _receive(name, config.device, parser, seconds, START)
+    if received is None:
         return findings
     key = f"fingertips.{name}.frame_period_s"
-    findings += _check_pace(name, heard, 1.0 / config.frame_period_s, key, as_period=True)
-    if heard.values:
-        findings.append(check_frames(name, heard.values, table))
+    findings += _check_pace(name, received, 1.0 / config.frame_period_s, key, as_period=True)
+    if received.values:
+        findings.append(check_frames(name, received.values, table))
     return findings
 
 
@@ -126,12 +126,12 @@ async def check_load_cell(config: LoadCellConfig, seconds: float) -> list[Findin
         # Among the files this is a finding of its own.
         calibration = LoadCalibration.of_torque_lines()
     parser = LoadParser(calibration, config.rate_hz)
-    findings, heard = await _hear("load_cell", config.device, parser, seconds)
-    if heard is None:
+    findings, received = await _receive("load_cell", config.device, parser, seconds)
+    if received is None:
         return findings
-    findings += _check_pace("load_cell", heard, config.rate_hz, "load_cell.rate_hz")
+    findings += _check_pace("load_cell", received, config.rate_hz, "load_cell.rate_hz")
     # The first line may lack its beginning.
-    samples = [sample for sample in heard.values if not sample.partial]
+    samples = [sample for sample in received.values if not sample.partial]
     if samples:
         findings.append(check_samples(samples))
     return findings
@@ -140,8 +140,8 @@ async def check_load_cell(config: LoadCellConfig, seconds: float) -> list[Findin
 async def check_adc(name: str, config: AdcConfig, rate_hz: float, seconds: float) -> list[Finding]:
     """Check the port, the lines and the rate of the skin's converter board."""
     parser = PairParser(rate_hz, config.full_scale_v)
-    findings, heard = await _hear(name, config.device, parser, seconds)
-    return findings if heard is None else findings + _check_pace(name, heard, rate_hz, "skin.daq.rate_hz")
+    findings, received = await _receive(name, config.device, parser, seconds)
+    return findings if received is None else findings + _check_pace(name, received, rate_hz, "skin.daq.rate_hz")
 
 
 def check_rate(subject: str, measured_hz: float, configured_hz: float, key: str, *, as_period: bool = False) -> Finding:
@@ -219,29 +219,29 @@ def check_samples(samples: Sequence[LoadSample]) -> Finding:
     return good(subject, f"{counted(n, 'reading')}, the last {last.raw:.10g}")
 
 
-async def _hear(
+async def _receive(
     name: str, device: SerialDevice, parser: Parser[ValueT], seconds: float, greeting: bytes = b""
-) -> tuple[list[Finding], Heard[ValueT] | None]:
-    """Return the findings on port and lines, and what was heard; None where no value came."""
+) -> tuple[list[Finding], Received[ValueT] | None]:
+    """Return the findings on port and lines, and the received data; None where no value came."""
     port = check_port(name, device)
     if port.state == "trouble":
         return [port], None
     nothing_read = "the daemon cannot read the board"
     try:
-        heard = await listen(_path_of(device), parser, seconds, greeting)
+        received = await listen(_path_of(device), parser, seconds, greeting)
     except DriverError as error:
         return [from_error(port.subject, error, nothing_read, "`shearloop ports` lists the boards")], None
-    if heard.loss:
+    if received.loss:
         cure = "check its cable and power"
-        return [port, from_error(f"lines of {name}", heard.loss, "it went while the doctor listened", cure)], None
-    if heard.values:
-        return [port, *_check_refused(name, heard)], heard
-    if heard.refused:
-        what, cure = split_cure(heard.refusal)
-        found = f"{counted(heard.refused, 'line')} came, and none is of use; {what}"
+        return [port, from_error(f"lines of {name}", received.loss, "it went while the doctor listened", cure)], None
+    if received.values:
+        return [port, *_check_refused(name, received)], received
+    if received.refused:
+        what, cure = split_cure(received.refusal)
+        found = f"{counted(received.refused, 'line')} came, and none is of use; {what}"
         return [port, trouble(f"lines of {name}", found, nothing_read, cure)], None
-    if heard.unfinished:
-        found = f"bytes without a line end came: {shown(heard.unfinished)}"
+    if received.unfinished:
+        found = f"bytes without a line end came: {shown(received.unfinished)}"
         cure = "see whether it is this board: `shearloop ports` lists them; let its program end each line"
         return [port, trouble(f"lines of {name}", found, nothing_read, cure)], None
     means = "the board has no power, is another one, or sends less often than once in that time"
@@ -250,25 +250,24 @@ async def _hear(
     return [port, trouble(f"rate of {name}", found, means, cure)], None
 
 
-def _check_refused(name: str, heard: Heard[ValueT]) -> list[Finding]:
-    if not heard.refused:
+def _check_refused(name: str, received: Received[ValueT]) -> list[Finding]:
+    if not received.refused:
         return []
-    what, cure = split_cure(heard.refusal)
-    found = (
-        f"{counted(heard.refused, 'line was', 'lines were')} left out of {heard.refused + len(heard.values)}; {what}"
-    )
+    what, cure = split_cure(received.refusal)
+    lines = received.refused + len(received.values)
+    found = f"{counted(received.refused, 'line was', 'lines were')} left out of {lines}; {what}"
     cure = cure or "replace the USB cable, and end other programs that use the board"
-    return [note(f"lines of {name}", found, "what is left out is missing in the estimates", cure)]
+    return [note(f"lines of {name}", found, "the estimates miss these lines", cure)]
 
 
 def _check_pace(
-    name: str, heard: Heard[ValueT], configured_hz: float, key: str, *, as_period: bool = False
+    name: str, received: Received[ValueT], configured_hz: float, key: str, *, as_period: bool = False
 ) -> list[Finding]:
-    if heard.rate_hz is None:
-        found = f"{counted(len(heard.values), 'value')} came in {heard.seconds:g} s"
-        cure = f"listen longer: `--seconds {_longer(heard.seconds)}`"
-        return [note(f"rate of {name}", found, "the rate cannot be told from so few", cure)]
-    return [check_rate(f"rate of {name}", heard.rate_hz, configured_hz, key, as_period=as_period)]
+    if received.rate_hz is None:
+        found = f"{counted(len(received.values), 'value')} came in {received.seconds:g} s"
+        cure = f"listen longer: `--seconds {_longer(received.seconds)}`"
+        return [note(f"rate of {name}", found, "the rate is unknown: these are too few", cure)]
+    return [check_rate(f"rate of {name}", received.rate_hz, configured_hz, key, as_period=as_period)]
 
 
 def _longer(seconds: float) -> str:

@@ -166,7 +166,7 @@ def _usual_period_s(frames: Sequence[Mapping[str, Any]]) -> float:
 
 
 def check_task(name: str, status: Mapping[str, Any]) -> Finding:
-    """Judge one task by what it reports."""
+    """Judge one task by its report."""
     subject, (_, state, _, notes) = f"task {name}", task_row(name, status)
     found = f"{state}, {notes}" if notes else state
     if state == "DEAD" or status.get("restarts"):

@@ -1,4 +1,4 @@
-"""Reads what is intact in a recording, closed or not: damage costs only what it hits.
+"""Reads the intact part of a recording, closed or not: damage loses only the records that it hits.
 
 A chunk and an attachment carry a checksum. Where a record's own length is damaged, reading continues at the next place
 that the index names, or at the next chunk that has the form of one.
@@ -76,7 +76,7 @@ _SEARCHED_BYTES = 1 << 20
 
 @dataclass(slots=True)
 class _MessageCounts:
-    """Numbers of messages by channel: intact ones, those in damaged chunks, and those of the whole file if known."""
+    """Numbers of messages by channel: intact ones, ones in damaged chunks, and all of the file if known."""
 
     intact: Counter[int] = field(default_factory=Counter)
     damaged: Counter[int] = field(default_factory=Counter)
@@ -98,7 +98,7 @@ class _MessageCounts:
 class IntactRecords:
     """The messages, metadata and attachments of a file, up to its end or to where nothing intact follows.
 
-    While it is iterated, it counts what is damaged; `channels` and `schemas` are those of the messages so far.
+    While it is iterated, it counts the damage; `channels` and `schemas` cover the messages so far.
     `progress` receives the bytes read.
     """
 
@@ -253,7 +253,7 @@ def check_magic(path: Path, file: BinaryIO) -> None:
 
 
 def check_size(chunk: Chunk) -> None:
-    """Raise ValueError for a chunk that would fill the memory, or whose compression is not known."""
+    """Raise ValueError for a chunk that would fill the memory, or has an unknown compression."""
     size = chunk.uncompressed_size
     match chunk.compression:
         case "" | "zstd":
@@ -313,7 +313,7 @@ class _Content(BytesIO):
 
 
 def _parsed(opcode: int, content: bytes) -> McapRecord | None:
-    """Return the record whose form the content has, from its first to its last byte, or None."""
+    """Return the record if its form fits the content from its first to its last byte, else None."""
     if opcode not in _KINDS and opcode != Opcode.MESSAGE:
         return None
     stream = ReadDataStream(_Content(content))

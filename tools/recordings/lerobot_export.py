@@ -1,6 +1,6 @@
 """Writes a recording as a LeRobotDataset v3.0 of one episode: 25 rows a second, each with the latest messages.
 
-The format is that of the library lerobot. A message counts from the moment when the daemon had it, and a
+The format is the library lerobot's. A message counts from the moment when the daemon had it, and a
 policy could have used it. Missing values are NaN, and `valid` is 1 or 0.
 """
 

@@ -50,9 +50,9 @@ _CYLINDER = re.compile(r"(\d+(?:\.\d+)?)mm[_.]")
 _ONE_LOOP_S = 0.02
 # A loop waited for its load values where this many end within this time of the line below all of them.
 _LEAST_PACED, _PACED_S = 3, 0.03
-# The paper's loop began to read so long after the load cell's board began to send. Recordings show 2.4 to 2.8 s by
-# their stamps, ± 0.27 s each, and 2.7 s by the gel's motion: one program, one delay. A loop whose stamps differ by more
-# than the second number is of another program.
+# The paper's loop began to read this long after the load cell's board began to send. Recordings show 2.4 to 2.8 s by
+# their stamps, ± 0.27 s each, and 2.7 s by the gel's motion: one program, one delay. A loop with stamps
+# that differ by more than the second number comes from another program.
 _PROGRAM_LATE_S, _OTHER_PROGRAM_S = 2.7, 0.55
 _HDF5_SIGNATURE = b"\x89HDF"
 
@@ -103,7 +103,7 @@ def read_stream(path: Path, name: str | None = None, time_format: str = DATENUM)
 
 
 def read_lines(path: Path, side: str | None = None) -> FloatArray:
-    """Return the lines (n, 1024) in volts of a fingertip's stream, whose times may be in any format.
+    """Return the lines (n, 1024) in volts of a fingertip's stream; its times may have any format.
 
     Raises UserError as `read_stream` does.
     """
@@ -133,7 +133,7 @@ def _fits(times: FloatArray, time_format: str) -> bool:
 
 
 def _check_times(path: Path, times: FloatArray, time_format: str) -> None:
-    """Raise UserError, with what was found and the cure, unless times (n,) are of the format and do not fall."""
+    """Raise UserError, with the finding and the cure, unless times (n,) are of the format and do not fall."""
     steps = np.diff(times)
     if _fits(times, time_format):
         steps_s = steps * TIME_FORMATS[time_format].unit_s
@@ -338,7 +338,7 @@ def _loop_clock(stamps_s: FloatArray) -> tuple[float, float] | None:
 
 
 def _loop_times(load: Stream, streams: dict[str, Stream], remarks: list[str]) -> tuple[Stream, dict[str, Stream], bool]:
-    """Return the streams of one loop with the times at which they were sent, and whether these are sure."""
+    """Return the streams of one loop with the times of sending, and whether these are sure."""
     # The loop read one line per frame and the board sends six. The rest waited in the port's buffer.
     clock = _loop_clock(load.unix_s)
     load_late_s, late_s = clock or (0.0, 0.0)

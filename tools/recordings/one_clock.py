@@ -51,7 +51,7 @@ def is_one_clock(identity: Mapping[str, str]) -> bool:
 
 
 def by_one_clock(first: tuple[Channel, Message], in_file_order: Callable[[], Messages]) -> Messages:
-    """Yield corrected messages by time; `first` is the file's first with a monotonic stamp, whatever is selected.
+    """Yield corrected messages by time; `first` is the file's first with a monotonic stamp, selected or not.
 
     Reads the file twice, and holds only the messages that are out of order.
     """

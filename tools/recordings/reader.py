@@ -127,7 +127,7 @@ class OpenRecording:
     def messages(self, topics: Iterable[str] | None = None, *, by_time: bool = True) -> Messages:
         """Return the messages of some topics or of all, by time or in the order of the file.
 
-        By time, log times are those of the monotonic stamps, so that a wall clock that was set changes nothing.
+        By time, log times come from the monotonic stamps, so that a wall clock that was set changes nothing.
         """
         wanted = None if topics is None else [*topics]
         if by_time and self.counts.get(schema.CLOCK_TOPIC) and not is_one_clock(self.identity):
@@ -335,10 +335,10 @@ class ListedRecording:
 
 
 def list_recordings(folder: Path) -> list[ListedRecording]:
-    """Return the recordings in a folder and below it, those of a known beginning first and by it.
+    """Return the recordings in a folder and below it, by their beginning; recordings without one come last.
 
-    Reads the indices only, but for recordings with log times of a wall clock, which are read whole. Raises UserError
-    for a folder that is none.
+    Reads the indices only, except in recordings with log times of a wall clock: these are read whole. Raises UserError
+    for a path that is no folder.
     """
     if not folder.is_dir():
         raise UserError(f"{folder} is no folder; `shearloop recording info FILE` shows one recording")

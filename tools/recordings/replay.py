@@ -67,7 +67,7 @@ class RecordedEvent:
 class ReplayEvents(NamedTuple):
     """What frames do not contain: tares, tools and known torques of the grip by source, each with its first frame.
 
-    `frame_numbers` holds the frames' numbers by source and arrival, `sample_numbers` those of the skin's samples by
+    `frame_numbers` holds the frames' numbers by source and arrival, `sample_numbers` the skin samples' numbers by
     their time; they continue from file to file.
     """
 
@@ -362,7 +362,7 @@ class Replay:
         return [replace(frame, seq=frame.seq + offset) for frame in frames] if offset else frames
 
     def _continued(self, message: messages.SkinShear) -> messages.SkinShear:
-        """Return a message with the number of its sample in the run; the first one takes that of the nearest time."""
+        """Return a message with the number of its sample in the run; the first takes the number of the nearest time."""
         if SKIN not in self._number_offset:
             numbers = self._events.sample_numbers
             nearest = min(numbers, key=lambda t_ns: abs(t_ns - message.t_mono_ns), default=None)
@@ -414,7 +414,7 @@ def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: in
         side, t_ns = topic.removeprefix(f"{schema.FRAME_TOPIC}."), int(content["arrival_unix_ns"])
         return RecordedEvent(schema.input_topic(side), t_ns, {}, side, RawEvent(InputKind.DATA, t_ns, text.encode()))
     complete = {
-        # The only imported topic beside the frames.
+        # The only imported topic other than the frames.
         "source": LOAD_CELL,
         "raw": content.get("torque_nm"),
         "saturated": False,

@@ -93,7 +93,7 @@ def _save_slice(out: Path, one: _Slice) -> Path:
 
 
 def _save_raw(folder: Path, one: _Slice) -> list[Path]:
-    """Write a slice's frames, clipped like the paper's, and return the files; those of an earlier recording stay."""
+    """Write a slice's frames, clipped like the paper's, and return the files; files of an earlier recording stay."""
     raw, homogeneous = folder / RAW_FRAME, folder / RAW_HOMOGENEOUS
     if raw.exists() or homogeneous.exists():
         return []
@@ -118,7 +118,7 @@ class _Sweep:
         self._hold: tuple[int, int, str] | None = None
 
     def add(self, topic: str, content: Mapping[str, Any]) -> _Slice | str | None:
-        """Take one message; return the slice of a hold that it ends, or why there is none."""
+        """Take one message; return the slice of a hold that it ends, or the reason for no slice."""
         if "source" not in content:
             raise ContentError("it is imported, and the control loop's messages are not")
         t_ns = content["t_mono_ns"]

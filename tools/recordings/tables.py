@@ -22,7 +22,7 @@ class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
     """The topics of a recording; each is a map of arrays, which is read when it is first used.
 
     `log_time_ns` is the Unix time of each message. Numbers have the shape (n,), arrays (n, m), NaN where a value is
-    missing; texts are objects, "" where one is missing. The keys and their units are those of `docs/messages.md`.
+    missing; texts are objects, "" where one is missing. `docs/messages.md` lists the keys and their units.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""The numbers by which programs write times, for the first column of MATLAB streams."""
+"""The number formats of times in programs, for the first column of MATLAB streams."""
 
 from typing import NamedTuple
 

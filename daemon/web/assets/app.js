@@ -65,7 +65,7 @@ function chartLines() {
   if (link.get("skin.shear")?.content.torque_nm != null || torques.columns.get("skin")?.some((value) => value != null)) {
     lines.push({ name: "skin", label: "shear skin", stroke: colours.skin, width: 2, dash: [2, 3] });
   }
-  if (link.get("loop.state")) lines.push({ name: "wanted", label: "wanted", stroke: colours.wanted, width: 2.5, dash: [9, 5] });
+  if (link.get("loop.state")) lines.push({ name: "wanted", label: "set point", stroke: colours.wanted, width: 2.5, dash: [9, 5] });
   return lines;
 }
 
@@ -108,7 +108,7 @@ function into(place, name) {
 function linkLine() {
   const state = link.state();
   byId("link").dataset.state = state;
-  const heard = Number.isFinite(link.sinceDaemon());
+  const received = Number.isFinite(link.sinceDaemon());
   const end = link.end()?.content;
   show(byId("summary"), state === "ended" && Boolean(end?.summary));
   put(byId("summary-text"), end?.summary ?? "");
@@ -116,10 +116,10 @@ function linkLine() {
     ended: [end?.finished ? "✓ DONE" : "ended", `the daemon ${link.viewerLost() ? "and the viewer have" : "has"} ended; the last values are shown`],
     live: ["● live", ""],
     connecting: ["connecting", "to the viewer on the rig's computer"],
-    lost: ["✗ VIEWER LOST", `no word from the viewer for ${age(link.sinceBatch())}; what is shown is old, and it is tried again`],
-    dead: heard
-      ? ["✗ DAEMON SILENT", `nothing from it for ${age(link.sinceDaemon())}; what is shown is old`]
-      : ["✗ NO DAEMON", `nothing is heard at ${settings.publish}; start one with \`shearloop run CONFIG\``],
+    lost: ["✗ VIEWER LOST", `nothing from the viewer for ${age(link.sinceBatch())}; all values are old, and the page reconnects by itself`],
+    dead: received
+      ? ["✗ DAEMON SILENT", `nothing from it for ${age(link.sinceDaemon())}; all values are old`]
+      : ["✗ NO DAEMON", `no message arrives from ${settings.publish}; start one with \`shearloop run CONFIG\``],
   }[state];
   put(byId("link-state"), name);
   put(byId("link-reason"), reason);

@@ -51,9 +51,9 @@ export class Controls {
   update(link) {
     this.reasons = refusals(link);
     this.refresh();
-    const heard = link.state() === "live" && link.get("loop.state") !== undefined;
-    if (heard && !this.heard) this.offer();
-    this.heard = heard;
+    const received = link.state() === "live" && link.get("loop.state") !== undefined;
+    if (received && !this.received) this.offer();
+    this.received = received;
   }
 
   // Fill the picker with the experiments that the daemon offers.

@@ -54,7 +54,7 @@ export function torquePanel(link) {
   warn(byId("torque-reason"), [said && !valid ? `no estimate: ${said.reason}` : "", silent].filter(Boolean).join("; "));
   const wanted = loop && !link.isOld(loop) && ACTIVE.has(loop.content.phase) ? loop.content : {};
   put(byId("wanted"), number(wanted.ramp_nm, 4, "N·m", { signed: true }));
-  put(byId("set-point"), wanted.set_point_nm == null ? "" : `set point ${number(wanted.set_point_nm, 3, "", { signed: true })}`);
+  put(byId("set-point"), wanted.set_point_nm == null ? "" : `final ${number(wanted.set_point_nm, 3, "", { signed: true })}`);
   loadFigure(link, load);
   diameterFigure(link, estimate);
 }
@@ -179,7 +179,7 @@ export function robotPanel(link) {
   const sent = loop && !link.isOld(loop) ? loop.content : {};
   put(byId("speed-sent"), number(sent.speed_sent_rad_per_s, 3, "rad/s", { signed: true }));
   const clipped = sent.speed_command_rad_per_s !== undefined && Math.abs(sent.speed_command_rad_per_s - sent.speed_sent_rad_per_s) > 0.0005;
-  put(byId("speed-command"), clipped ? `wanted ${number(sent.speed_command_rad_per_s, 3, "", { signed: true })}` : "");
+  put(byId("speed-command"), clipped ? `requested ${number(sent.speed_command_rad_per_s, 3, "", { signed: true })}` : "");
 }
 
 export function gripperPanel(link) {

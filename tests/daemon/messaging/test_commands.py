@@ -135,7 +135,7 @@ def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
 
 
 async def test_commands_are_told_with_their_answer_and_questions_are_not():
-    told: list[tuple[str, str | None]] = []
+    reported: list[tuple[str, str | None]] = []
     sensors = SimpleNamespace(tareable={"right": SimpleNamespace(tare=lambda: None)})
     handlers = Commands(
         rig=None,
@@ -143,16 +143,16 @@ async def test_commands_are_told_with_their_answer_and_questions_are_not():
         experiment=None,
         health=SimpleNamespace(tasks=dict, rig="bench"),
         daemon_end=asyncio.Event(),
-        tell=lambda answered: told.append((answered.name, answered.refusal)),
+        report=lambda answered: reported.append((answered.name, answered.refusal)),
     ).handlers()
     await handlers["tare"]({"by": "ann"})
     await handlers[STATUS]({})
     for name, request_ in (("tare", {"source": "left"}), ("start", {}), ("start", {"ask": True})):
         with pytest.raises(CommandRefusedError):
             await handlers[name](request_)
-    assert [name for name, _ in told] == ["tare", "tare", "start"]
-    assert told[0][1] is None
-    assert "there is no sensor 'left' to tare" in str(told[1][1])
+    assert [name for name, _ in reported] == ["tare", "tare", "start"]
+    assert reported[0][1] is None
+    assert "there is no sensor 'left' to tare" in str(reported[1][1])
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def test_steps_holds_and_stops_are_told_once_each():
         ("step", "step 1 of 3: grip"),
         ("step", "step 2 of 3: grip"),
         ("hold", "holding: the torque is not valid. Wait."),
-        ("step", "goes on"),
+        ("step", "continues"),
         ("stop", "STOPPED, stop and keep grip: the operator stopped it."),
         ("step", "the stop is acknowledged"),
         ("step", "hold runs"),

@@ -8,7 +8,7 @@ const TOKEN_NEEDED = "needs the token: open the address that `shearloop view` pr
 // A daemon answers within milliseconds; `unlock` takes longer.
 const LATE_MS = 65000;
 const STOP_LATE_MS = 4000;
-// An answer goes after so long; that a stop is not confirmed stays.
+// An answer disappears after this time; an unconfirmed stop stays.
 const SHOWN_MS = 8000;
 
 export class Controls {

@@ -31,7 +31,9 @@ def run(args: argparse.Namespace) -> int:
     content = read_yaml(args.config, UserError)
     is_experiment = isinstance(content, dict) and "steps" in content
     if args.rig is not None and not is_experiment:
-        raise UserError(f"{args.config}: --config names a configuration for an experiment, and this file is none")
+        raise UserError(
+            f"{args.config}: this file is a configuration, and --config goes with an experiment; leave --config out"
+        )
     parts = _check_experiment(args.config, args.rig) if is_experiment else _check_configuration(args.config)
     plan_lines = [line for plan in parts.plans for line in plan.sentences()]
     if parts.mistakes:

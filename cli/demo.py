@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     if args.play is None and not config.autostart:
         raise UserError(
             f"{folder / name} starts nothing by itself: it needs `emulated: true` and `autostart: true`; remove it, "
-            "and `shearloop demo` writes it anew"
+            "and `shearloop demo` writes it again"
         )
     if args.play is not None:
         from shearloop.tools.recordings.matlab_import import read_lines

@@ -122,7 +122,7 @@ class ActionExecutor:
 
     async def _open(self) -> None:
         if self.gripper is None:
-            raise ActionError("no gripper is configured")
+            raise ActionError("no gripper is configured; add a `gripper` section to the configuration")
         self.fingers_move = True
         await self.gripper.open_by_operator()
         self.fingers_move = False
@@ -235,7 +235,7 @@ class ActionExecutor:
                     state = await self.robot.next_state()
         except TimeoutError:
             what = f"the arm did not come to rest within {COMES_TO_REST_S:g} s"
-            raise ActionError(f"{what}; check what moves it") from None
+            raise ActionError(f"{what}; find what moves it, such as freedrive or another program") from None
 
     async def _move(self, action: ApproachStep) -> None:
         pose = action.pose_m_rad
@@ -247,7 +247,7 @@ class ActionExecutor:
                 continue
             here = self.robot.state
             if here is None:
-                raise ActionError("the robot is not connected")
+                raise ActionError("the robot is not connected; `shearloop doctor CONFIG` examines it")
             # The goal is fixed at the first start, so that an interruption does not lengthen the move.
             pose = pose or along_tool(here.tcp_pose, action.along_tool_m or 0.0)
             command = MoveLinear(pose, action.speed_m_per_s, LINEAR_ACCELERATION_M_PER_S2)

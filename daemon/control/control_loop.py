@@ -214,10 +214,11 @@ class ControlLoop:
         if (running := self.running) is not None:
             return f"the experiment {running.file.name!r} is running; stop it first"
         if "gripper" not in self._watched.required:
-            return "no gripper is configured"
+            return "no gripper is configured; add a `gripper` section to the configuration"
         gripper = self.inputs.gripper
         if gripper is None or "gripper" in self.inputs.lost:
-            return f"the gripper is not connected: {self.inputs.lost.get('gripper', 'it has not answered yet')}"
+            reason = self.inputs.lost.get("gripper", "it has not answered yet")
+            return f"the gripper is not connected: {reason.removesuffix('.')}; `shearloop doctor CONFIG` examines it"
         return None
 
     def release_question(self) -> str:
@@ -376,7 +377,7 @@ class ControlLoop:
         if "gripper" not in self._watched.required or hand is None or not (hand.uncertain or hand.moving):
             return None
         doubt = "are moving" if hand.moving else "stand where a stop, an activation or a lack of power has left them"
-        return f"the gripper does not say whether it holds a tool: its fingers, {hand.width_mm:.1f} mm apart, {doubt}"
+        return f"the gripper does not know whether it holds a tool: its fingers, {hand.width_mm:.1f} mm apart, {doubt}"
 
     def _run_step(self, experiment: Experiment, decision: SafetyDecision, wrist_rad: float, t_ns: int) -> ControlOutput:
         """Let the experiment choose its command, and the wrist's controller a speed."""

@@ -72,12 +72,13 @@ class FaultCode(Enum):
     TORQUE_LIMIT = Rule(
         _RELEASE,
         "the torque is beyond its limit: {detail}.",
-        "Check what blocks the tool; raise `limits.torque_nm` only if tool and gel bear it.",
+        "Find the obstacle of the tool, then `shearloop command unlock`; raise `limits.torque_nm` only if tool and gel "
+        "bear it.",
     )
     ANGLE_LIMIT = Rule(
         _KEEP,
         "the wrist has reached its angle limit: {detail}.",
-        "The tool may be slipping; regrip it, or widen `limits.angle_rad`.",
+        "If the tool slips, grip it again, else widen `limits.angle_rad`; then `shearloop command unlock`.",
     )
     TORQUES_DISAGREE = Rule(
         _HOLD,
@@ -93,7 +94,7 @@ class FaultCode(Enum):
     EMERGENCY_STOP = Rule(
         _KEEP,
         "the robot's emergency stop is pressed: {detail}.",
-        "Release the button, power the arm on the pendant, then `shearloop command unlock`.",
+        "Release the button, power the arm on at the pendant, then `shearloop command unlock`.",
     )
     GRIPPER_FAULT = Rule(
         _KEEP,
@@ -101,7 +102,7 @@ class FaultCode(Enum):
         "Clear the fault; `shearloop command unlock` then activates the gripper again.",
     )
     GRIP_LOST = Rule(
-        _KEEP, "the gripper no longer holds an object: {detail}.", "Put the tool back and start the experiment again."
+        _KEEP, "the gripper no longer holds an object: {detail}.", "Put the tool back, then `shearloop command unlock`."
     )
     NOT_RELEASED = Rule(
         _KEEP,
@@ -117,13 +118,13 @@ class FaultCode(Enum):
     DEVICE_AWAITED = Rule(
         _KEEP,
         "a device that the experiment needs is not connected yet: {detail}.",
-        "Switch it on and connect it; it is found automatically. `shearloop doctor CONFIG` examines it.",
+        "Switch it on and connect it; the daemon finds it by itself. `shearloop doctor CONFIG` examines it.",
     )
     ROBOT_STARTING = Rule(_KEEP, "the robot is not ready yet: {detail}.", "The experiment can begin in a few seconds.")
     DEVICE_LOST = Rule(
         _KEEP,
         "a device that the experiment needs is gone: {detail}.",
-        "Plug it in again; it is found automatically. Then `shearloop command unlock`, and the experiment can begin.",
+        "Connect it again; the daemon finds it by itself. Then `shearloop command unlock`; the experiment can begin.",
     )
     ROBOT_LOST = Rule(
         _KEEP,
@@ -138,7 +139,7 @@ class FaultCode(Enum):
     TASK_DIED = Rule(
         _KEEP,
         "a task of the daemon crashed and restarts: {detail}.",
-        "Read the log above this line; report the crash if it recurs.",
+        "Read the log above this line, then `shearloop command unlock`. Report the crash if it recurs.",
     )
     DAEMON_PAUSED = Rule(
         _KEEP,
@@ -159,7 +160,7 @@ class FaultCode(Enum):
     HELD_TOO_LONG = Rule(
         _KEEP,
         "the wrist was held for too long by several faults: {detail}.",
-        "Clear the longest one first, then start the experiment again.",
+        "Clear the longest one first, then `shearloop command unlock`.",
     )
     RECORDING_FAILED = Rule(
         Response.REFUSE_START,
@@ -179,7 +180,7 @@ class FaultCode(Enum):
     STEP_OVERDUE = Rule(
         _KEEP,
         "a step took longer than it may: {detail}.",
-        "Check what delayed it; lengthen `timeout_s` of the step if it is too short.",
+        "Find the cause of the delay, or lengthen the step's `timeout_s`; then `shearloop command unlock`.",
     )
     STEP_FAILED = Rule(
         _KEEP, "the experiment cannot continue: {detail}.", "Clear the cause, then `shearloop command unlock`."
@@ -190,7 +191,7 @@ class FaultCode(Enum):
     TOOL_GRIPPED = Rule(
         Response.NOTE,
         "the gripper still holds something: {detail}.",
-        "Secure it. Then `shearloop command release --yes` opens the gripper, and what it holds drops.",
+        "Secure it. Then `shearloop command release --yes` opens the gripper, and the object drops.",
     )
     DAEMON_ENDED = Rule(
         _KEEP, "the daemon ended: {detail}.", "Look at the rig, then `shearloop command unlock` allows the next start."

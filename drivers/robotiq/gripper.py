@@ -64,7 +64,10 @@ class WidthCalibration(CalibrationModel):
             raise ValueError("the open position must have fewer counts and more millimetres than the closed one")
         widths = [self.width_mm(counts) for counts in range(COUNTS_MAX + 1)]
         if any(one <= other for one, other in pairwise(widths)):
-            raise ValueError(f"with a bow of {self.bow_mm:g} mm the width would not fall with the counts")
+            raise ValueError(
+                f"with a bow of {self.bow_mm:g} mm the width would not fall with the counts: measure it again with "
+                "`shearloop calibrate gripper`"
+            )
         return self
 
     @classmethod
@@ -87,8 +90,8 @@ class WidthCalibration(CalibrationModel):
             raise DeviceCalibrationError("A width calibration needs objects of at least two different diameters.")
         if max(diameters) > own.stroke_mm:
             raise DeviceCalibrationError(
-                f"An object of {max(diameters):g} mm does not fit between the fingers of a {model}, whose stroke is "
-                f"{own.stroke_mm:g} mm."
+                f"An object of {max(diameters):g} mm does not fit between the fingers of a {model}: its stroke is "
+                f"{own.stroke_mm:g} mm. Measure without it, or correct `--model`."
             )
         counts, widths = (np.array(column, dtype=float) for column in zip(*gauges, strict=True))
         line = cls._line(counts, widths, own)

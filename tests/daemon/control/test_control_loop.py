@@ -157,7 +157,7 @@ def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(sen
 
     why = refused({"do": "wait", "wait_s": 1}, turning, GRIP)
     assert why == (
-        f"the gripper does not say whether it holds a tool: its fingers, 43.2 mm apart, {what}; put a `grip` or a "
+        f"the gripper does not know whether it holds a tool: its fingers, 43.2 mm apart, {what}; put a `grip` or a "
         f"`release` before step 2 ({turning['do']}), which turns the wrist"
     )
     assert rig.control_loop.experiment is None

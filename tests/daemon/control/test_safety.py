@@ -227,6 +227,14 @@ def test_a_reason_to_wait_with_the_start_does_not_ask_for_a_start(code):
     assert "start the experiment again" not in trouble(FaultCode[code]).sentence
 
 
+@pytest.mark.parametrize("code", FaultCode)
+def test_the_cure_of_a_stop_names_the_command_that_allows_the_next_start(code):
+    stops = code.value.response >= Response.STOP_AND_KEEP_GRIP
+    # These two only delay a start.
+    if stops and code not in {FaultCode.DEVICE_AWAITED, FaultCode.ROBOT_STARTING}:
+        assert "`shearloop command unlock`" in code.value.cure
+
+
 @pytest.mark.parametrize("event", [FaultCode.RECORDING_FAILED, FaultCode.COMMAND_REFUSED])
 def test_what_does_not_come_of_a_pause_is_told_beside_it(event):
     paused, other, limit = trouble(FaultCode.DAEMON_PAUSED), trouble(event), trouble(FaultCode.TORQUE_LIMIT)

@@ -108,7 +108,7 @@ def test_no_tare_while_something_is_held():
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
 def test_a_tare_with_an_uncertain_gripper_has_to_be_confirmed(sense):
     rig = held(**sense)
-    assert "does not say whether it holds a tool" in (rig.control_loop.tare_refusal() or "")
+    assert "does not know whether it holds a tool" in (rig.control_loop.tare_refusal() or "")
     assert rig.control_loop.tare_refusal(confirmed=True) is None
 
 

@@ -148,7 +148,7 @@ def functions_of(calls: Iterable[CodeType]) -> Way:
 
 
 def shortest(ways: Sequence[Way]) -> Way:
-    """Return the way with the fewest functions; raises RuntimeError without one."""
+    """Return the path with the fewest functions; raises RuntimeError without one."""
     if not ways:
         raise RuntimeError("no way was traced from its beginning to its end")
     return min(ways, key=len)
@@ -254,7 +254,7 @@ def traced_worker(folder: Path) -> Iterator[None]:
 
 
 def run_worker(folder: Path) -> None:
-    """Run the robot's process; write the shortest way of a wrist speed into a file of the folder."""
+    """Run the robot's process; write the shortest path of a wrist speed into a file of the folder."""
     trace = WorkerTrace(folder / WORKER)
     trace.recording = True
     trace.install()
@@ -276,7 +276,7 @@ class WorkerTrace(WayTrace):
         self._best: Way | None = None
 
     def take(self) -> Way:
-        """Return the way, and write it if it is the shortest one."""
+        """Return the path, and write it if it is the shortest one."""
         way = super().take()
         if self._best is None or len(way) < len(self._best):
             self._best = way
@@ -298,7 +298,7 @@ def trace_calibration(rig: Path, folder: Path) -> Way:
 
 
 def loaded_by_run() -> Loaded:
-    """Return what `shearloop run` loads of the package, in an interpreter of its own."""
+    """Return the package's modules that `shearloop run` loads, in a separate interpreter."""
     listing = (
         "import json, sys, shearloop.cli.run, shearloop.daemon.app; "
         "print(json.dumps({name: module.__file__ for name, module in sys.modules.items() "
@@ -324,7 +324,7 @@ def diagram(way: Way) -> str:
 
 
 def measure(rig: Path) -> dict[str, Any]:
-    """Return the ways and what `shearloop run` loads, after printing each way."""
+    """Return the paths and the modules that `shearloop run` loads, after printing each path."""
     ways: dict[str, Way] = {}
     with tempfile.TemporaryDirectory() as name:
         for kind in ("frame", "command", "calibration"):

@@ -76,7 +76,7 @@ COMMANDS = {name: command for group in GROUPS.values() for name, command in grou
 # Spellings that scripts use, and the words that stand for them.
 OTHER_SPELLINGS = {"replay": ("recording", "replay"), "import": ("recording", "import")}
 
-# What may move the rig: no other word is taken for one of these.
+# Commands that move the rig: no abbreviation or mistyped word selects one.
 MOVING = frozenset({"start", "resume", "unlock", "release", "commission"})
 EXIT_OK, EXIT_USAGE = 0, 2
 # Exit statuses of `run` with `stop_when_done`: a fault, or a person, stopped the experiment.

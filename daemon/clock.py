@@ -26,7 +26,7 @@ class ClockStep:
     def between(cls, before: ClockReading, after: ClockReading) -> Self | None:
         """Return what happened between two readings, or None if it is less than STEP_S."""
         suspended_s = (after.suspended_ns - before.suspended_ns) / 1e9
-        # CLOCK_MONOTONIC stands still while the computer is suspended.
+        # CLOCK_MONOTONIC stops while the computer is suspended.
         set_s = (after.offset_ns - before.offset_ns) / 1e9 - suspended_s
         step = cls(_beyond_step(set_s), _beyond_step(suspended_s))
         return step if step.set_s or step.suspended_s else None

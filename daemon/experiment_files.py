@@ -37,7 +37,7 @@ class InvalidExperimentError(UserError):
 
 
 def read_experiment(path: Path) -> ExperimentFile:
-    """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
+    """Return the experiment of a file; raises UserError for an invalid one, or one beyond its limits."""
     return _checked(read_document(path), None, None)
 
 

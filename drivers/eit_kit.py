@@ -281,7 +281,7 @@ class FrameParser:
 
     @property
     def unfinished(self) -> bytes:
-        """What has come of the next line."""
+        """The received beginning of the next line."""
         return self._lines.partial
 
     def handle(self, event: RawEvent) -> list[Frame]:

@@ -17,7 +17,7 @@ from shearloop.drivers.refused_lines import BoardKind, refusal_sentence, shown
 # Opening the port resets an Uno; its boot loader waits before it starts the sketch.
 BOOT_S = 4.0
 SILENT_PERIODS = 8
-# After a wait in vain, the next wait is twice as long, up to this factor: the board's period can be longer than
+# After a timeout, the next wait is twice as long, up to this factor: the board's period can be longer than
 # configured. This many values in time end that.
 LONGEST_PATIENCE, PROMPT_VALUES = 16, 20
 # Values in a row that agree with each other and become the new level.
@@ -62,7 +62,7 @@ class Parser(Protocol[ValueT_co]):
 
     @property
     def unfinished(self) -> bytes:
-        """What has come of the next line."""
+        """The received beginning of the next line."""
 
     def handle(self, event: RawEvent) -> Sequence[ValueT_co]:
         """Process a live or recorded event; return the values that it completes."""
@@ -172,7 +172,7 @@ class LineParser(ABC, Generic[ValueT]):
 
     @property
     def unfinished(self) -> bytes:
-        """What has come of the next line."""
+        """The received beginning of the next line."""
         return self._lines.partial
 
     @abstractmethod

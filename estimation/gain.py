@@ -28,7 +28,7 @@ _REPEATING_TWISTS, _UNREPEATED_SPREADS = 3, {1: 0.9, 2: 0.24}
 FIRST_SPREAD, _PRIOR_GRIPS = 0.2, 1
 # The same of a tool that was not calibrated, against the law over the diameter: a factor of 4 either way.
 TOOL_SPREAD = 0.7
-# Twists of a recording differ at least by this; a few alike are chance.
+# The minimum spread of a recording's twists: a few equal ones are chance.
 _LEAST_WITHIN = 0.05
 _LEAST_NOISE, _LEAST_ZERO = 1e-3, 1e-6
 # The gain drifts while the gel settles, so successive twists deviate alike from the later ones, by this share of the
@@ -36,11 +36,11 @@ _LEAST_NOISE, _LEAST_ZERO = 1e-3, 1e-6
 _ALIKE = 0.8
 # Furthest diameter beyond the calibrated ones, as a ratio.
 _REACH = 1.5
-# A frame is loaded above this share of the largest torque.
+# A frame is loaded above this fraction of the largest torque.
 LOADED_SHARE = 0.1
-# A correction that leaves more than this share of the spread before it says nothing.
+# A correction that leaves more than this fraction of the spread carries no information.
 _MOST_LEFT = 0.95
-# Damping of the first step, the most steps, and the square of a step, in standard errors, that changes nothing.
+# Damping of the first step, the maximum of steps, and the square of a step, in standard errors, that changes nothing.
 _FIRST_DAMPING, _MOST_STEPS, _SETTLED = 1e-3, 200, 1e-12
 
 
@@ -140,7 +140,7 @@ class GainSpread:
         """
         m, loaded, total = parts.shape[1], np.concatenate(twists), parts.sum(axis=1)
         is_first = np.array([first is not None and bool(first[rows].any()) for rows in twists])
-        # Variances of the logarithm: what successive twists have in common, and each one's own.
+        # Variances of the logarithm: the part common to successive twists, and each twist's part.
         alike = _ALIKE * self.within**2
         own = self.within**2 - alike + np.where(is_first, self.first_spread**2, 0.0)
         spread = self._with_this(total[loaded], truth[loaded], alike + float(own.mean()) / len(twists))
@@ -320,7 +320,7 @@ def log_gain(predicted: FloatArray, truth: FloatArray) -> float | None:
 def _least_squares(
     residuals: Callable[[FloatArray], FloatArray], slopes: Callable[[FloatArray], FloatArray], start: FloatArray
 ) -> FloatArray | None:
-    """Return the (d,) unknowns with the least squares of residuals, by Levenberg's and Marquardt's steps.
+    """Return the (d,) unknowns that minimize the squared residuals, by Levenberg's and Marquardt's steps.
 
     None where they do not settle. SciPy's would take the daemon a tenth of a second to import.
     """

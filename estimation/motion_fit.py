@@ -29,11 +29,11 @@ _DIRECTIONS, _STEPS, _PENALTIES = (1, 2, 3), (10, 12), (1e-5, 1e-4)
 _STEPS_WITH_POSITION = (8,)
 # Fits with a left-out error within this factor of the minimum are averaged.
 _NEARLY_AS_GOOD = 1.25
-# Fewest twists that are left out one by one, and most parts; with more twists, neighbours are left out together.
+# Minimum number of twists that are left out one by one, and maximum number of parts; more twists are grouped.
 _LEAST_TWISTS, _MOST_PARTS = 3, 10
 # Below this fraction of loaded frames, the frames left out hold few twists.
 _RARE_LOAD, _FRAMES_OF_FEW_TWISTS = 0.5, 2
-# The slope is divided out where left-out loads err by less than this share: a poor estimate has no sure slope. On the
+# The slope is divided out if left-out loads err by less than this fraction: a poor estimate has no sure slope. On the
 # recorded stream both fingertips have 0.08, right 0.11, left 0.25.
 _SURE_SLOPE = 0.15
 
@@ -80,12 +80,12 @@ class MotionFit:
 
     @property
     def n_directions(self) -> int:
-        """The most directions of a candidate."""
+        """The maximum number of directions of a candidate."""
         return max(one.n_directions for one in self.candidates)
 
     @property
     def n_steps(self) -> int:
-        """The most steps of a candidate."""
+        """The maximum number of steps of a candidate."""
         return max(one.n_steps for one in self.candidates)
 
     @property

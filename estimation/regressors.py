@@ -18,7 +18,7 @@ from shearloop.words import counted
 
 N_BLOCKS = 5
 FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
-# Values within this share of their range are of one level: half of the way to the next of ten, and a little more.
+# Values within this fraction of their range have one level: a little more than half the distance between ten levels.
 NEAR_LEVEL = 0.06
 # Penalties of the curve's higher terms and of the trend, as this many frames without them. From 10 to 100 for the trend
 # the error on later slices is nearly the same; without a trend it is a sixth larger (docs/decisions/0042).

@@ -16,7 +16,7 @@ from shearloop.estimation.values import FrameSeries
 
 # Step of a twist's profile, and how far it reaches either way from the twist's middle: a twist of the paper takes 5 s.
 _STEP_S, _REACH_S = 0.25, 15.0
-# A fall by more than this share of the range begins another repeat of a series of slices.
+# A fall by more than this fraction of the range begins another repeat of a series of slices.
 _RESTART = 0.5
 
 

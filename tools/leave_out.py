@@ -35,7 +35,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 _ENOUGH_GRIPS = 3
 # A tool that is left out needs three others, which determine the gain over the diameter.
 _ENOUGH_TOOLS = 4
-# Least share of truths within 95 % intervals that does not call for more data.
+# Below this coverage of the 95 % intervals, the advice is more data.
 _LEAST_COVERAGE = 0.9
 
 

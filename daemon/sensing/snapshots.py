@@ -35,7 +35,7 @@ def record_state(inputs: InputRecorder, state: Mapping[str, object], fixed: Mapp
     try:
         text = snapshot(state, fixed)
     except SnapshotError as error:
-        # A measurement goes on without its recording.
+        # A measurement continues without its recording.
         structlog.get_logger().error("the recording cannot be replayed from its beginning", reason=str(error))
         text = b""
     inputs.record(RawEvent(InputKind.STATE, now_ns, text))

@@ -40,7 +40,7 @@ ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
 ACCELERATION_S = 0.04
 # The pendant shows grams, tenths of a millimetre and thousandths of a radian.
 PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
-# A straight move goes on for this fraction of `silence_timeout_s` after a cycle of the worker.
+# A straight move continues for this fraction of `silence_timeout_s` after a cycle of the worker.
 LEASE_SHARE = 0.3
 # A motion has ended after this number of successive samples at rest.
 REST_SAMPLES = 3

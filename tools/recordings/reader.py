@@ -524,7 +524,7 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
                         writer.add_attachment(
                             record.create_time, record.log_time, record.name, record.media_type, record.data
                         )
-            # The record has no checksum of its own, and the chunks have.
+            # The record has no checksum; the chunks have one.
             identity = records.identity or identity
             if identity:
                 writer.add_metadata(schema.METADATA, identity)

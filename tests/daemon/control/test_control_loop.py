@@ -175,7 +175,7 @@ def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_w
     rig.run(1)
     assert not rig.control_loop.experiment.running
     assert (
-        f"step 2 ({turning['do']}) cannot be done: the gripper does not say" in rig.control_loop.experiment.stop_reason
+        f"step 2 ({turning['do']}) cannot be done: the gripper does not know" in rig.control_loop.experiment.stop_reason
     )
     assert rig.control_loop.experiment.stop_reason.endswith("; put a `grip` or a `release` before it")
     assert rig.speed == 0.0

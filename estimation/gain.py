@@ -76,37 +76,40 @@ class GainSpread:
         `grips` are the number of each one's grip, `is_first` whether it belongs to the grip's first twist, `left_out`
         logarithms of the gains of grips that were left out of the fit. The fingertips share the prior.
         """
-        root = math.sqrt(fingertips)
         noise: list[FloatArray] = []
         firsts: list[float] = []
-        squares, freedom = 0.0, 0
-        for own in (np.flatnonzero(grips == one) for one in np.unique(grips)):
+        squares, freedom, n_twists = 0.0, 0, 0
+        for grip in np.unique(grips):
+            own = np.flatnonzero(grips == grip)
             twists = [own[rows] for rows in find_twists(truth[own])]
-            gains = [log_gain(predicted[rows], truth[rows]) for rows in twists]
-            noise += [
-                truth[rows] - (0.0 if gain is None else math.exp(gain)) * predicted[rows]
-                for rows, gain in zip(twists, gains, strict=True)
-            ]
+            n_twists += len(twists)
+            gains_of_first: list[float] = []
+            gains_of_later: list[float] = []
+            for rows in twists:
+                gain = log_gain(predicted[rows], truth[rows])
+                if gain is None:
+                    noise.append(truth[rows])
+                    continue
+                noise.append(truth[rows] - math.exp(gain) * predicted[rows])
+                (gains_of_first if is_first[rows[0]] else gains_of_later).append(gain)
             # A tool's own gain is not a difference between twists, so each grip counts from its own mean.
-            known = [
-                (gain, bool(is_first[rows[0]])) for gain, rows in zip(gains, twists, strict=True) if gain is not None
-            ]
-            if later := [gain for gain, first in known if not first]:
-                mean = float(np.mean(later))
-                squares, freedom = squares + sum((gain - mean) ** 2 for gain in later), freedom + len(later) - 1
-                firsts += [gain - mean for gain, first in known if first]
+            if gains_of_later:
+                mean = float(np.mean(gains_of_later))
+                squares += sum((gain - mean) ** 2 for gain in gains_of_later)
+                freedom += len(gains_of_later) - 1
+                firsts += [gain - mean for gain in gains_of_first]
         noise_nm = float(np.sqrt(np.mean(np.concatenate(noise) ** 2))) if noise else 0.0
-        noise_nm = max(noise_nm, _LEAST_NOISE * float(np.abs(truth).max(initial=0.0)))
-        n_twists = sum(len(find_twists(truth[grips == one])) for one in np.unique(grips))
+        least_noise_nm = _LEAST_NOISE * float(np.abs(truth).max(initial=0.0))
         spreads = _UNREPEATED_SPREADS if 0 < n_twists < _REPEATING_TWISTS else PRIOR_SPREADS
         within = math.sqrt(squares / freedom) if freedom else 0.0
         first = sum(firsts) / (_PRIOR_GRIPS + len(firsts))
+        first_prior = FIRST_SPREAD / math.sqrt(fingertips)
         prior = cls(
             spreads[fingertips],
             max(within, _LEAST_WITHIN),
-            noise_nm,
+            max(noise_nm, least_noise_nm),
             first=first,
-            first_spread=_pooled(FIRST_SPREAD / root, _PRIOR_RECORDINGS, [(one - first) ** 2 for one in firsts]),
+            first_spread=_pooled(first_prior, _PRIOR_RECORDINGS, [(one - first) ** 2 for one in firsts]),
         )
         return prior._with_recordings([one**2 for one in left_out])
 
@@ -138,50 +141,77 @@ class GainSpread:
         grip. With `bounded` a frame without load counts only while it is predicted above zero. Raises CalibrationError
         where the twists do not follow the torque, or leave the gain as uncertain as before.
         """
-        m, loaded, total = parts.shape[1], np.concatenate(twists), parts.sum(axis=1)
+        loaded = np.concatenate(twists)
         is_first = np.array([first is not None and bool(first[rows].any()) for rows in twists])
         # Variances of the logarithm: the part common to successive twists, and each twist's part.
-        alike = _ALIKE * self.within**2
-        own = self.within**2 - alike + np.where(is_first, self.first_spread**2, 0.0)
-        spread = self._with_this(total[loaded], truth[loaded], alike + float(own.mean()) / len(twists))
-        load_nm = float(np.sqrt((truth[loaded] ** 2).mean()))
-        along = [truth[rows] for rows in twists]
-        power = np.array([float(one @ one) for one in along])
-        errors = np.diag(power * (self.noise_nm**2 + own * power)) + alike * np.outer(power, power)
-        whiten = np.linalg.inv(np.linalg.cholesky(errors))
-        # The first twist reads the gain times its own deviation from the later ones.
-        deviation = np.exp(np.where(is_first, self.first, 0.0))[:, None]
-        of_parts = np.array([one @ parts[rows] for one, rows in zip(along, twists, strict=True)])
-        unloaded = np.setdiff1d(np.arange(len(truth)), loaded)
-        equations = _Equations(
-            whiten @ (deviation * of_parts),
-            whiten @ np.array([one.sum() for one in along]),
-            whiten @ power,
-            parts[unloaded],
-            # The unloaded frames before a twist have one error in common.
-            math.sqrt(len(twists) / max(len(unloaded), 1)) / self.noise_nm,
-            np.append(np.full(m, math.sqrt(m) * spread.between), max(self.zero, _LEAST_ZERO) * load_nm),
-            bounded,
-        )
+        common = _ALIKE * self.within**2
+        own = self.within**2 - common + np.where(is_first, self.first_spread**2, 0.0)
+        explained = common + float(own.mean()) / len(twists)
+        spread = self._with_this(parts.sum(axis=1)[loaded], truth[loaded], explained)
+        equations = self._equations(parts, truth, twists, is_first, common, own, spread.between, bounded=bounded)
+        m = parts.shape[1]
         x = _least_squares(equations.residuals, equations.slopes, np.zeros(m + 1))
         if x is None:
             raise CalibrationError("the gain of these twists does not settle; twist further, and several times")
         factors, offset_nm = np.exp(x[:m]), float(x[m])
         slope = equations.slopes(x)
-        covariance = np.linalg.inv(slope.T @ slope)
-        columns = np.column_stack([parts[loaded] * factors, np.ones(len(loaded))])
-        corrected = parts[loaded] @ factors + offset_nm
-        before, left = (
-            float(np.sqrt(np.einsum("ni,ij,nj->n", columns, one, columns).mean() / (corrected**2).mean()))
-            for one in (np.diag(equations.prior**2), covariance)
-        )
+        covariance: FloatArray = np.asarray(np.linalg.inv(slope.T @ slope))
+        before = _relative_error(np.diag(equations.prior**2), parts[loaded], factors, offset_nm)
+        left = _relative_error(covariance, parts[loaded], factors, offset_nm)
         if left > _MOST_LEFT * before:
             raise CalibrationError(
                 "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
                 "these are too small; twist further, and several times"
             )
-        spread = replace(spread, between=min(left, spread.between))
-        return GainCorrection(factors, factors * np.sqrt(np.diag(covariance))[:m], offset_nm, spread, len(twists))
+        return GainCorrection(
+            factors,
+            factors * np.sqrt(np.diag(covariance))[:m],
+            offset_nm,
+            replace(spread, between=min(left, spread.between)),
+            len(twists),
+        )
+
+    def _equations(
+        self,
+        parts: FloatArray,
+        truth: FloatArray,
+        twists: Sequence[IntArray],
+        is_first: BoolArray,
+        common: float,
+        own: FloatArray,
+        between: float,
+        *,
+        bounded: bool,
+    ) -> "_Equations":
+        """Return what twists (k) say of the factors on parts (n, m), in standard errors.
+
+        `is_first` (k,) marks the first twists after a grip. The logarithm's variances are `common` to the twists, and
+        each one's `own` (k,); `between` is its standard deviation from grip to grip.
+        """
+        # Along its torque, a twist's noise grows with the power of the torque, an error of the gain with its square.
+        along = [truth[rows] for rows in twists]
+        power = np.array([float(one @ one) for one in along])
+        errors = np.diag(power * (self.noise_nm**2 + own * power)) + common * np.outer(power, power)
+        whiten = np.linalg.inv(np.linalg.cholesky(errors))
+        of_parts = np.array([one @ parts[rows] for one, rows in zip(along, twists, strict=True)])
+        # The first twist reads the gain times its own deviation from the later ones.
+        deviation = np.exp(np.where(is_first, self.first, 0.0))[:, None]
+        loaded = np.concatenate(twists)
+        unloaded = np.setdiff1d(np.arange(len(truth)), loaded)
+        # The unloaded frames before a twist have one error in common.
+        weight = math.sqrt(len(twists) / max(len(unloaded), 1)) / self.noise_nm
+        m = parts.shape[1]
+        load_nm = float(np.sqrt((truth[loaded] ** 2).mean()))
+        of_offset_nm = max(self.zero, _LEAST_ZERO) * load_nm
+        return _Equations(
+            of_parts=whiten @ (deviation * of_parts),
+            of_offset=whiten @ np.array([one.sum() for one in along]),
+            known=whiten @ power,
+            parts=parts[unloaded],
+            weight=weight,
+            prior=np.append(np.full(m, math.sqrt(m) * between), of_offset_nm),
+            bounded=bounded,
+        )
 
     def _with_this(self, predicted: FloatArray, truth: FloatArray, explained: float) -> Self:
         """Return the spread with the gain of loaded frames (n,), less the variance that twists and noise explain.
@@ -338,6 +368,17 @@ def _least_squares(
         else:
             damping *= 10.0
     return None
+
+
+def _relative_error(covariance: FloatArray, parts: FloatArray, factors: FloatArray, offset_nm: float) -> float:
+    """Return the standard error of (n, m) corrected parts as a ratio of their sum, both as root mean squares.
+
+    `covariance` (m + 1, m + 1) is that of the factors' logarithms and of the offset.
+    """
+    slopes = np.column_stack([parts * factors, np.ones(len(parts))])
+    corrected = parts @ factors + offset_nm
+    variances = np.einsum("ni,ij,nj->n", slopes, covariance, slopes)
+    return float(np.sqrt(variances.mean() / (corrected**2).mean()))
 
 
 def _pooled(prior: float, counts_as: int, squares: Sequence[float]) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from shearloop.daemon.control import experiment_schema as steps
@@ -14,7 +14,10 @@ from shearloop.drivers.ur.settings import UrLimits
 
 @dataclass(frozen=True, slots=True)
 class StepPlan:
-    """One step: its action in words, its largest values, and its limits, reversals and refusals."""
+    """One step: its action in words, its largest values, and its limits, reversals and refusals.
+
+    `reverses` says whether it turns a held tool against the turn before.
+    """
 
     number: int
     do: str
@@ -25,6 +28,7 @@ class StepPlan:
     angle_rad: float = 0.0
     force_n: float = 0.0
     timeout_s: float | None = None
+    reverses: bool = False
     notes: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
 
@@ -46,25 +50,43 @@ class Plan:
     limit_rad: float
     steps: tuple[StepPlan, ...]
     unknown: str = ""
-    _totals: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def duration_s(self) -> float:
+        """How long all steps take, about."""
+        return sum(step.duration_s for step in self.steps)
+
+    @property
+    def angle_rad(self) -> float:
+        """The largest angle of a step."""
+        return max(step.angle_rad for step in self.steps)
+
+    @property
+    def torque_nm(self) -> float:
+        """The largest torque of a step."""
+        return max(step.torque_nm for step in self.steps)
+
+    @property
+    def force_n(self) -> float:
+        """The largest force of the fingers."""
+        return max(step.force_n for step in self.steps)
 
     def as_json(self) -> dict[str, Any]:
         """Return the plan for a script."""
-        content = {key: value for key, value in asdict(self).items() if not key.startswith("_")}
-        return content | dict(self._totals)
+        totals = {name: getattr(self, name) for name in ("duration_s", "angle_rad", "torque_nm", "force_n")}
+        return asdict(self) | totals
 
     def sentences(self) -> Iterator[str]:
         """Yield the plan's lines."""
-        totals = self._totals
-        yield f"plan of {self.name!r}, driven by {self.torque_source}, about {_duration(totals['duration_s'])}:"
+        yield f"plan of {self.name!r}, driven by {self.torque_source}, about {_duration(self.duration_s)}:"
         for step in self.steps:
             yield from step.sentences()
         yield (
-            f"  at most {_angle(totals['angle_rad'])} in a step, {totals['torque_nm']:g} N·m, fingers "
-            f"{totals['force_n']:g} N; its limits stop it at {self.limit_nm:g} N·m and {_angle(self.limit_rad)} from "
+            f"  at most {_angle(self.angle_rad)} in a step, {self.torque_nm:g} N·m, fingers "
+            f"{self.force_n:g} N; its limits stop it at {self.limit_nm:g} N·m and {_angle(self.limit_rad)} from "
             "the grip"
         )
-        turned_back = sum(any(note.startswith("reversal") for note in step.notes) for step in self.steps)
+        turned_back = sum(step.reverses for step in self.steps)
         yield f"  {turned_back or 'no'} reversal{'s' if turned_back != 1 else ''} of a held tool"
         yield "  clockwise and counterclockwise are for an eye that faces the gripper"
         if self.unknown:
@@ -83,14 +105,19 @@ def plan_of(
     `refused` has the reasons against each step by its index; `warm_up_s` passes after a grip until the first torque.
     """
     back = {one.number: one.sentence(file) for one in reversals(file)}
-    planned, waits = [], False
+    planned: list[StepPlan] = []
+    # Whether the next step that twists waits for the first torques of a grip or a tare.
+    waits = False
     for number, (step, turn) in enumerate(zip(file.steps, turns(file), strict=True), 1):
         needs = demand(step)
-        duration_s, notes = needs.stands_s + needs.moves_s, list(_notes(file, step, turn, robot))
-        if waits and isinstance(step, steps.TwistingStep):
+        duration_s = needs.stands_s + needs.moves_s
+        notes = list(_notes(file, step, turn, robot))
+        if isinstance(step, steps.GripStep | steps.TareStep):
+            waits = warm_up_s > 0
+        elif waits and isinstance(step, steps.TwistingStep):
             notes.append(f"before it, up to {warm_up_s:g} s for the first torques of the grip")
-            duration_s, waits = duration_s + warm_up_s, False
-        waits = warm_up_s > 0 if isinstance(step, steps.GripStep | steps.TareStep) else waits
+            duration_s += warm_up_s
+            waits = False
         if number in back:
             notes.insert(0, back[number])
         planned.append(
@@ -104,19 +131,14 @@ def plan_of(
                 _largest_angle(step, needs),
                 step.force_n if isinstance(step, steps.GripStep) else 0.0,
                 step.timeout_s,
+                number in back,
                 tuple(notes),
                 (refused or {}).get(number - 1, ()),
             )
         )
-    totals = {
-        "duration_s": sum(one.duration_s for one in planned),
-        "angle_rad": max(one.angle_rad for one in planned),
-        "torque_nm": max(one.torque_nm for one in planned),
-        "force_n": max(one.force_n for one in planned),
-    }
     unknown = "" if robot is not None else "the robot's limits are not known: give `--config RIG` to check against them"
     limits = file.limits
-    return Plan(file.name, file.torque_source, limits.torque_nm, limits.angle_rad, tuple(planned), unknown, totals)
+    return Plan(file.name, file.torque_source, limits.torque_nm, limits.angle_rad, tuple(planned), unknown)
 
 
 def _words(step: Step, gripper: GripperModel | None) -> str:
@@ -183,13 +205,16 @@ def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None)
     if robot is None:
         return
     match step:
-        case steps.ApproachStep(speed_m_per_s=speed) if speed > (top := robot.linear_speed_m_per_s.inner):
-            yield f"the robot's limit allows {top:g} m/s"
+        case steps.ApproachStep():
+            largest_m_per_s = robot.linear_speed_m_per_s.inner
+            if step.speed_m_per_s > largest_m_per_s:
+                yield f"the robot's limit allows {largest_m_per_s:g} m/s"
+            if step.pose_m_rad is None:
+                yield "its end is checked against the workspace as it begins: it depends on where the tool is"
         case steps.TwistStep() | steps.TurnToStep() | steps.TightenStep():
-            if step.speed_rad_per_s > (top := robot.wrist_speed_rad_per_s.inner):
-                yield f"the robot's limit allows {top:g} rad/s"
-        case steps.ApproachStep(pose_m_rad=None):
-            yield "its end is checked against the workspace as it begins: it depends on where the tool is"
+            largest_rad_per_s = robot.wrist_speed_rad_per_s.inner
+            if step.speed_rad_per_s > largest_rad_per_s:
+                yield f"the robot's limit allows {largest_rad_per_s:g} rad/s"
 
 
 def _largest_angle(step: Step, needs: Demand) -> float:

@@ -50,8 +50,11 @@ def test_the_plan_of_every_delivered_experiment_is_in_words_and_in_numbers(path,
 def test_a_reversal_is_pointed_out_at_its_step(tmp_path, result_of, ran):
     back = {"do": "hold_torque", "torque_nm": 0.05, "direction": "counterclockwise"}
     path = written(tmp_path, GRIP, {"do": "identify"}, TIGHTEN, back)
-    notes = result_of("check", path)["plan"]["steps"][3]["notes"]
-    assert notes == ["reversal: hold_torque turns counterclockwise, against step 3 (tighten), which turned clockwise"]
+    planned = result_of("check", path)["plan"]["steps"]
+    assert [step["reverses"] for step in planned] == [False, False, False, True]
+    assert planned[3]["notes"] == [
+        "reversal: hold_torque turns counterclockwise, against step 3 (tighten), which turned clockwise"
+    ]
     assert "1 reversal of a held tool" in ran("check", path).out
 
 

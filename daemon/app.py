@@ -25,7 +25,7 @@ from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, build_rig, open_settings
-from shearloop.daemon.rig_memory import Remembered, sole_driver
+from shearloop.daemon.rig_memory import Remembered, lock_robot
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.daemon.service import notify
@@ -71,7 +71,7 @@ class Daemon:
             authenticator = ClientAuthenticator(context, clients, refusals)
             opened.callback(authenticator.close)
             if (settings := open_settings(config)) is not None:
-                opened.enter_context(sole_driver(settings.host))
+                opened.enter_context(lock_robot(settings.host))
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
             self.publisher.add_listener(self._summary)
             self.recorder: Recorder | None = None

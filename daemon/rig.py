@@ -110,10 +110,10 @@ def open_settings(config: DaemonConfig) -> UrSettings | None:
             f"{config.robot}: `host: {settings.host}` is not this computer, and the configuration says "
             "`emulated: true`: take that out for a real robot, or give 127.0.0.1 for an emulated one"
         )
-    return patient(settings) if config.emulated else settings
+    return with_emulated_deadlines(settings) if config.emulated else settings
 
 
-def patient(settings: UrSettings) -> UrSettings:
+def with_emulated_deadlines(settings: UrSettings) -> UrSettings:
     """Return the settings of an emulated robot, with deadlines that fit a busy computer."""
     return replace(
         settings,

@@ -16,6 +16,7 @@ import structlog
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.errors import UserError
+from shearloop.files import replace_file
 
 VERSION = 1
 # The file is written at this interval, and at the start of each experiment.
@@ -119,7 +120,7 @@ def memory_path(host: str) -> Path:
 
 
 @contextlib.contextmanager
-def sole_driver(host: str) -> Iterator[None]:
+def lock_robot(host: str) -> Iterator[None]:
     """Keep other daemons of this user away from a robot; raises UserError if one of them has it.
 
     Two daemons would share the robot's memory, and neither would know of the other's stops and grips. The lock ends
@@ -162,9 +163,5 @@ def read_memory(path: Path) -> Remembered:
 def write_memory(path: Path, state: Remembered) -> None:
     """Replace the file as a whole, on the disk when this returns; raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_suffix(".new")
-    with new.open("w", encoding="utf-8") as file:
-        json.dump({"version": VERSION, **asdict(state)}, file)
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)
+    with replace_file(path) as file:
+        file.write(json.dumps({"version": VERSION, **asdict(state)}).encode())

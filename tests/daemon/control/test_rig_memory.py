@@ -9,7 +9,7 @@ import pytest
 
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
-from shearloop.daemon.rig_memory import Remembered, RigMemory, memory_path, read_memory, sole_driver, write_memory
+from shearloop.daemon.rig_memory import Remembered, RigMemory, lock_robot, memory_path, read_memory, write_memory
 from shearloop.errors import UserError
 from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, started, stop
 
@@ -127,18 +127,18 @@ def test_the_file_is_in_systemds_state_folder_or_the_users(tmp_path, monkeypatch
 
 
 def test_one_daemon_at_a_time_drives_a_robot():
-    with sole_driver("192.168.1.10"):
+    with lock_robot("192.168.1.10"):
         taken = rf"driven by another daemon of this computer \(process {os.getpid()}\)"
-        with pytest.raises(UserError, match=taken), sole_driver("192.168.1.10"):
+        with pytest.raises(UserError, match=taken), lock_robot("192.168.1.10"):
             pytest.fail("it has the robot as well")
-        with sole_driver("192.168.1.11"):
+        with lock_robot("192.168.1.11"):
             pass
-    with sole_driver("192.168.1.10"):
+    with lock_robot("192.168.1.10"):
         pass
 
 
 def test_a_robot_whose_lock_cannot_be_written_can_be_watched(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    with sole_driver("192.168.1.10"):
+    with lock_robot("192.168.1.10"):
         assert read_memory(memory_path("192.168.1.10")).stop

@@ -30,6 +30,8 @@ class _Sender:
     who: str
     board: BoardKind | None = None
     cure: str = ""
+    # An EIT-kit sends such lines too, with its stock library.
+    stock_library: bool = False
 
 
 # The first that matches the whole line counts.
@@ -40,7 +42,10 @@ _SENDERS: Final = (
     _Sender(re.compile(rb"[+-]?\d+\.\d+, ?[+-]?\d+\.\d+\s*"), "a converter board", "skin's converter board"),
     _Sender(re.compile(rb"[+-]?\d+\s*"), "a load cell's board", "load cell"),
     _Sender(
-        re.compile(rb"[+-]?\d\.\d{4}\s*"), "a load cell's board, or an EIT-kit with its stock library,", "load cell"
+        re.compile(rb"[+-]?\d\.\d{4}\s*"),
+        "a load cell's board, or an EIT-kit with its stock library,",
+        "load cell",
+        stock_library=True,
     ),
     _Sender(re.compile(rb"[+-]?\d*\.\d+\s*|[+-]?\d+\.\s*"), "a load cell's board", "load cell"),
     _Sender(re.compile(rb"([+-]?\d+,\d+[;, \t]*)+\s*"), "a program with a decimal comma"),
@@ -70,7 +75,7 @@ def sender_of(line: bytes, expected: BoardKind) -> tuple[str, str]:
         return sender.who, sender.cure or _SKETCH[expected]
     if sender.board == expected:
         return sender.who, _OWN
-    if expected == "EIT-kit" and "stock library" in sender.who:
+    if expected == "EIT-kit" and sender.stock_library:
         return sender.who, f"{_EXCHANGE}, or {_SKETCH[expected]}"
     return sender.who, _EXCHANGE
 

@@ -22,14 +22,13 @@ class EventLog:
 
     def add(self, topic: str, content: Mapping[str, Any], number: int) -> None:
         """Add the events between the previous message of `topic` and this one; `number` is the message's."""
-        events_of = _EVENTS_OF.get(topic)
-        if events_of is None:
+        if topic not in _EVENTS_OF:
             return
         before = self._before.get(topic, {})
         if topic != DaemonEnd.topic:
             self._before.pop(DaemonEnd.topic, None)
         self._before[topic] = content
-        for kind, text in events_of(before, content):
+        for kind, text in _EVENTS_OF[topic](before, content):
             self.events.append({"number": number, "timestamp": content["timestamp"], "kind": kind, "text": text})
 
     def after(self, number: int) -> list[dict[str, Any]]:
@@ -37,6 +36,7 @@ class EventLog:
         return [event for event in self.events if event["number"] > number]
 
 
+# Kind and text of each event.
 Events = Iterator[tuple[str, str]]
 
 
@@ -65,7 +65,7 @@ def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
 
 
 def _stop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
-    if all(before.get(key, ...) == now.get(key) for key in ("experiment", "decided_after_s", "stands_after_s")):
+    if before and all(before.get(key) == now.get(key) for key in ("experiment", "decided_after_s", "stands_after_s")):
         return
 
     def after(key: str) -> str:
@@ -102,14 +102,14 @@ def _dead(facts: Mapping[str, Any]) -> bool:
     return facts.get("alive") is False and not facts.get("done")
 
 
-def _text_of(key: str) -> Callable[[Mapping[str, Any], Mapping[str, Any]], Events]:
-    """Return a function that yields the sentence of `key` when it appears."""
+def _robot(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
+    if now.get("blocked") and not before.get("blocked"):
+        yield "fault", str(now["blocked"])
 
-    def appears(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
-        if now.get(key) and not before.get(key):
-            yield "fault", str(now[key])
 
-    return appears
+def _gripper(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
+    if now.get("fault_text") and not before.get("fault_text"):
+        yield "fault", str(now["fault_text"])
 
 
 def _end(before: Mapping[str, Any], _now: Mapping[str, Any]) -> Events:
@@ -117,12 +117,13 @@ def _end(before: Mapping[str, Any], _now: Mapping[str, Any]) -> Events:
         yield "stop", "the daemon has ended"
 
 
+# By topic, what happened between a message and the one before it, which is empty for the first.
 _EVENTS_OF: Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], Events]] = {
     "loop.state": _loop,
     "loop.stop": _stop,
     "daemon.command": _command,
     "health": _health,
-    "robot.state": _text_of("blocked"),
-    "gripper.state": _text_of("fault_text"),
+    "robot.state": _robot,
+    "gripper.state": _gripper,
     "daemon.end": _end,
 }

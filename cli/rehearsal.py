@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:
-    from shearloop.daemon.config import DaemonConfig, FingertipConfig
+    from shearloop.daemon.config import DaemonConfig, FingertipConfig, LoadCellConfig, SkinConfig
     from shearloop.drivers.ur.settings import UrSettings
 
 # Robot and gripper are emulated on the first of these local addresses with free ports.
@@ -62,11 +62,11 @@ class _Stage:
         from shearloop.daemon.config import DaemonConfig
 
         config = self._config
-        robot = self._robot() if config.robot is not None else None
+        robot = self._robot(config.robot) if config.robot is not None else None
         # Without another sensor on the tool, the robot turns it on the skin.
         on_skin = config.skin is not None and config.gripper is None and not config.fingertips
         if config.skin is not None:
-            self._skin(robot if on_skin and config.load_cell is None else None)
+            self._skin(config.skin, robot if on_skin and config.load_cell is None else None)
         if robot is not None and not (on_skin and config.load_cell is None):
             self._rig(robot)
         elif robot is None:
@@ -83,15 +83,13 @@ class _Stage:
         self._content |= {"emulated": True, "emulators": self._emulators}
         return Rehearsal(DaemonConfig.model_validate(self._content), tuple(self._sentences))
 
-    def _robot(self) -> "UrSettings":
-        """Write the robot's settings with a loopback address, and return them."""
+    def _robot(self, source: Path) -> "UrSettings":
+        """Write the robot's settings of a file with a loopback address, and return them."""
         import yaml
 
         from shearloop.daemon.rig import robot_settings
         from shearloop.yaml_files import read_yaml
 
-        source = self._config.robot
-        assert source is not None  # noqa: S101 - for the type checker; the caller has checked it
         settings = robot_settings(source)
         copy = self._folder / "ur.yaml"
         copy.write_text(yaml.safe_dump({**read_yaml(source, UserError), "host": self._host}), encoding="utf-8")
@@ -111,7 +109,7 @@ class _Stage:
             arguments += ["--fingertip", name, _bank(name, fingertip, self._path)]
             self._replace_port("fingertips", name, link=self._folder / f"eit-{name}")
         if config.load_cell is not None:
-            arguments += self._load_cell()
+            arguments += self._load_cell(config.load_cell)
         else:
             arguments.append("--no-load-cell")
         arguments += self._gripper()
@@ -127,13 +125,11 @@ class _Stage:
             self._replace_port("fingertips", name, link=link)
             source = ["--bank", _bank(name, fingertip, self._path)]
             self._emulators.append({"device": "eit-kit", "arguments": ["--link", str(link)], "synthetic": source})
-        if self._config.load_cell is not None:
-            arguments = ["--link", str(self._folder / "load-cell"), *self._load_cell()]
+        if (cell := self._config.load_cell) is not None:
+            arguments = ["--link", str(self._folder / "load-cell"), *self._load_cell(cell)]
             self._emulators.append({"device": "hx711", "arguments": arguments})
 
-    def _load_cell(self) -> list[str]:
-        cell = self._config.load_cell
-        assert cell is not None  # noqa: S101 - for the type checker; the callers have checked it
+    def _load_cell(self, cell: "LoadCellConfig") -> list[str]:
         self._replace_port("load_cell", link=self._folder / "load-cell")
         calibration = ["--paper-sketch"] if cell.calibration is None else ["--load-calibration", str(cell.calibration)]
         return [*calibration, "--load-rate-hz", str(cell.rate_hz)]
@@ -155,10 +151,8 @@ class _Stage:
         self._sentences.append(f"the gripper, a {gripper.model}, is played at {where}")
         return ["--gripper", interface, "--model", gripper.model]
 
-    def _skin(self, robot: "UrSettings | None") -> None:
+    def _skin(self, skin: "SkinConfig", robot: "UrSettings | None") -> None:
         """Play the skin's instruments, and the robot that turns a tool on it, if one is given."""
-        skin = self._config.skin
-        assert skin is not None  # noqa: S101 - for the type checker; the caller has checked it
         arguments = ["--bind", LOOPBACKS[0], "--normal-n", str(skin.normal_n)]
         if skin.tool_radius_mm is not None:
             arguments += ["--radius-mm", str(skin.tool_radius_mm)]

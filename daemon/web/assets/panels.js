@@ -302,13 +302,12 @@ export function loopPanel(link) {
   const stop = current.response.startsWith("stop");
   byId("holding").dataset.kind = stop ? "stop" : "hold";
   put(byId("holding-title"), { note: "Note", "refuse start": "No start" }[current.response] ?? (stop ? `Stopped: ${current.response}` : "Holding, because"));
-  const items = sentences(reasons);
   const list = byId("reasons");
   if (list.dataset.shown === reasons) return;
   list.dataset.shown = reasons;
-  list.replaceChildren(...items.map((sentence) => {
+  list.replaceChildren(...causeFirst(current).map((sentences) => {
     const item = document.createElement("li");
-    put(item, sentence);
+    put(item, sentences);
     return item;
   }));
 }
@@ -320,5 +319,5 @@ function stopTimes(stop, current) {
   return `After its cause: decided ${seconds(stop.decided_after_s)}, confirmed by the robot's process ${seconds(stop.sent_after_s)}, arm at rest ${seconds(stop.stands_after_s)}.`;
 }
 
-// A reason begins with a small letter and its cure with a capital; split after each full stop before a small letter.
-const sentences = (reasons) => reasons.split(/(?<=\.) (?=[a-z])/);
+// The cause with its cure, then all other reasons: `reasons` begins with the cause.
+const causeFirst = ({ cause, reasons }) => [cause, reasons.slice(cause.length).trim()].filter(Boolean);

@@ -28,9 +28,10 @@ from shearloop.daemon.messaging.refusals import Refusals
 # Estimates and heatmaps come twice a second, all else ten times.
 PUMP_S, SLOW_TURNS = 0.1, 5
 SLOW = ("eit.estimate", "eit.heatmap")
+CAUSE = "the torque estimate is not valid: right says nothing. Wait for the next valid estimate."
 REASONS = (
-    "the torque estimate is not valid: right says nothing. Wait for the next valid estimate. "
-    "a device's state is out of date: the gripper last reported its state 0.6 s ago. It goes on by itself."
+    f"{CAUSE} a device's state is out of date: the gripper last reported its state 0.6 s ago. It goes on by itself. "
+    "A third reason can begin with a capital."
 )
 
 

@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from shearloop.daemon.web.message_store import conductivity_profile
-from tests.daemon.web.fake_daemon import MESSAGES, REASONS
+from tests.daemon.web.fake_daemon import CAUSE, MESSAGES, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
 
@@ -158,13 +158,13 @@ def test_a_replay_is_drawn_at_its_own_times(browsed):
         browsed.page.wait_for_function(COLOURED, arg=chart)
 
 
-def test_every_reason_for_a_hold_is_shown(browsed):
-    browsed.daemon.say(loop={"phase": "held", "response": "hold", "reasons": REASONS})
+def test_the_cause_of_a_hold_comes_first_and_every_other_reason_after_it(browsed):
+    browsed.daemon.say(loop={"phase": "held", "response": "hold", "cause": CAUSE, "reasons": REASONS})
     browsed.open()
     browsed.until("#holding-title", "Holding, because")
-    first, second = browsed.page.locator("#reasons li").all_inner_texts()
-    assert f"{first} {second}" == REASONS
-    assert second.startswith("a device's state is out of date")
+    first, others = browsed.page.locator("#reasons li").all_inner_texts()
+    assert first == CAUSE
+    assert f"{first} {others}" == REASONS
     browsed.daemon.say()
     browsed.page.wait_for_selector("#holding", state="hidden")
 
@@ -194,7 +194,13 @@ def test_every_reason_for_a_hold_is_shown(browsed):
             {
                 "robot": {"protective_stop": True, "safety_mode": 3, "blocked": "The robot is in a protective stop."},
                 "gripper": {"fault": 11, "fault_text": "overheated"},
-                "loop": {"phase": "stopped", "response": "stop and keep grip", "reasons": REASONS, "activity": "a"},
+                "loop": {
+                    "phase": "stopped",
+                    "response": "stop and keep grip",
+                    "cause": CAUSE,
+                    "reasons": REASONS,
+                    "activity": "a",
+                },
             },
             {
                 "#robot-blocked": "PROTECTIVE STOP: The robot is in a protective stop.",
@@ -280,7 +286,7 @@ def test_head_and_title_name_rig_computer_emulation_and_state(browsed):
     page.wait_for_function("() => document.title === 'STOPPED · EMULATED · bench on rig-pc'")
     assert browsed.text("#where") == "EMULATED bench on rig-pc"
     assert page.evaluate("document.body.dataset.alarm") == "stopped"
-    browsed.daemon.say(loop={"phase": "held", "reasons": REASONS})
+    browsed.daemon.say(loop={"phase": "held", "cause": CAUSE, "reasons": REASONS})
     page.wait_for_function("() => document.title.startsWith('HOLD · ') && document.body.dataset.alarm === ''")
 
 
@@ -309,7 +315,7 @@ def test_limits_are_lines_of_the_chart(browsed):
 
 def test_what_happened_survives_a_reload(browsed):
     page = browsed.open()
-    browsed.daemon.say(loop={"phase": "held", "reasons": REASONS})
+    browsed.daemon.say(loop={"phase": "held", "cause": CAUSE, "reasons": REASONS})
     browsed.until("#events", "holding: the torque estimate is not valid")
     page.reload()
     browsed.until("#events", "holding: the torque estimate is not valid")

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.web.fake_daemon import MESSAGES, PLAN, REASONS
+from tests.daemon.web.fake_daemon import CAUSE, MESSAGES, PLAN, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
 COMMANDS = ("tare", "start", "pause", "resume", "unlock", "release")
@@ -173,7 +173,7 @@ def test_a_phone_shows_the_chart_on_its_first_screen(browsed):
 def test_the_page_fits_and_stop_stays_visible(size, browsed):
     page = browsed.open(token=True)
     page.set_viewport_size({"width": size[0], "height": size[1]})
-    browsed.daemon.say(loop={"phase": "held", "response": "hold", "reasons": REASONS})
+    browsed.daemon.say(loop={"phase": "held", "response": "hold", "cause": CAUSE, "reasons": REASONS})
     browsed.until("#holding-title", "Holding")
     found, cut = browsed.layout(), page.evaluate(CUT)
     progress = page.locator("#progress").bounding_box()

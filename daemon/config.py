@@ -319,7 +319,9 @@ class DaemonConfig(ConfigModel):
         if self.autostart and self.experiment is None:
             raise ValueError("`autostart` starts no experiment: name one in `experiment`, or take `autostart` out")
         if self.emulated:
-            for key, device in self._real_devices():
+            real = next(self._real_devices(), None)
+            if real is not None:
+                key, device = real
                 raise ValueError(f"`emulated: true` and `{key}: {device}`, a real device: take one of the two out")
         if self.gripper is not None and self.robot is None:
             raise ValueError("a gripper without a robot cannot be driven: add `robot: ur.yaml`, or take `gripper` out")

@@ -40,7 +40,7 @@ from shearloop.tools.recordings.intact_records import (
     check_magic,
     check_size,
 )
-from shearloop.tools.recordings.one_clock import Messages, OneClock, by_one_clock, is_one_clock
+from shearloop.tools.recordings.monotonic_times import Messages, MonotonicTimes, has_one_offset, in_monotonic_order
 
 _NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
 _OTHER_PROGRAM = "another program made or changed this recording: record or import it again"
@@ -130,9 +130,9 @@ class OpenRecording:
         By time, log times come from the monotonic stamps, so that a wall clock that was set changes nothing.
         """
         wanted = None if topics is None else [*topics]
-        if by_time and self.counts.get(schema.CLOCK_TOPIC) and not is_one_clock(self.identity):
+        if by_time and self.counts.get(schema.CLOCK_TOPIC) and not has_one_offset(self.identity):
             first = next(self._found([schema.CLOCK_TOPIC], by_log_time=False))
-            return by_one_clock(first, lambda: self._found(wanted, by_log_time=False))
+            return in_monotonic_order(first, lambda: self._found(wanted, by_log_time=False))
         return self._found(wanted, by_log_time=by_time)
 
     def _found(self, topics: list[str] | None, *, by_log_time: bool) -> Messages:
@@ -148,7 +148,7 @@ class OpenRecording:
             imported = "source" not in content
             if imported != self._imported.setdefault(channel.topic, imported):
                 raise ContentError("it has other keys than the first one")
-            if "timestamp" in content and not is_one_clock(self.identity):
+            if "timestamp" in content and not has_one_offset(self.identity):
                 content |= schema.unix_times(schema.schema_name(channel.topic), content, message.log_time)
                 check_time(schema.ARRIVAL, content.get(schema.ARRIVAL) or 0)
         except ContentError as error:
@@ -359,7 +359,7 @@ def _listed(path: Path) -> ListedRecording:
             counts = summary.statistics
             experiments = [one for one in reader.iter_metadata() if one.name == schema.EXPERIMENT_METADATA]
             follows_wall_clock = any(
-                channel.topic == schema.CLOCK_TOPIC and not is_one_clock(channel.metadata)
+                channel.topic == schema.CLOCK_TOPIC and not has_one_offset(channel.metadata)
                 for channel in summary.channels.values()
             )
             whole = summarise(path) if follows_wall_clock else None
@@ -415,7 +415,7 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
     spans: dict[str, tuple[int, int]] = {}
     named: dict[str, list[dict[str, str]]] = {}
     attachments = []
-    clock, readings = OneClock(), list[tuple[int, ClockReading]]()
+    clock, readings = MonotonicTimes(), list[tuple[int, ClockReading]]()
     for record in records:
         match record:
             case Message():

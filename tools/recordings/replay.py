@@ -264,7 +264,8 @@ class Replay:
         if config.load_cell is not None:
             self._load_parser = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
         self._skin = ReplayedSkin(config.skin) if config.skin is not None else None
-        self.comparison.awaited.update(run.continued.intersection(self._sources)) if run.continues_with(config) else ()
+        if run.continues_with(config):
+            self.comparison.awaited.update(run.continued.intersection(self._sources))
 
     @property
     def _sources(self) -> set[str]:
@@ -295,11 +296,7 @@ class Replay:
         elif event.raw is not None:
             self._clock.set(event.t_mono_ns)
             await self._process_input(event.source, event.raw)
-        elif (
-            self._run.has_inputs
-            and event.topic in COMPUTED_TOPICS
-            and event.source in self._sources - self.comparison.awaited
-        ):
+        elif self._is_compared(event):
             self.comparison.compare(event)
         elif event.topic != messages.EitHeatmap.topic:
             self._publisher.forward(event.topic, messages.with_packed_arrays(event.content))

@@ -1,7 +1,7 @@
-"""One clock for a recording: each message's monotonic stamp plus one offset, however the wall clock was set meanwhile.
+"""The log times of a recording by its monotonic stamps plus one offset, however the wall clock was set meanwhile.
 
 Recordings with schema.CLOCK_OFFSET have such log times. Others have log times of the wall clock as it was at each
-message, and `OneClock` corrects them. Imported messages have no monotonic stamp: their log times stay.
+message, and `MonotonicTimes` corrects them. Imported messages have no monotonic stamp: their log times stay.
 """
 
 import heapq
@@ -21,7 +21,7 @@ _STAMP = re.compile(rb'"t_mono_ns":\s*(\d{1,18})\b')
 Messages: TypeAlias = Iterator[tuple[Channel, Message]]
 
 
-class OneClock:
+class MonotonicTimes:
     """Corrects messages in the order of the file; the first with a monotonic stamp gives the offset."""
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class OneClock:
 
     def time_ns(self, channel: Channel, message: Message) -> int:
         """Return the Unix time of a message by the one offset."""
-        stamp = None if is_one_clock(channel.metadata) else _STAMP.search(message.data)
+        stamp = None if has_one_offset(channel.metadata) else _STAMP.search(message.data)
         if stamp is None:
             return message.log_time
         t_mono_ns = int(stamp[1])
@@ -45,17 +45,17 @@ class OneClock:
         return replace(message, log_time=t_ns, publish_time=message.publish_time + t_ns - message.log_time)
 
 
-def is_one_clock(identity: Mapping[str, str]) -> bool:
+def has_one_offset(identity: Mapping[str, str]) -> bool:
     """Return whether a recording of this identity has log times of one offset."""
     return schema.CLOCK_OFFSET in identity
 
 
-def by_one_clock(first: tuple[Channel, Message], in_file_order: Callable[[], Messages]) -> Messages:
+def in_monotonic_order(first: tuple[Channel, Message], in_file_order: Callable[[], Messages]) -> Messages:
     """Yield corrected messages by time; `first` is the file's first with a monotonic stamp, selected or not.
 
     Reads the file twice, and holds only the messages that are out of order.
     """
-    clock = OneClock()
+    clock = MonotonicTimes()
     clock.time_ns(*first)
     times = array("q", (clock.time_ns(channel, message) for channel, message in in_file_order()))
     # The earliest time from each message on.

@@ -18,12 +18,14 @@ from shearloop.estimation.gain import (
 from shearloop.estimation.interval_regressor import CensoredRidge, Ridge, fit_interval_regressor
 
 TWISTS = np.tile([0.0, 0.0, 0.0, 0.03, 0.05, 0.04, 0.0, 0.0], 10)
+# Of one fingertip.
+NOISE_NM = 0.001
 
 
 def twisted(gains, seed):
     """Return (n, 2) features of two fingertips whose torques are these factors too small, and (n,) torques."""
     rng = np.random.default_rng(seed)
-    features = TWISTS[:, None] / gains + rng.normal(0.0, 0.001, (len(TWISTS), 2))
+    features = TWISTS[:, None] / gains + rng.normal(0.0, NOISE_NM, (len(TWISTS), 2))
     return features, TWISTS
 
 
@@ -46,7 +48,9 @@ def test_intervals_grow_with_the_load_alone():
     factor = math.exp(1.96 * PRIOR_SPREADS[2])
     assert loaded[1] == pytest.approx(0.05 * (1 - 1 / factor), rel=0.1)
     assert loaded[2] == pytest.approx(0.05 * (factor - 1), rel=0.1)
-    assert max(free[1:]) < 0.15 * loaded[1]
+    # Two fingertips share the noise. Of 80 errors the 95 % quantile has a standard error of 11 %.
+    noise_nm = 1.96 * NOISE_NM / math.sqrt(2)
+    assert max(free[1:]) == pytest.approx(1.05 * noise_nm, rel=0.22)
 
 
 def spread_of(factors, left_out=(), first=1.0):

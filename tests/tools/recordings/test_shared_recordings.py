@@ -31,7 +31,9 @@ from shearloop.tools.recordings.reader import read_recording
 
 # Five of the ten twists come before this share of the recording.
 HALF = 0.457
-# By the slices fitted to: largest RMSE and interval score on the later ones, N·m.
+# By the slices fitted to: largest RMSE and interval score on the later ones, N·m. After 19 and 24 slices a curve of
+# degree 4 errs by 0.0108 and 0.0083 alone: it has learned the levels, which repeat. On other levels it errs more, see
+# test_torques_between_the_calibrated_levels_are_read_too.
 LATER_SLICES = {
     19: (0.0118, 0.102), 24: (0.0094, 0.165), 29: (0.0086, 0.067), 34: (0.0085, 0.061), 39: (0.011, 0.064),
     44: (0.004, 0.074),
@@ -130,7 +132,7 @@ def test_later_twists(twists, sides, r, rmse_nm):
     figures = figures_of([estimate_series(calibration, part_of(series, HALF - 0.015, 1))])
     assert figures["r"] >= r
     assert figures["rmse_nm"] <= rmse_nm
-    assert 0.90 <= figures["coverage_95"] <= 0.99
+    assert 0.90 <= figures["coverage_95"] <= 0.98
     assert 0.6 <= figures["valid_fraction"] <= 0.75
 
 

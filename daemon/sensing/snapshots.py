@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 import structlog
+from pydantic import BaseModel
 
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
@@ -195,7 +196,9 @@ class _Decoder:
                 return found
             case "object":
                 kind_of = _class(form)
-                made = self._meet(kind_of.__new__(kind_of))
+                # A model cannot be copied without what pydantic keeps beside its attributes.
+                is_model = issubclass(kind_of, BaseModel)
+                made = self._meet(kind_of.model_construct() if is_model else kind_of.__new__(kind_of))
                 for name, one in form["attributes"].items():
                     object.__setattr__(made, name, self.value(one))
                 return made

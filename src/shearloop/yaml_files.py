@@ -8,7 +8,7 @@ import copy
 import math
 import re
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -99,6 +99,8 @@ class Document:
     content: Any
     raises: type[Exception]
     _root: yaml.Node | None
+    # What `with_values` was given as a number or as true or false: the text by its place in the content.
+    _given: Mapping[tuple[int | str, ...], str] = field(default_factory=dict)
 
     @classmethod
     def read(cls, path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Self:
@@ -140,14 +142,32 @@ class Document:
         try:
             return _validated(self.content, model, self.path.resolve().parent)
         except ValidationError as error:
+            if texts := self._expected_texts(error):
+                return self._with_texts(texts).model(model)
             raise self.raises("\n".join(_mistakes(error, model, self.content, str(self.path), self._root))) from error
+
+    def _expected_texts(self, error: ValidationError) -> dict[tuple[int | str, ...], str]:
+        """Return the given values, as they were written, where a text or a path is expected."""
+        places = [one["loc"] for one in error.errors() if one["type"] in ("string_type", "path_type")]
+        return {place: self._given[place] for place in places if place in self._given}
+
+    def _with_texts(self, texts: Mapping[tuple[int | str, ...], str]) -> Self:
+        content = copy.deepcopy(self.content)
+        for place, text in texts.items():
+            section = content
+            for part in place[:-1]:
+                section = section[part]
+            section[place[-1]] = text
+        others = {place: text for place, text in self._given.items() if place not in texts}
+        return type(self)(self.path, content, self.raises, self._root, others)
 
     def with_values(self, values: Mapping[str, str]) -> Self:
         """Return the document with other values, given as YAML by their keys, such as `loop.kp` or `steps.0`.
 
-        Sections that are missing are made. Mistakes in the result are named without a line.
+        Sections that are missing are made. A number is a text where a text is expected, as it is written: a shell takes
+        its quotes away. Mistakes in the result are named without a line.
         """
-        content = copy.deepcopy(self.content)
+        content, given = copy.deepcopy(self.content), dict(self._given)
         for key, text in values.items():
             try:
                 value = yaml.load(text, _Loader)  # noqa: S506 - it is a SafeLoader
@@ -163,7 +183,9 @@ class Document:
                 section[last] = value
             else:
                 raise self.raises(f"{self.path}: {'.'.join(sections)} is a value, so it has no {last}")
-        return type(self)(self.path, content, self.raises, None)
+            if isinstance(value, bool | int | float):
+                given[tuple(int(part) if part.isdecimal() else part for part in key.split("."))] = text.strip()
+        return type(self)(self.path, content, self.raises, None, given)
 
     def _section(self, section: Any, name: str, key: str) -> Any:
         if isinstance(section, list):

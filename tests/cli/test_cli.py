@@ -318,6 +318,15 @@ def test_set_replaces_values_of_the_configuration(config, tmp_path, mistake):
         assert sentence in mistake("run", str(config(emulators=[])), "--set", assignment)
 
 
+def test_set_takes_a_number_as_text_where_a_text_is_expected(config, tmp_path):
+    device = "fingertips.right.device"
+    given = {"name": "007", f"{device}.serial_number": "0070123", f"{device}.path": "", "loop.kp": "0.5"}
+    found = load_daemon_config(config(), given)
+    assert (found.name, found.fingertips["right"].device.serial_number, found.loop.kp) == ("007", "0070123", 0.5)
+    assert load_daemon_config(config(), {"name": "on"}).name == "on"
+    assert load_daemon_config(config(), {f"{device}.path": "0123"}).fingertips["right"].device.path == tmp_path / "0123"
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_explains_itself(name, capsys):
     with pytest.raises(SystemExit) as ended:

@@ -178,30 +178,41 @@ class RunningRig:
 
     def move_straight(self) -> None:
         """Move the open gripper along the tool, to the other side of where it began; return at full speed."""
+        self._run(self._line, _moves_or_ended)
+
+    def turn(self) -> None:
+        """Grip the tool and turn it from where the wrist is to the other side; return at full speed."""
+        self._run(self._twist, _turns_or_ended)
+
+    def _line(self) -> list[dict[str, Any]]:
         height_m = self.wait_for(lambda topic, _: topic == "robot.state")["tcp_pose"][2]
         if self._middle_m is None:
             self._middle_m = height_m - 0.5 * FAR_M
         # The tool points down.
         along_m = FAR_M if height_m > self._middle_m else -FAR_M
         approach = {"do": "approach", "along_tool_m": along_m, "speed_m_per_s": SPEED_M_PER_S}
-        self._run([{"do": "release", "width_mm": 30}, approach], _moves_or_ended)
+        return [{"do": "release", "width_mm": 30}, approach]
 
-    def turn(self) -> None:
-        """Grip the tool and turn it from where the wrist is to the other side; return at full speed."""
+    def _twist(self) -> list[dict[str, Any]]:
         wrist_rad = self.wait_for(lambda topic, _: topic == "robot.state")["wrist_rad"]
         twist = {"do": "twist", "angles_rad": [-FAR_RAD if wrist_rad > 0 else FAR_RAD], "absolute": True,
                  "speed_rad_per_s": SPEED_RAD_PER_S, "return_to_start": False}  # fmt: skip
         grip = {"do": "grip", "width_mm": 5, "speed_mm_per_s": 250, "force_n": 60}
-        self._run([{"do": "release", "width_mm": 30}, grip, twist], _turns_or_ended)
+        return [{"do": "release", "width_mm": 30}, grip, twist]
 
-    def _run(self, steps: list[dict[str, Any]], condition: Callable[[str, Mapping[str, Any]], bool]) -> None:
-        """Start an experiment, again while it ends early; return once a robot's state meets the condition."""
+    def _run(
+        self, steps: Callable[[], list[dict[str, Any]]], condition: Callable[[str, Mapping[str, Any]], bool]
+    ) -> None:
+        """Start an experiment, again while it ends early; return once a robot's state meets the condition.
+
+        The steps are chosen at each start: a motion that ended early has left the arm elsewhere.
+        """
         limits = {"torque_nm": 0.3, "angle_rad": 6.28}
         path = self._folder / "motion.yaml"
-        content = {"name": "motion", "torque_source": "load_cell", "limits": limits, "steps": steps}
-        path.write_text(yaml.safe_dump(content))
+        content = {"name": "motion", "torque_source": "load_cell", "limits": limits}
         end_s = time.monotonic() + DEADLINE_S
         while time.monotonic() < end_s:
+            path.write_text(yaml.safe_dump({**content, "steps": steps()}))
             reply = self.send("start", experiment=str(path))
             if reply["ok"] and "wrist_rad" in (reply := dict(self.wait_for(condition))):
                 return

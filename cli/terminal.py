@@ -1,7 +1,6 @@
 """What commands print, as text or JSON, with progress bars, and the lines that an operator types."""
 
 import asyncio
-import dataclasses
 import json
 import os
 import shutil
@@ -64,8 +63,8 @@ class StatusLine:
             self._state = loop_line(content)
             self._driving = content["torque_source"]
         elif topic in ("eit.estimate", "load.torque", "skin.shear") and content["source"] == self._driving:
-            torque_nm = content["torque_nm"] if content["valid"] else None
-            self._torque = "" if torque_nm is None else f"   {self._driving} {torque_nm:+.3f} N·m"
+            torque = _shown(topic, content, "torque_nm", "+.3f") if content["valid"] else ""
+            self._torque = torque and f"   {self._driving} {torque}"
         elif topic in ("eit.estimate", "skin.shear") and self._driving is None:
             self._state = message_line(topic, content)
         else:
@@ -148,7 +147,7 @@ class Operator:
 def message_line(topic: str, content: Mapping[str, Any]) -> str:
     """Return one line of text: time, topic, source, and the values with their units."""
     clock = datetime.fromtimestamp(content["timestamp"]).astimezone().strftime("%H:%M:%S.%f")[:-3]
-    body = _BODIES[topic](content) if topic in _BODIES else _columns(topic, content)
+    body = _BODIES.get(topic, _columns)(topic, content)
     return f"{clock}  {topic:<13} {content['source']:<9} {body}"
 
 
@@ -163,46 +162,52 @@ def message_json(topic: str, content: Mapping[str, Any]) -> str:
     return json.dumps(json.loads(compact), ensure_ascii=False)
 
 
-def _estimate(content: Mapping[str, Any]) -> str:
+def _estimate(topic: str, content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no estimate: {content['reason']}"
-    torque = _with_interval(content, "torque", "nm", "torque {:+.4f} N·m", "[{:+.4f}, {:+.4f}]")
     details = (
-        _present("diameter {:5.1f} mm", content["diameter_mm"]),
-        _present("k {:.3f}  sigma {:.3f} cm", content["k"], content["sigma"]),
-        _present("score {:.3f}", content["score"]),
+        _shown(topic, content, "diameter_mm", "5.1f", "diameter "),
+        _shown(topic, content, "k", ".3f", "k "),
+        _shown(topic, content, "sigma", ".3f", "sigma "),
+        _shown(topic, content, "score", ".3f", "score "),
     )
-    return "   ".join(filter(None, (torque or "no torque", *details)))
+    return "   ".join(filter(None, (_with_interval(topic, content, "torque", "nm", "+.4f") or "no torque", *details)))
 
 
-def _shear(content: Mapping[str, Any]) -> str:
+def _shear(topic: str, content: Mapping[str, Any]) -> str:
     if not content["valid"]:
         return f"no force: {content['reason']}"
-    shear = _with_interval(content, "shear", "n", "shear {:+.3f} N", "[{:+.3f}, {:+.3f}]")
     details = (
-        _present("torque {:+.4f} N·m", content["torque_nm"]),
-        _present("response {:+.5f}", content["response"]),
+        _shown(topic, content, "torque_nm", "+.4f", "torque "),
+        _shown(topic, content, "response", "+.5f", "response "),
         "within the deadband" if content["deadband"] else content["direction"],
     )
-    return "   ".join(filter(None, (shear or "no force", *details)))
+    return "   ".join(filter(None, (_with_interval(topic, content, "shear", "n", "+.3f") or "no force", *details)))
 
 
-def _with_interval(content: Mapping[str, Any], name: str, unit: str, value: str, interval: str) -> str:
+def _with_interval(topic: str, content: Mapping[str, Any], name: str, suffix: str, form: str) -> str:
     """Return a value with its interval, or alone without one end of it; empty without the value."""
-    shown = _present(value, content[f"{name}_{unit}"])
-    ends = _present(interval, content[f"{name}_low_{unit}"], content[f"{name}_high_{unit}"])
-    return f"{shown} {ends}" if shown and ends else shown
+    shown = _shown(topic, content, f"{name}_{suffix}", form, f"{name} ")
+    low, high = content[f"{name}_low_{suffix}"], content[f"{name}_high_{suffix}"]
+    return f"{shown} [{low:{form}}, {high:{form}}]" if shown and low is not None and high is not None else shown
 
 
-def _present(pattern: str, *values: float | None) -> str:
-    """Return the values in their pattern, empty if one of them is None."""
-    return "" if any(value is None for value in values) else pattern.format(*values)
+def _shown(topic: str, content: Mapping[str, Any], key: str, form: str, name: str = "") -> str:
+    """Return a value behind its name, with the unit of its key; empty without the value."""
+    from shearloop.daemon.messaging.messages import with_unit
+
+    return "" if content[key] is None else name + with_unit(topic, key, content[key], form)
 
 
-def _load(content: Mapping[str, Any]) -> str:
+def _load(topic: str, content: Mapping[str, Any]) -> str:
+    raw = _shown(topic, content, "raw", ".10g", "raw ")
     if not content["valid"]:
-        return f"no torque: {content['reason']}   raw {content['raw']:.10g}"
-    return f"torque {content['torque_nm']:+.4f} N·m   raw {content['raw']:.10g}"
+        return f"no torque: {content['reason']}   {raw}"
+    return f"{_shown(topic, content, 'torque_nm', '+.4f', 'torque ')}   {raw}"
+
+
+def _loop(_topic: str, content: Mapping[str, Any]) -> str:
+    return loop_line(content)
 
 
 def loop_line(content: Mapping[str, Any]) -> str:
@@ -218,12 +223,13 @@ def loop_line(content: Mapping[str, Any]) -> str:
     return "  ".join(parts[:2] if activity == reasons else parts)
 
 
-def _health(content: Mapping[str, Any]) -> str:
+def _health(topic: str, content: Mapping[str, Any]) -> str:
     from shearloop.tools.task_row import task_row
 
     rows = [task_row(name, facts) for name, facts in content["tasks"].items()]
     tasks = (f"{name} {', '.join(filter(None, cells))}" for name, *cells in rows)
-    return f"{content['memory_mb']:.0f} MB  {content['cpu_percent']:.1f} % CPU  " + "; ".join(tasks)
+    memory, cpu = _shown(topic, content, "memory_mb", ".0f"), _shown(topic, content, "cpu_percent", ".1f")
+    return f"{memory}  {cpu} CPU  " + "; ".join(tasks)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -234,17 +240,15 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def _columns(topic: str, content: Mapping[str, Any]) -> str:
-    from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS
+    from shearloop.daemon.messaging.messages import ENVELOPE, units
 
-    fields = dataclasses.fields(TOPICS[topic]) if topic in TOPICS else ()
-    units = {item.name: f" {item.metadata['unit']}" for item in fields if item.metadata.get("unit")}
     hidden = (*ENVELOPE, "topic")
     own = {
         key: value
         for key, value in content.items()
         if key not in hidden and value is not None and not (isinstance(value, str) and not value)
     }
-    return "  ".join(f"{key} {_value(value)}{units.get(key, '')}" for key, value in own.items())
+    return "  ".join(f"{key} {_value(value)} {units(topic).get(key, '')}".rstrip() for key, value in own.items())
 
 
 def _value(value: object) -> str:
@@ -257,10 +261,10 @@ def _value(value: object) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
-_BODIES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+_BODIES: Mapping[str, Callable[[str, Mapping[str, Any]], str]] = {
     "eit.estimate": _estimate,
     "skin.shear": _shear,
     "load.torque": _load,
-    "loop.state": loop_line,
+    "loop.state": _loop,
     "health": _health,
 }

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.messaging.messages import with_unit
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.printable import printable
 from shearloop.words import counted, times
@@ -165,11 +166,11 @@ def _codes(content: Mapping[str, Any]) -> list[str]:
 
 def stop_sentence(content: Mapping[str, Any]) -> str:
     """Return the times of a `loop.stop` message in words."""
-    sent, stands = (
-        f"{after} {content[key]:.3f} s" if content[key] is not None else f"{after} an unknown time"
-        for key, after in (("sent_after_s", "sent after"), ("stands_after_s", "standstill after"))
+    decided, sent, stands = (
+        "an unknown time" if content[key] is None else with_unit("loop.stop", key, content[key], ".3f")
+        for key in ("decided_after_s", "sent_after_s", "stands_after_s")
     )
-    return f"The stop, from its cause: decided after {content['decided_after_s']:.3f} s, {sent}, {stands}."
+    return f"The stop, from its cause: decided after {decided}, sent after {sent}, standstill after {stands}."
 
 
 def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
@@ -202,10 +203,14 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
         step.set_point_nm = content["set_point_nm"]
         if content["hold"] and step.held_from_ns is None:
             step.held_from_ns = now_ns
-    if all(content[key] is not None for key in ("stiffness_nm_per_rad", "delay_s", "noise_nm")):
-        text = "   stiffness {stiffness_nm_per_rad:.3f} N·m/rad, delay {delay_s:.2f} s, "
-        text += "noise of one torque {noise_nm:.4f} N·m"
-        run.identified = text.format_map(content)
+    found = (
+        ("stiffness", "stiffness_nm_per_rad", ".3f"),
+        ("delay", "delay_s", ".2f"),
+        ("noise of one torque", "noise_nm", ".4f"),
+    )
+    if all(content[key] is not None for _, key, _ in found):
+        named = (f"{name} {with_unit('loop.state', key, content[key], form)}" for name, key, form in found)
+        run.identified = f"   {', '.join(named)}"
 
 
 def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[str]:
@@ -235,12 +240,17 @@ def _elapsed_s(first: Mapping[str, Any], last: Mapping[str, Any]) -> float:
 def _turned(step: _StepSummary, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
     driving = run.first["torque_source"]
     if step.wrist_from_rad is not None and step.wrist_to_rad is not None:
-        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; {_named(driving, truth)}"
+        turned = with_unit("robot.state", "wrist_rad", step.wrist_to_rad - step.wrist_from_rad, "+.3f")
+        yield f"    turned by {turned}; {_named(driving, truth)}"
     for name, series in _all_torques(run, truth).items():
         turning = series.between(step.from_ns, step.to_ns).torque_nm
         if turning.size and name in (TRUE, driving):
             largest_nm = turning[np.abs(turning).argmax()]
-            yield f"    {name:<11} {turning[-1]:+.4f} N·m at the end, {largest_nm:+.4f} at most"
+            yield f"    {name:<11} {_torque(turning[-1], '+.4f')} at the end, {largest_nm:+.4f} at most"
+
+
+def _torque(torque_nm: float, form: str) -> str:
+    return with_unit("loop.state", "torque_nm", torque_nm, form)
 
 
 def _named(driving: str, truth: TorqueSeries | None) -> str:
@@ -257,11 +267,11 @@ def _held(
 ) -> Iterator[str]:
     driving, held_s = run.first["torque_source"], (step.to_ns - from_ns) / 1e9
     sources = _all_torques(run, truth)
-    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; {_named(driving, truth)}"
+    yield f"    set point {_torque(set_nm, '+.3f')}, held for {held_s:.0f} s; {_named(driving, truth)}"
     for name, series in sources.items():
         held = series.between(from_ns, step.to_ns).torque_nm
         if held.size:
-            mean = f"    {name:<11} {held.mean():+.4f} N·m on average, standard deviation {held.std():.4f}"
+            mean = f"    {name:<11} {_torque(held.mean(), '+.4f')} on average, standard deviation {held.std():.4f}"
             yield f"{mean}, within ± {BAND:.0%} for {np.mean(_in_band(held, set_nm)):.0%} of the time"
     # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
     names = sorted(set(sources) - {driving}, key=lambda name: (name != TRUE, name != LOAD_CELL, name))
@@ -280,7 +290,7 @@ def _held(
                 never = "not back by the end" if next_ns is None else "not back by the next one"
                 back = never if back_s == np.inf else f"back within ± {BAND:.0%} after {back_s:.1f} s"
                 since_s = (t_ns - from_ns) / 1e9
-                yield f"    disturbed after {since_s:.1f} s ({description}): {worst_nm:.3f} N·m off, {back}"
+                yield f"    disturbed after {since_s:.1f} s ({description}): {_torque(worst_nm, '.3f')} off, {back}"
 
 
 def _in_band(torque_nm: FloatArray, set_nm: float) -> NDArray[np.bool_]:

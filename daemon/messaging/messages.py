@@ -290,6 +290,11 @@ def units(topic: str) -> Mapping[str, str]:
     return {**envelope, **{item.name: item.metadata["unit"] for item in fields if item.metadata.get("unit")}}
 
 
+def with_unit(topic: str, key: str, value: float, form: str) -> str:
+    """Return a value of a message's key in a format, with the unit of the key: `+0.100 N·m`."""
+    return f"{value:{form}} {units(topic).get(key, '')}".rstrip()
+
+
 def stale_after_s(topic: str) -> float:
     """Return the age in seconds that makes a topic's latest message stale.
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from shearloop.daemon.messaging.messages import DaemonEnd
+from shearloop.daemon.messaging.messages import DaemonEnd, LoopStop, with_unit
 
 # The page shows at most this many.
 MAX_EVENTS = 200
@@ -70,7 +70,7 @@ def _stop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
 
     def after(key: str) -> str:
         value = now.get(key)
-        return f"{value:.3f} s" if isinstance(value, float) else "unknown"
+        return with_unit(LoopStop.topic, key, value, ".3f") if isinstance(value, float) else "unknown"
 
     yield (
         "stop",

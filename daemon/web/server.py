@@ -274,6 +274,7 @@ class _Page:
             "publish": publish,
             "dead_after_s": DEAD_AFTER_S,
             "stale_after_periods": messages.STALE_AFTER_PERIODS,
+            "units": {topic: dict(messages.units(topic)) for topic in messages.TOPICS},
             "stale_after_s": {topic: max(messages.stale_after_s(topic), MIN_STALE_S) for topic in regular},
         }
         self._open: set[web.WebSocketResponse] = set()

@@ -1,6 +1,7 @@
 """Listeners of the daemon's messages: each takes every message, and none can end a task."""
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from contextlib import closing
 from io import StringIO
@@ -12,10 +13,12 @@ import zmq
 from shearloop.cli.emulator_processes import EmulatedDevices
 from shearloop.cli.terminal import StatusLine, message_json, message_line, print_estimate
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, LoadTorque, Message, decode, encode, wire_map
 from shearloop.daemon.messaging.publisher import LISTENER_FAILED, Publisher
 from shearloop.daemon.run_summary import RunSummary
 from tests.sample_messages import sample
+from tests.tools.recordings.every_message import distinct
 
 
 def nullable_keys(kind: type[Message]) -> list[str]:
@@ -38,6 +41,27 @@ def test_every_message_is_shown_with_any_key_empty(topic):
         assert f" {content['source']} " in line
         assert "None" not in line
         assert message_json(topic, content)
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+def test_each_number_that_listen_prints_is_that_of_its_key_with_its_unit(topic, monkeypatch):
+    marked = {name: {key: f"<{key}>" for key in messages.units(name)} for name in TOPICS}
+    monkeypatch.setattr(messages, "units", lambda name: marked[name])
+    content = decode(encode(wire_map(distinct(TOPICS[topic], 0, "one", 5), timestamp=0.0, seq=1)))
+    # Every value is shown, not the reason for its absence.
+    content |= {key: True for key in ("valid",) if key in content}
+    line = message_line(topic, content)
+    shown = re.findall(r"(\S+) <(\w+)>", line)
+    scalars = {key for key in marked[topic].keys() & content.keys() if isinstance(content[key], float)}
+    # The line of the loop has words, and no value with a unit.
+    assert bool(shown) == (topic != "loop.state" and scalars != {"timestamp"})
+    for text, key in shown:
+        if key in scalars:
+            digits = len(text.partition(".")[2])
+            assert float(text) == pytest.approx(content[key], abs=0.51 * 10**-digits, rel=1e-4), key
+    # No unit is typed in: without the marks there is none.
+    bare = re.sub(r"<\w+>", "", line)
+    assert not re.search(r"\d (N·m/rad|N·m|N|rad/s|rad|mm|mA|cm|Ω|MB|s|V|% CPU)(?!\S)", bare), line
 
 
 @pytest.mark.parametrize("topic", TOPICS)
@@ -65,8 +89,8 @@ def test_the_state_of_a_task_is_shown_with_any_fact_empty():
 
 
 def test_an_estimate_without_a_torque_shows_its_diameter():
-    values = {"torque_nm": None, "torque_low_nm": None, "torque_high_nm": None, "k": None, "score": None}
-    message = sample(EitEstimate, **values, diameter_mm=31.0)
+    empty = dict.fromkeys(("torque_nm", "torque_low_nm", "torque_high_nm", "k", "sigma", "score"))
+    message = sample(EitEstimate, **empty, diameter_mm=31.0)
     line = message_line("eit.estimate", wire_map(message, timestamp=0.0, seq=1))
     assert line.endswith("no torque   diameter  31.0 mm")
 

@@ -1,3 +1,4 @@
+import re
 from collections.abc import Sequence
 from io import StringIO
 from types import SimpleNamespace
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.daemon.messaging import messages
 from shearloop.daemon.run_summary import RunSummary, TorqueSeries
 
 S = 1_000_000_000
@@ -206,3 +208,129 @@ def test_the_times_of_a_stop_follow_the_summary():
     text = summary_of(loop_state(0), loop_state(5, phase="stopped"), stop)
     sentence = "The stop, from its cause: decided after 0.004 s, sent after 0.006 s, standstill after an unknown time."
     assert text.index("STOPPED before its end") < text.index(sentence)
+
+
+SET_NM, HOLD_S, END_S = 0.1, 14.25, 44.0
+
+
+def back_after(t_s: np.ndarray, torque_nm: np.ndarray) -> float | None:
+    """Return the first of the times from which the torque is within 10 % for a second, tried one after the other."""
+    inside = [abs(value - SET_NM) <= 0.1 * SET_NM for value in torque_nm]
+    for at, begin_s in enumerate(t_s):
+        near = [inside[i] for i in range(at, len(t_s)) if t_s[i] < begin_s + 1.0]
+        if all(near) and t_s[-1] >= begin_s + 1.0:
+            return float(begin_s)
+    return None
+
+
+def in_text(pattern: str, text: str) -> list[tuple[str, ...]]:
+    found = re.findall(pattern, text)
+    assert found, f"{pattern!r} is not in:\n{text}"
+    return [one if isinstance(one, tuple) else (one,) for one in found]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_each_number_of_a_hold_follows_from_the_messages(seed):
+    random = np.random.default_rng(seed)
+    kicks = [(20.0, "first"), (26.5, "second"), (38.0, "third")]
+    rates_hz = {"right": 1.85, "load_cell": 10.9, "true torque": 25.0}
+    series: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for name, rate_hz in rates_hz.items():
+        t_ns = np.round((np.arange(1.0, END_S + 2.0, 1 / rate_hz) + random.uniform(0, 0.01)) * S)
+        t_s = t_ns / S
+        torque_nm = SET_NM * (1 - np.exp(-np.maximum(t_s - 10.0, 0) / random.uniform(0.5, 1.5)))
+        for kick_s, _ in kicks:
+            torque_nm -= 0.05 * np.where(t_s >= kick_s, np.exp(-(t_s - kick_s) / random.uniform(0.3, 3)), 0)
+        # So much that the torque leaves its band again and again.
+        series[name] = t_ns, torque_nm + random.normal(0, 0.004, len(t_s))
+    # States of the loop: twice held by a fault, at times that no other message has.
+    first = {"step": 1, "step_name": "identify", "set_point_nm": None}
+    held = {"phase": "held", "response": "hold", "faults": FaultCode.ESTIMATE_STALE.text, "hold": 1}
+    states = [loop_state(0.5, **first), loop_state(9.75), loop_state(HOLD_S, hold=1)]
+    states += [loop_state(21.125, **held), loop_state(21.9, **held), loop_state(22.75, hold=1)]
+    states += [loop_state(30.0, **held), loop_state(31.3, hold=1), loop_state(END_S, phase="done")]
+    invalid_at = set(random.choice(len(series["load_cell"][0]), 37, replace=False).tolist())
+    readings = []
+    for name in ("right", "load_cell"):
+        for number, (t_ns, torque_nm) in enumerate(zip(*series[name], strict=True)):
+            valid = name == "right" or number not in invalid_at
+            said = {"torque_nm": torque_nm, "valid": valid, "reason": "" if valid else "a spike: 3 times the others"}
+            readings.append({"source": name, "t_mono_ns": int(t_ns), **said})
+    every = sorted([*states, *readings], key=lambda one: one["t_mono_ns"])
+    heard = [one for one in every if 0.5 * S <= one["t_mono_ns"] <= END_S * S]
+    truth = TorqueSeries(*series["true torque"])
+    text = summary_of(*heard, truth=truth, sent=[(round(t_s * S), name) for t_s, name in kicks])
+
+    # What the messages say, one by one.
+    taken = {
+        name: [
+            (one["t_mono_ns"] / S, one["torque_nm"])
+            for one in heard
+            if one["source"] == name and one.get("valid") and one["t_mono_ns"] / S <= END_S
+        ]
+        for name in ("right", "load_cell")
+    }
+    taken["true torque"] = [(t_ns / S, value) for t_ns, value in zip(*series["true torque"], strict=True)]
+    lines = in_text(r"    (\S+|true torque) +(\S+) N·m on average, standard deviation (\S+), .* for (\d+)%", text)
+    assert sorted(line[0] for line in lines) == ["load_cell", "right", "true torque"]
+    for name, mean, deviation, share in lines:
+        during = [value for t_s, value in taken[name] if HOLD_S <= t_s <= END_S]
+        average = sum(during) / len(during)
+        assert float(mean) == pytest.approx(average, abs=0.51e-4), name
+        squares = sum((value - average) ** 2 for value in during)
+        assert float(deviation) == pytest.approx((squares / len(during)) ** 0.5, abs=0.51e-4), name
+        near = sum(abs(value - SET_NM) <= 0.1 * SET_NM for value in during)
+        assert float(share) == pytest.approx(100 * near / len(during), abs=0.51), name
+    ((set_point, lasted),) = in_text(r"set point (\S+) N·m, held for (\d+) s", text)
+    assert float(set_point) == SET_NM
+    assert float(lasted) == pytest.approx(END_S - HOLD_S, abs=0.51)
+    ((took,),) = in_text(r"was done, after (\d+) s", text)
+    assert float(took) == pytest.approx(END_S - 0.5, abs=0.51)
+    steps = in_text(r"step (\d) of 3 +(\w+) +(\S+) s", text)
+    assert steps == [("1", "identify", f"{9.75 - 0.5:.1f}"), ("2", "hold_torque", f"{END_S - 9.75:.1f}")]
+    # The first hold lasts from 21.125 to 22.75 s, the second from 30 to 31.3 s.
+    kind = FaultCode.ESTIMATE_STALE.value.kind
+    assert f"held for {22.75 - 21.125 + 31.3 - 30.0:.1f} s in all: twice {kind}" in text
+    heard_loads = [one for one in heard if one["source"] == "load_cell"]
+    refused = [one for one in heard_loads if not one["valid"]]
+    assert f"{len(refused)} of {len(heard_loads)} torques of load_cell were not valid and not used" in text
+    # The way in and the ways back are judged by the true torque.
+    t_s, torque_nm = map(np.array, zip(*taken["true torque"], strict=True))
+    step = (t_s >= 9.75) & (t_s <= END_S)
+    ((reached,),) = in_text(r"within ± 10% (\S+) s after the set point changed, by true torque", text)
+    assert float(reached) == pytest.approx(back_after(t_s[step], torque_nm[step]) - 9.75, abs=0.051)
+    told = in_text(r"disturbed after (\S+) s \((\w+)\): (\S+) N·m off, (.*)", text)
+    for (after, name, off, back), (kick_s, kick), end_s in zip(told, kicks, (26.5, 38.0, END_S), strict=True):
+        assert name == kick
+        assert float(after) == pytest.approx(kick_s - HOLD_S, abs=0.051)
+        part = (t_s >= kick_s) & (t_s <= END_S if end_s == END_S else t_s < end_s)
+        assert float(off) == pytest.approx(max(abs(torque_nm[part] - SET_NM)), abs=0.51e-3)
+        expected = back_after(t_s[part], torque_nm[part])
+        if expected is None:
+            assert back.startswith("not back by the ")
+        else:
+            ((back_s,),) = in_text(r"back within ± 10% after (\S+) s", back)
+            assert float(back_s) == pytest.approx(expected - kick_s, abs=0.051)
+
+
+def test_the_times_of_a_stop_are_those_of_its_message():
+    times = dict(zip(("decided_after_s", "sent_after_s", "stands_after_s"), (0.0123, 0.0456, 1.7894), strict=True))
+    text = summary_of(loop_state(0), loop_state(5, phase="stopped"), {"source": "stop", "t_mono_ns": 5 * S, **times})
+    ((decided, sent, stands),) = in_text(r"decided after (\S+) s, sent after (\S+) s, standstill after (\S+) s\.", text)
+    assert (float(decided), float(sent), float(stands)) == pytest.approx((0.012, 0.046, 1.789))
+
+
+def test_each_unit_of_the_summary_is_that_of_a_messages_key(monkeypatch):
+    marked = {topic: {key: f"<{topic} {key}>" for key in messages.units(topic)} for topic in messages.TOPICS}
+    monkeypatch.setattr(messages, "units", lambda topic: marked[topic])
+    text = summary_of_hold(truth_that_falls_at(26.0, 5.5), [(26 * S, "kick")])
+    assert "stiffness 0.750 <loop.state stiffness_nm_per_rad>, delay 0.80 <loop.state delay_s>, " in text
+    assert "noise of one torque 0.0120 <loop.state noise_nm>" in text
+    turning = {"step_name": "tighten", "set_point_nm": None}
+    robot = [{"source": "robot", "wrist_rad": angle_rad} for angle_rad in (0.4, -0.1)]
+    load = {"source": "right", "t_mono_ns": S, "torque_nm": -0.05, "valid": True}
+    stop = {"source": "stop", "decided_after_s": 0.004, "sent_after_s": 0.006, "stands_after_s": None}
+    text += summary_of(loop_state(0, **turning), *robot, load, loop_state(5, phase="stopped", **turning), stop)
+    assert "turned by -0.500 <robot.state wrist_rad>" in text
+    assert "decided after 0.004 <loop.stop decided_after_s>, sent after 0.006 <loop.stop sent_after_s>" in text
+    assert not re.search(r"\d (N·m|rad)", text)

@@ -22,8 +22,8 @@ const torques = new Series();
 const forces = new Series();
 const tips = new Map();
 const drawn = {};
-const torqueChart = new TimeChart(byId("torque-chart"), byId("torque-legend"), "N·m", 0.05);
-const shearChart = new TimeChart(byId("shear-chart"), byId("shear-legend"), "N", 0.2);
+const torqueChart = new TimeChart(byId("torque-chart"), byId("torque-legend"), settings.units["loop.state"].torque_nm, 0.05);
+const shearChart = new TimeChart(byId("shear-chart"), byId("shear-legend"), settings.units["skin.shear"].shear_n, 0.2);
 
 const gap = (topic) => settings.stale_after_s[topic];
 const unlessInvalid = (said, value) => (said.valid ? value : null);

@@ -1,5 +1,7 @@
 // The connection to the viewer: the latest messages, their ages, and whether daemon and viewer respond.
 
+import { number } from "./text.js";
+
 const RETRY_MS = 500;
 // The viewer sends a batch every quarter of a second; after this silence the connection counts as lost.
 const LOST_AFTER_S = 1.0;
@@ -117,6 +119,14 @@ export class Link {
     if (source !== undefined) return this.latest.get(`${topic}/${source}`);
     for (const message of this.latest.values()) if (message.topic === topic) return message;
     return undefined;
+  }
+
+  // The unit of a message's key; empty without one.
+  unit(topic, key) { return this.settings.units[topic]?.[key] ?? ""; }
+
+  // The number of a message's key with its unit; a dash without the message or the number.
+  number(message, key, digits, signed) {
+    return message ? number(message.content[key], digits, this.unit(message.topic, key), signed) : "–";
   }
 
   sources(topic) {

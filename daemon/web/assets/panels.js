@@ -7,6 +7,7 @@ import { age, array, byId, interval, number, put, show, warn } from "./text.js";
 const ROBOT_MODES = { "-1": "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off", 4: "power on", 5: "idle", 6: "backdrive", 7: "running", 8: "updating" };
 const SAFETY_MODES = { 1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop", 6: "system emergency stop", 7: "robot emergency stop", 8: "violation", 9: "fault", 10: "validate joint", 11: "undefined", 12: "automatic mode safeguard stop", 13: "three-position enabling stop" };
 const MARK_OLD_AFTER_S = 1;
+const SIGNED = { signed: true };
 
 // Phases with a set point.
 export const ACTIVE = new Set(["running", "paused", "held"]);
@@ -47,14 +48,14 @@ export function torquePanel(link) {
   const said = shown?.content;
   put(byId("torque-source"), said ? `estimate of ${said.source}${said.source === driving ? ", drives the loop" : ""}` : "estimate");
   const valid = said?.valid ?? false;
-  put(byId("torque-now"), valid ? number(said.torque_nm, 4, "N·m", { signed: true }) : "–");
+  put(byId("torque-now"), valid ? link.number(shown, "torque_nm", 4, SIGNED) : "–");
   put(byId("torque-interval"), valid && said.torque_low_nm !== undefined ? `${interval(said.torque_low_nm, said.torque_high_nm, 4)} (95 %)` : "");
   const load = link.get("load.torque");
   const silent = load && !load.content.valid && !link.isOld(load) ? `load cell: ${load.content.reason}` : "";
   warn(byId("torque-reason"), [said && !valid ? `no estimate: ${said.reason}` : "", silent].filter(Boolean).join("; "));
-  const wanted = loop && !link.isOld(loop) && ACTIVE.has(loop.content.phase) ? loop.content : {};
-  put(byId("wanted"), number(wanted.ramp_nm, 4, "N·m", { signed: true }));
-  put(byId("set-point"), wanted.set_point_nm == null ? "" : `final ${number(wanted.set_point_nm, 3, "", { signed: true })}`);
+  const wanted = loop && !link.isOld(loop) && ACTIVE.has(loop.content.phase) ? loop : undefined;
+  put(byId("wanted"), link.number(wanted, "ramp_nm", 4, SIGNED));
+  put(byId("set-point"), wanted?.content.set_point_nm == null ? "" : `final ${number(wanted.content.set_point_nm, 3, "", SIGNED)}`);
   loadFigure(link, load);
   diameterFigure(link, estimate);
 }
@@ -63,8 +64,8 @@ function loadFigure(link, load) {
   show(byId("load"), load !== undefined);
   if (!load) return;
   const old = link.isOld(load);
-  const { torque_nm, valid } = load.content;
-  put(byId("load-torque"), old || !valid ? "–" : number(torque_nm, 4, "N·m", { signed: true }));
+  const { valid } = load.content;
+  put(byId("load-torque"), old || !valid ? "–" : link.number(load, "torque_nm", 4, SIGNED));
   put(byId("load-note"), old ? `OLD, ${age(link.ageOf(load))}` : valid ? "" : "not valid");
 }
 
@@ -72,10 +73,10 @@ function diameterFigure(link, estimate) {
   const gripper = link.get("gripper.state");
   const seen = estimate && !link.isOld(estimate) && estimate.content.valid ? estimate.content.diameter_mm : null;
   const held = gripper && !link.isOld(gripper) ? gripper.content.diameter_mm : null;
-  put(byId("diameter"), number(seen, 1, "mm"));
+  put(byId("diameter"), seen == null ? "–" : link.number(estimate, "diameter_mm", 1));
   const { diameter_low_mm: low, diameter_high_mm: high } = estimate?.content ?? {};
   const spread = seen == null || low == null ? "" : `${number(low, 1)} to ${number(high, 1)}`;
-  put(byId("diameter-note"), [spread, held == null ? "" : `gripper ${number(held, 1, "mm")}`].filter(Boolean).join(", "));
+  put(byId("diameter-note"), [spread, held == null ? "" : `gripper ${link.number(gripper, "diameter_mm", 1)}`].filter(Boolean).join(", "));
 }
 
 export class FingertipPanel {
@@ -101,13 +102,14 @@ export class FingertipPanel {
     const said = estimate?.content ?? {};
     put(this.part("score"), number(said.score, 4));
     put(this.part("runner-up"), number(said.runner_up, 4));
-    put(this.part("k"), number(said.k, 3, "cm"));
-    put(this.part("sigma"), number(said.sigma, 3, "cm"));
+    // The bank's model, which the heatmap names, decides between the units of k.
+    put(this.part("k"), number(said.k, 3, heatmap?.k_unit || link.unit("eit.estimate", "k")));
+    put(this.part("sigma"), link.number(estimate, "sigma", 3));
     put(this.part("frame"), said.frame === undefined ? "–" : String(said.frame));
     put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));
     warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : "");
     if (this.drawn.gel !== estimate || !estimate) this.drawGel(estimate);
-    if (this.drawn.map !== heatmap) this.drawMap(heatmap);
+    if (this.drawn.map !== heatmap) this.drawMap(heatmap, link.unit("eit.heatmap", "sigma_high"));
     if (heatmap) this.mapText(heatmap, said);
   }
 
@@ -125,11 +127,11 @@ export class FingertipPanel {
       : "no conductivity is known");
   }
 
-  drawMap(heatmap) {
+  drawMap(heatmap, sigmaUnit) {
     this.drawn.map = heatmap;
     if (!heatmap) return;
     const { scores, k_low: kLow, k_high: kHigh, sigma_low: sigmaLow, sigma_high: sigmaHigh } = heatmap.content;
-    const map = { scores: array(scores), k: [kLow, kHigh], kUnit: heatmap.k_unit, sigma: [sigmaLow, sigmaHigh] };
+    const map = { scores: array(scores), k: [kLow, kHigh], kUnit: heatmap.k_unit, sigma: [sigmaLow, sigmaHigh], sigmaUnit };
     drawMap(this.part("map"), map, heatmap.peaks);
   }
 
@@ -150,10 +152,10 @@ export function shearPanel(link) {
   markAge(byId("shear"), link, message);
   if (!message) return;
   const said = message.content;
-  put(byId("shear-now"), said.valid ? number(said.shear_n, 3, "N", { signed: true }) : "–");
+  put(byId("shear-now"), said.valid ? link.number(message, "shear_n", 3, SIGNED) : "–");
   put(byId("shear-interval"), said.valid ? interval(said.shear_low_n, said.shear_high_n, 3) : "");
-  put(byId("shear-response"), number(said.response, 5, "", { signed: true }));
-  put(byId("shear-gauges"), `${number(said.r1_ohm, 3)} · ${number(said.r2_ohm, 3)} Ω`);
+  put(byId("shear-response"), number(said.response, 5, "", SIGNED));
+  put(byId("shear-gauges"), `${number(said.r1_ohm, 3)} · ${link.number(message, "r2_ohm", 3)}`);
   put(byId("shear-state"), said.deadband ? "within the deadband" : said.direction);
   warn(byId("shear-reason"), said.valid ? "" : `no force: ${said.reason}`);
 }
@@ -167,19 +169,20 @@ export function robotPanel(link) {
   const said = message.content;
   const stops = [said.emergency_stop ? "EMERGENCY STOP" : "", said.protective_stop ? "PROTECTIVE STOP" : "", said.blocked];
   warn(byId("robot-blocked"), stops.filter(Boolean).join(": "));
-  put(byId("wrist"), number(said.wrist_rad, 3, "rad", { signed: true }));
-  put(byId("wrist-speed"), number(said.wrist_speed_rad_per_s, 3, "rad/s", { signed: true }));
-  put(byId("wrist-torque"), number(said.wrist_torque_nm, 3, "N·m", { signed: true }));
+  put(byId("wrist"), link.number(message, "wrist_rad", 3, SIGNED));
+  put(byId("wrist-speed"), link.number(message, "wrist_speed_rad_per_s", 3, SIGNED));
+  put(byId("wrist-torque"), link.number(message, "wrist_torque_nm", 3, SIGNED));
   put(byId("robot-mode"), mode(ROBOT_MODES, said.robot_mode));
   put(byId("safety-mode"), mode(SAFETY_MODES, said.safety_mode));
   put(byId("speed-scaling"), `${number(100 * said.speed_scaling, 0)} %`);
   const tcp = array(said.tcp_pose).values;
   put(byId("tcp"), `${[...tcp.slice(0, 3)].map((m) => number(1000 * m, 0)).join(" · ")} mm`);
   const loop = link.get("loop.state");
-  const sent = loop && !link.isOld(loop) ? loop.content : {};
-  put(byId("speed-sent"), number(sent.speed_sent_rad_per_s, 3, "rad/s", { signed: true }));
+  const current = loop && !link.isOld(loop) ? loop : undefined;
+  const sent = current?.content ?? {};
+  put(byId("speed-sent"), link.number(current, "speed_sent_rad_per_s", 3, SIGNED));
   const clipped = sent.speed_command_rad_per_s !== undefined && Math.abs(sent.speed_command_rad_per_s - sent.speed_sent_rad_per_s) > 0.0005;
-  put(byId("speed-command"), clipped ? `requested ${number(sent.speed_command_rad_per_s, 3, "", { signed: true })}` : "");
+  put(byId("speed-command"), clipped ? `requested ${number(sent.speed_command_rad_per_s, 3, "", SIGNED)}` : "");
 }
 
 export function gripperPanel(link) {
@@ -190,11 +193,11 @@ export function gripperPanel(link) {
   if (!message) return;
   const said = message.content;
   warn(byId("gripper-fault"), said.fault ? `fault ${said.fault}: ${said.fault_text}` : "");
-  put(byId("gripper-width"), number(said.width_mm, 1, "mm"));
+  put(byId("gripper-width"), link.number(message, "width_mm", 1));
   put(byId("gripper-object"), said.object);
   const spread = said.diameter_std_mm == null ? "" : ` ± ${number(said.diameter_std_mm, 1)}`;
-  put(byId("gripper-diameter"), said.diameter_mm == null ? "nothing held" : `${number(said.diameter_mm, 1)}${spread} mm`);
-  put(byId("gripper-current"), number(said.current_ma, 0, "mA"));
+  put(byId("gripper-diameter"), said.diameter_mm == null ? "nothing held" : `${number(said.diameter_mm, 1)}${spread} ${link.unit("gripper.state", "diameter_mm")}`);
+  put(byId("gripper-current"), link.number(message, "current_ma", 0));
 }
 
 // The rig, the computer that it runs on, and the page's title with the state.
@@ -212,13 +215,14 @@ export function headPanel(link) {
 const isStopped = (link) => link.get("loop.state")?.content.phase === "stopped";
 
 function stateWord(link) {
-  const loop = link.get("loop.state")?.content;
+  const state = link.get("loop.state");
+  const loop = state?.content;
   const lost = { ended: "ENDED", dead: "NO DAEMON", lost: "NO VIEWER", connecting: "connecting" }[link.state()];
   if (lost) return lost;
   if (!loop) return "no robot";
   const word = { stopped: "STOPPED", held: "HOLD" }[loop.phase] ?? loop.phase;
   const holds = loop.phase === "running" && loop.set_point_nm != null;
-  return holds ? `holding ${number(loop.ramp_nm ?? loop.set_point_nm, 2, "N·m", { signed: true })}` : word;
+  return holds ? `holding ${link.number(state, loop.ramp_nm == null ? "set_point_nm" : "ramp_nm", 2, SIGNED)}` : word;
 }
 
 export function healthPanel(link, drawn) {
@@ -238,7 +242,7 @@ export function healthPanel(link, drawn) {
   put(byId("tasks-line"), said ? trouble || `✓ all ${tasks.length} are well` : "–");
   put(byId("trouble"), trouble);
   show(byId("trouble"), trouble !== "");
-  put(byId("process"), said ? `${number(said.memory_mb, 0, "MB")}, ${number(said.cpu_percent, 1, "%")} of a core, event loop ${number(1000 * said.loop_lag_s, 1, "ms")} late` : "");
+  put(byId("process"), said ? `${link.number(message, "memory_mb", 0)}, ${link.number(message, "cpu_percent", 1)} of a core, event loop ${number(1000 * said.loop_lag_s, 1, "ms")} late` : "");
 }
 
 function newChip() {
@@ -290,12 +294,12 @@ export function loopPanel(link) {
   const reasons = current?.reasons ?? "";
   // The reason for the stop is listed below, with its cure.
   const stopped = current?.phase === "stopped";
-  const texts = [stopped && reasons ? "" : current?.activity, stopped && stopTimes(link.get("loop.stop")?.content, current)];
+  const texts = [stopped && reasons ? "" : current?.activity, stopped && stopTimes(link, current)];
   put(byId("phase-activity"), texts.filter(Boolean).join(" "));
   const underWay = Boolean(current?.steps) && (ACTIVE.has(current.phase) || current.phase === "done");
   const share = underWay ? current.progress : 0;
   if (byId("progress").value !== share) byId("progress").value = share;
-  const left = current?.phase === "done" ? "" : `, about ${Math.round(current?.remaining_s)} s left`;
+  const left = current?.phase === "done" ? "" : `, about ${link.number(message, "remaining_s", 0)} left`;
   put(byId("progress-text"), underWay ? `${Math.round(100 * share)} %${left}` : "");
   show(byId("holding"), reasons !== "");
   if (reasons === "") return;
@@ -313,10 +317,11 @@ export function loopPanel(link) {
 }
 
 // The times of the stop of this experiment, from its cause.
-function stopTimes(stop, current) {
-  if (stop?.experiment !== current.experiment) return "";
-  const seconds = (value) => (value === null ? "unknown" : `${value.toFixed(3)} s`);
-  return `After its cause: decided ${seconds(stop.decided_after_s)}, confirmed by the robot's process ${seconds(stop.sent_after_s)}, arm at rest ${seconds(stop.stands_after_s)}.`;
+function stopTimes(link, current) {
+  const stop = link.get("loop.stop");
+  if (stop?.content.experiment !== current.experiment) return "";
+  const after = (key) => (stop.content[key] === null ? "unknown" : link.number(stop, key, 3));
+  return `After its cause: decided ${after("decided_after_s")}, confirmed by the robot's process ${after("sent_after_s")}, arm at rest ${after("stands_after_s")}.`;
 }
 
 // The cause with its cure, then all other reasons: `reasons` begins with the cause.

@@ -137,7 +137,7 @@ function levels(pen, conductivity, high, x0, w, yOf) {
 export function drawMap(canvas, map, peaks) {
   const { pen, width, height } = fitted(canvas);
   const [x0, y0, w, h] = [44, 8, width - 44 - 52, height - 8 - 38];
-  const { scores, k, kUnit, sigma } = map;
+  const { scores, k, kUnit, sigma, sigmaUnit } = map;
   const [rows, columns] = scores.shape;
   let [low, high] = [Infinity, -Infinity];
   for (const value of scores.values) {
@@ -156,7 +156,7 @@ export function drawMap(canvas, map, peaks) {
   if (kUnit) label(pen, kUnit, x0 - 5, y0 + h / 2 + 14, "right");
   label(pen, sigma[0].toFixed(1), x0, y0 + h + 10);
   label(pen, sigma[1].toFixed(1), x0 + w, y0 + h + 10, "right");
-  label(pen, "σ, cm", x0 + w / 2, y0 + h + 27, "center");
+  label(pen, `σ, ${sigmaUnit}`, x0 + w / 2, y0 + h + 27, "center");
   if (high >= low) scaleBar(pen, x0 + w + 8, y0, h, low, high, 2);
   if (!peaks) return;
   const at = ([row, column]) => [x0 + ((column + 0.5) / columns) * w, y0 + h - ((row + 0.5) / rows) * h];

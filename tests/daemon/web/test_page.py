@@ -1,9 +1,12 @@
 """The page in a browser: what it shows is what was said."""
 
 import itertools
+import re
 
 import pytest
+from playwright.sync_api import Route
 
+from shearloop.daemon.messaging.messages import TOPICS, units
 from shearloop.daemon.web.message_store import conductivity_profile
 from tests.daemon.web.fake_daemon import CAUSE, MESSAGES, REASONS
 
@@ -111,6 +114,34 @@ def test_the_page_shows_the_messages_numbers(browsed):
     values = conductivity_profile("gaussian_derivative", estimate["k"], estimate["sigma"], 3.6)
     spread = f"conductivity over the height, from {min(values):.2f} to {max(values):.2f} of the untouched gel's"
     browsed.page.wait_for_function("text => document.querySelector('.gel').ariaLabel === text", arg=spread)
+
+
+def test_each_unit_is_that_of_the_messages_key(browsed):
+    def mark(route: Route) -> None:
+        settings = route.fetch().json()
+        assert settings["units"] == {topic: dict(units(topic)) for topic in TOPICS}
+        marked = {topic: {key: f"{unit}*" for key, unit in known.items()} for topic, known in settings["units"].items()}
+        route.fulfill(json={**settings, "units": marked})
+
+    browsed.page.route("**/settings.json", mark)
+    stopped = {"phase": "stopped", "response": "stop and keep grip", "reasons": REASONS}
+    try:
+        browsed.open()
+        browsed.until_shown({"#progress-text": "62 %, about 38 s* left", ".fingertip .k": "3.514 cm"})
+        browsed.until("#process", "142 MB*, 6.0 %* of a core")
+        browsed.until_shown({"#torque-legend > :last-child": "limit ±0.25 N·m*"})
+        shown = browsed.page.locator("output, small, dd").all_text_contents()
+        browsed.daemon.say(loop=stopped)
+        browsed.until("#phase-activity", "decided 0.004 s*, confirmed by the robot's process 0.006 s*")
+    finally:
+        browsed.page.unroute("**/settings.json")
+    bare = [text for text in shown if re.search(r"\d (N·m|N|rad|rad/s|mm|cm|Ω|mA)(?!\S)", text)]
+    # Metres are shown as millimetres, and the unit of k is that of the heatmap's model.
+    assert set(bare) == {"\u2212492 · \u2212133 · 488 mm", "3.514 cm"}
+    browsed.daemon.say(heatmap={"model": "modulated_gaussian"})
+    browsed.open()
+    browsed.until_shown({".fingertip .k": "3.514 rad/cm"})
+    browsed.daemon.say(heatmap=None)
 
 
 def test_the_heatmap_has_k_upwards_and_sigma_to_the_right_and_shades_rise_evenly(browsed):

@@ -112,7 +112,7 @@ def test_what_the_robot_slows_down_is_said(tmp_path, ran):
 
 
 def test_an_option_for_experiments_is_refused_for_a_configuration(tmp_path, mistake):
-    assert "--config names a configuration for an experiment" in mistake("check", rig(tmp_path), "--config", "a.yaml")
+    assert "--config goes with an experiment" in mistake("check", rig(tmp_path), "--config", "a.yaml")
 
 
 SKIN = yaml.safe_load((ROOT / "config" / "skin_demo.yaml").read_text(encoding="utf-8"))["skin"]

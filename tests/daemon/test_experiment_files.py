@@ -124,19 +124,32 @@ async def test_the_event_loop_goes_on_while_a_large_file_is_read(folder):
     assert beats > 10
 
 
+class SlowDrive:
+    """A drive that is asked for a file and does not answer until it is told to."""
+
+    def __init__(self) -> None:
+        self.asked, self.answers = threading.Event(), threading.Event()
+        self._read = experiment_files.read_file
+
+    def read_file(self, path: Path, most_bytes: int) -> bytes:
+        self.asked.set()
+        self.answers.wait()
+        return self._read(path, most_bytes)
+
+
 @pytest.fixture
 def slow_drive(monkeypatch):
-    """Lets no file be read until the event is set."""
-    answers = threading.Event()
-    read = experiment_files.read_file
+    drive = SlowDrive()
+    monkeypatch.setattr(experiment_files, "read_file", drive.read_file)
+    yield drive
+    drive.answers.set()
 
-    def wait(path: Path, most_bytes: int) -> bytes:
-        answers.wait()
-        return read(path, most_bytes)
 
-    monkeypatch.setattr(experiment_files, "read_file", wait)
-    yield answers
-    answers.set()
+async def end_of_reading() -> None:
+    """Wait until no thread reads an experiment."""
+    for thread in threading.enumerate():
+        if thread.name == "experiment":
+            await asyncio.to_thread(thread.join)
 
 
 async def test_a_drive_that_does_not_answer_ends_the_start_and_keeps_one_thread(folder, slow_drive, monkeypatch):
@@ -147,15 +160,11 @@ async def test_a_drive_that_does_not_answer_ends_the_start_and_keeps_one_thread(
     for _ in range(16):
         with pytest.raises(UserError, match="the file of another start is being read"):
             await files.read(path)
-    slow_drive.set()
-    async with deadline("the next start was not read"):
-        while True:
-            try:
-                assert (await files.read(path)).file.name == "one"
-            except UserError:
-                await asyncio.sleep(0.01)
-            else:
-                break
+    slow_drive.answers.set()
+    async with deadline("the first reading did not end"):
+        await end_of_reading()
+    monkeypatch.undo()
+    assert (await files.read(path)).file.name == "one"
 
 
 class Runner:
@@ -186,9 +195,9 @@ async def test_no_file_is_read_while_none_can_start(folder, monkeypatch):
 async def test_a_stop_while_the_file_is_read_counts_for_the_start(folder, slow_drive):
     runner = Runner()
     starting = asyncio.create_task(rig(folder, runner).start(write(folder / "one.yaml", VALID)))
-    await asyncio.sleep(0)
+    await asyncio.to_thread(slow_drive.asked.wait)
     runner.stop_count += 1
-    slow_drive.set()
+    slow_drive.answers.set()
     await starting
     assert runner.started == [("one", 0)]
 

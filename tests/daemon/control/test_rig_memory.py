@@ -109,11 +109,23 @@ async def test_nothing_starts_where_a_stop_could_not_be_remembered(tmp_path):
     assert json.loads(memory.path.read_text())["running"] == "test"
 
 
-async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it(tmp_path):
+async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it(tmp_path, monkeypatch):
     memory = RigMemory(tmp_path / "robot.json", new_loop())
     assert await memory.begins("test") is None
+    saved: list[Remembered] = []
+    twice = asyncio.Event()
+    save = memory.save
+
+    async def note(state: Remembered) -> None:
+        await save(state)
+        saved.append(state)
+        if len(saved) == 2:
+            twice.set()
+
+    monkeypatch.setattr(RigMemory, "save", lambda _, state: note(state))
+    monkeypatch.setattr("shearloop.daemon.rig_memory.FOLLOWS_S", 0.0)
     following = asyncio.create_task(memory.run())
-    await asyncio.sleep(0)
+    await twice.wait()
     following.cancel()
     await asyncio.gather(following, return_exceptions=True)
     assert read_memory(memory.path).running == "test"

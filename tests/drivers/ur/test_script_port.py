@@ -46,17 +46,22 @@ async def test_program_is_sent_again_over_a_connection_of_its_own():
     port.close()
 
 
-async def test_client_that_does_not_read_is_not_heard():
+async def test_client_that_does_not_read_is_not_heard(monkeypatch):
     """As on a real controller: a second program over ur-rtde's connection never arrives."""
+    buffers_are_full = asyncio.Event()
+    drain = asyncio.StreamWriter.drain
+
+    async def note(writer: asyncio.StreamWriter) -> None:
+        if writer.transport.get_write_buffer_size():
+            buffers_are_full.set()
+        await drain(writer)
+
+    monkeypatch.setattr(asyncio.StreamWriter, "drain", note)
     async with serving() as robot:
         unread = socket.create_connection((HOST, SCRIPT_PORT))
         unread.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        # Until both buffers are full.
-        filled = -1
         async with asyncio.timeout(10):
-            while (waiting := len(await asyncio.to_thread(unread.recv, 1 << 20, socket.MSG_PEEK))) > filled:
-                filled = waiting
-                await asyncio.sleep(0.2)
+            await buffers_are_full.wait()
         unread.sendall(PROGRAM.encode())
         port = ScriptPort(HOST, 1.0)
         await send(port, robot)

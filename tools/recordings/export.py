@@ -14,8 +14,8 @@ from scipy.io import savemat
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
-from shearloop.tools.recordings.columns import columns
 from shearloop.tools.recordings.intact_records import Progress
+from shearloop.tools.recordings.message_content import columns
 from shearloop.tools.recordings.reader import read_messages
 from shearloop.tools.recordings.tables import Rows, arrays, columns_of, read_rows, row_of
 

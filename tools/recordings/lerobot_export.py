@@ -26,8 +26,8 @@ from shearloop.daemon.messaging.messages import (
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
-from shearloop.tools.recordings.columns import ContentError, check_length
 from shearloop.tools.recordings.intact_records import Progress
+from shearloop.tools.recordings.message_content import ContentError, check_length
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
 
 ROWS_PER_S = 25

@@ -32,7 +32,6 @@ from shearloop.drivers.serial_sensor import InputKind
 from shearloop.errors import UserError
 from shearloop.estimation import Measured
 from shearloop.files import open_file, replace_file
-from shearloop.tools.recordings.columns import ContentError, OtherKeysError, check_time, read_content
 from shearloop.tools.recordings.intact_records import (
     LARGEST_RECORD_BYTES,
     IntactRecords,
@@ -40,6 +39,7 @@ from shearloop.tools.recordings.intact_records import (
     check_magic,
     check_size,
 )
+from shearloop.tools.recordings.message_content import ContentError, OtherKeysError, check_time, read_content
 from shearloop.tools.recordings.monotonic_times import Messages, MonotonicTimes, has_one_offset, in_monotonic_order
 
 _NOTHING_INTACT = "it holds no intact message, so nothing can be saved"

@@ -41,7 +41,7 @@ from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
-from shearloop.tools.recordings.columns import ContentError
+from shearloop.tools.recordings.message_content import ContentError
 from shearloop.tools.recordings.reader import open_recording, reading
 from shearloop.yaml_files import validated
 

@@ -21,9 +21,9 @@ from shearloop.daemon.messaging.messages import EitFrame, GripperStateMessage, L
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError
 from shearloop.files import replace_file
-from shearloop.tools.recordings.columns import ContentError, check_length
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.matlab_import import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
+from shearloop.tools.recordings.message_content import ContentError, check_length
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.

@@ -25,7 +25,7 @@ from shearloop.daemon.recorder.schema import (
     schemas,
 )
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
-from shearloop.tools.recordings.columns import read_content
+from shearloop.tools.recordings.message_content import read_content
 from tests.sample_messages import sample
 
 PLAIN = {"boolean", "string", "number", "integer"}

@@ -25,8 +25,8 @@ from shearloop.daemon.recorder.schema import message_json, recorded_topic
 from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import EstimatorSession, Measured
-from shearloop.tools.recordings.columns import read_content
 from shearloop.tools.recordings.matlab_import import import_mat
+from shearloop.tools.recordings.message_content import read_content
 from shearloop.tools.recordings.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
 from tests.fixtures.daemons import ask, emulated_kit, running_daemon
 from tests.sample_messages import sample

@@ -8,7 +8,7 @@ import pytest
 
 from shearloop.daemon.messaging.messages import TOPICS, wire_map
 from shearloop.daemon.recorder import schema
-from shearloop.tools.recordings.columns import ContentError, columns, read_content
+from shearloop.tools.recordings.message_content import ContentError, columns, read_content
 from tests.sample_messages import sample
 from tests.tools.recordings.every_message import made
 from tests.tools.recordings.test_damage import recorded

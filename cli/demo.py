@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import socket
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,10 +14,12 @@ from urllib.parse import urlsplit
 from shearloop.cli import bank, init
 from shearloop.cli import run as run_command
 from shearloop.cli.emulator_processes import SHEARLOOP, running
+from shearloop.cli.free_ports import is_free
 from shearloop.cli.options import PORT, add_option, path_of
 from shearloop.cli.view import PAGE_PORT
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.process import interrupt_status
+from shearloop.drivers.defaults import RTDE_PORT
 from shearloop.errors import UserError, missing
 from shearloop.tools.outputs import writing
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
 
 HOST = "127.0.0.1"
-# Of a robot's controller.
-RTDE_PORT = 30004
 # A daemon on a busy computer answers within it.
 STATUS_S = 2.0
 
@@ -68,8 +67,8 @@ def run(args: argparse.Namespace) -> int:
     # Mistakes, and another daemon, are found before anything is built and served.
     settings = open_settings(config)
     check_ports(config, settings.host if settings is not None else None)
-    port = args.port if args.port is not None else PAGE_PORT if _is_free(HOST, PAGE_PORT) else 0
-    if port and not _is_free(HOST, port):
+    port = args.port if args.port is not None else PAGE_PORT if is_free(HOST, PAGE_PORT) else 0
+    if port and not is_free(HOST, port):
         raise UserError(f"the page cannot be served on {HOST}:{port}, which is taken; give another --port")
     if args.play is None and not config.autostart:
         raise UserError(
@@ -97,7 +96,7 @@ def check_ports(config: "DaemonConfig", robot: str | None) -> None:
         reply = send_to_stop_socket(config.commands, {"command": "status"}, STATUS_S)
     if reply is not None:
         running = reply.get("daemon", {})
-        shown = "" if _is_free(HOST, PAGE_PORT) else f", its page is http://{HOST}:{PAGE_PORT}/"
+        shown = "" if is_free(HOST, PAGE_PORT) else f", its page is http://{HOST}:{PAGE_PORT}/"
         raise UserError(
             f"a daemon runs already at {config.commands}: process {running.get('process')} ({running.get('rig')}) in "
             f"{running.get('folder')}{shown}; `shearloop command stop --connect {config.commands}` stops its "
@@ -107,18 +106,8 @@ def check_ports(config: "DaemonConfig", robot: str | None) -> None:
     places = [(str(one.hostname), one.port) for one in ours if one.port]
     places += [(robot, RTDE_PORT)] if robot is not None and config.emulators else []
     for host, port in places:
-        if not _is_free(host, port):
+        if not is_free(host, port):
             raise UserError(f"{host}:{port} is taken by another program; `ss -ltnp` names it: end it first")
-
-
-def _is_free(host: str, port: int) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError:
-            return False
-    return True
 
 
 def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:

@@ -34,6 +34,7 @@ def running(command: Sequence[str], **options: Any) -> "Iterator[subprocess.Pope
     It ends with this process, also if that is killed.
     """
     end = partial(end_with_parent, os.getpid())
+    # What runs before the command asks the kernel alone, so that it waits for no thread.
     with subprocess.Popen(command, process_group=0, bufsize=0, preexec_fn=end, **options) as process:  # noqa: PLW1509
         try:
             yield process

@@ -1,13 +1,14 @@
 """A rehearsal: a configuration of real devices, with an emulated one in the place of each."""
 
 import contextlib
-import socket
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from shearloop.cli.free_ports import free_port, is_free
+from shearloop.drivers.defaults import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, URCAP_PORT
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 LOOPBACKS = tuple(f"127.0.0.{number}" for number in range(1, 255))
 # Control cycles per second: twice the states that the daemon asks for, and gentle to this computer.
 EMULATED_RATE_HZ = "250"
-ROBOT_PORTS = (29999, 30003, 30004)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +135,6 @@ class _Stage:
         return [*calibration, "--load-rate-hz", str(cell.rate_hz)]
 
     def _gripper(self) -> list[str]:
-        from shearloop.drivers.defaults import URCAP_PORT
-
         gripper = self._config.gripper
         if gripper is None:
             self._sentences.append("no gripper is configured: the tool is clamped to the wrist")
@@ -174,7 +172,7 @@ class _Stage:
     def _instrument(self, section: dict[str, Any], name: str, by_socket: str, by_serial: str) -> list[str]:
         """Replace the address of an instrument, and return the emulator's arguments for the new one."""
         if by_socket and section.get(by_socket) is not None:
-            was, port = section[by_socket], _free_port()
+            was, port = section[by_socket], free_port(LOOPBACKS[0])
             self._sentences.append(
                 f"the skin's {name} at {was['host']}:{was['port']} is played at {LOOPBACKS[0]}:{port}"
             )
@@ -235,20 +233,7 @@ def _bank(name: str, fingertip: "FingertipConfig", path: Path) -> str:
 
 def _free_loopback() -> str:
     """Return an address of this computer with free ports for robot and gripper."""
-    from shearloop.drivers.defaults import URCAP_PORT
-
     for host in LOOPBACKS:
-        with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
-            for port in (*ROBOT_PORTS, URCAP_PORT):
-                bound = stack.enter_context(socket.socket())
-                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                bound.bind((host, port))
+        if all(is_free(host, port) for port in (RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT, URCAP_PORT)):
             return host
     raise UserError("every loopback address plays a robot already: end one of the other rigs")
-
-
-def _free_port() -> int:
-    with socket.socket() as bound:
-        bound.bind((LOOPBACKS[0], 0))
-        port: int = bound.getsockname()[1]
-    return port

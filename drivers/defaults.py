@@ -4,6 +4,8 @@
 FRAME_PERIOD_S = 0.5408
 # The load cell, measured on the paper's rig (4882 lines in 447 s); the HX711's data sheet says 10 samples a second.
 LOAD_CELL_RATE_HZ = 10.9
+# A UR controller's services: RTDE, the Real-Time Client, which takes programs, and the Dashboard Server.
+RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # The gripper behind the URCap.
 URCAP_PORT = 63352
 # The shear skin's current source. Twice two gauges of 25 Ω and their leads need 1 V; harmless for people and gauges.

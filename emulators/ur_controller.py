@@ -9,13 +9,13 @@ from collections.abc import AsyncIterator, Collection
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import replace
 
+from shearloop.drivers.defaults import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 from shearloop.emulators import number_between
 from shearloop.emulators.ports import Connections, connected
 from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
 from shearloop.emulators.ur_rtde import RtdeSession
 from shearloop.emulators.urscript import translate
 
-RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # A control script closes its outermost block in the first column.
 SCRIPT_END = b"\nend\n"
 # A controller is never late. When this process was, the robot's time stands still, so that no watchdog expires on

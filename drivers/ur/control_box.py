@@ -15,12 +15,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final
 
+from shearloop.drivers.defaults import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs
 from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, STEP_REGISTER
 from shearloop.drivers.ur.settings import GENERATIONS, UrSettings
 
-RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # The services behind the ports, as PolyScope's menu names them.
 SERVICES: Final = {RTDE_PORT: "RTDE", SCRIPT_PORT: "Real-Time Client", DASHBOARD_PORT: "Dashboard Server"}
 # From this version on an e-Series opens only the enabled interfaces.

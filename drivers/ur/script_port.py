@@ -9,8 +9,8 @@ import socket
 import time
 from typing import Final
 
+from shearloop.drivers.defaults import SCRIPT_PORT
 from shearloop.drivers.errors import system_reason
-from shearloop.drivers.ur.control_box import SCRIPT_PORT
 from shearloop.drivers.ur.messages import RobotLostError
 
 # Some seconds of states.

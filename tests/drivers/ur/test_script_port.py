@@ -7,9 +7,10 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
+from shearloop.drivers.defaults import SCRIPT_PORT
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.script_port import ScriptPort
-from shearloop.emulators.ur_controller import SCRIPT_PORT, Controller
+from shearloop.emulators.ur_controller import Controller
 from shearloop.emulators.ur_robot import Robot
 from tests.emulator_process import own_address
 

@@ -45,8 +45,11 @@ def write_gif(taken: list[bytes], path: Path) -> None:
     """Write the pictures as a small animation of sixty seconds."""
     size = (GIF_WIDTH_PX, GIF_WIDTH_PX * HEIGHT_PX // WIDTH_PX)
     images = [Image.open(io.BytesIO(one)).convert("RGB").resize(size, Image.Resampling.LANCZOS) for one in taken]
-    # One palette, without dithering: what stands still costs nothing.
-    palette = images[int(HOLD * len(images))].quantize(COLOURS)
+    # One palette, of the hold and of the end, without dithering: an unchanged pixel costs nothing.
+    both = Image.new("RGB", (size[0], 2 * size[1]))
+    both.paste(images[int(HOLD * len(images))])
+    both.paste(images[-1], (0, size[1]))
+    palette = both.quantize(COLOURS)
     frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     duration_ms = int(OVERVIEW_S * 1000 / len(frames))
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration_ms, loop=0, optimize=True)

@@ -112,7 +112,7 @@ export class Controls {
     if (name && !this.reasons[name]) this.command(name, true, this.picked);
   }
 
-  // The experiment of a question is that of its confirmation, whatever is picked meanwhile.
+  // The confirmation starts the experiment of the question, even if another one is picked meanwhile.
   async command(name, confirmed = false, picked = byId("experiment").value) {
     this.ask_about("");
     this.picked = picked;

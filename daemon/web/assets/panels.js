@@ -287,7 +287,7 @@ export function eventsPanel(link, drawn) {
 // The loop's phase, and every reason for a hold.
 export function loopPanel(link) {
   const message = link.get("loop.state");
-  // The last state of a daemon that has ended stands struck out.
+  // The last state of an ended daemon is struck out.
   const current = message && (!link.isOld(message) || link.end()) ? message.content : undefined;
   const step = current?.steps ? `, step ${current.step} of ${current.steps}` : "";
   put(byId("phase-name"), current ? `${current.phase}${current.experiment ? `: ${current.experiment}` : ""}${step}` : "–");

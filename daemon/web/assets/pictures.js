@@ -151,7 +151,7 @@ export function drawMap(canvas, map, peaks) {
   pen.strokeRect(x0, y0, w, h);
   label(pen, k[1].toFixed(1), x0 - 5, y0 + 6, "right");
   label(pen, k[0].toFixed(1), x0 - 5, y0 + h - 6, "right");
-  // The unit of k is that of the bank's model.
+  // The bank's model gives the unit of k.
   label(pen, "k", x0 - 5, y0 + h / 2, "right");
   if (kUnit) label(pen, kUnit, x0 - 5, y0 + h / 2 + 14, "right");
   label(pen, sigma[0].toFixed(1), x0, y0 + h + 10);

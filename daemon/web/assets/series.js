@@ -68,7 +68,7 @@ export class Series {
   }
 }
 
-// uPlot leaves out what lies between a null and the rows beside it, and those may be of other sources: the null is drawn
+// uPlot leaves out what lies between a null and the neighbouring rows, and those may be of other sources: the null is drawn
 // out to this source's own neighbours.
 function broken(column) {
   const rows = column.slice();

@@ -12,7 +12,7 @@ export function show(element, shown) {
   if (element.hidden === shown) element.hidden = !shown;
 }
 
-// What is normal between a tare and the first torque of a grip, not a fault.
+// Reasons that are normal between a tare and the first torque of a grip, not faults.
 const WAITING = /^(no \w+: |not valid: )?(no grip|gripped too recently|taking the idle frame|there is no earlier frame)/;
 
 export function warn(element, sentence) {

@@ -240,7 +240,7 @@ def build_sensors(
         own, tareable[name] = config.fingertips[name], (estimates := pipeline(name, estimator))
         board = EitKit(link(name, own.device), estimator.table.zero_slots, own.frame_period_s, inputs(name))
         states.add(board, estimates)
-        tasks[name] = FingertipTask(board, estimates, publisher, pairs, own.heatmap == "always", states)
+        tasks[name] = FingertipTask(board, estimates, publisher, states, pairs, own.heatmap == "always")
     if pairs is not None:
         tareable[COMBINED] = pairs.pipeline
     if config.skin is not None:

@@ -169,7 +169,7 @@ def _facts(reporter: Reporter) -> TaskFacts:
         return reporter.diagnostics()
     except Exception as error:  # noqa: BLE001 - the service stays alive
         structlog.get_logger().exception("a part of the daemon could not report its state")
-        return {"error": f"its state is unknown: {type(error).__name__}: {error}"[:MAX_ERROR_LENGTH]}
+        return {"error": f"its state is unknown: {error_text(error)}"}
 
 
 def resident_memory_mb() -> float:

@@ -324,16 +324,16 @@ class FingertipTask:
     board: EitKit
     pipeline: FingertipPipeline
     publisher: Publisher
+    states: FingertipStates
     combined: CombinedFingertips | None = None
     always_heatmap: bool = False
-    states: FingertipStates | None = None
     dead_electrodes: DeadElectrodes = field(default_factory=DeadElectrodes)
 
     async def run(self) -> None:
         """Process every frame until cancelled."""
         async with contextlib.aclosing(self.board.batches()) as batches:
             async for frames in batches:
-                with self.states.processing() if self.states is not None else contextlib.nullcontext():
+                with self.states.processing():
                     if self.combined is not None:
                         self.combined.add(self.pipeline.name, frames)
                     for frame in frames:

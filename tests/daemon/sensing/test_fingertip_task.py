@@ -14,7 +14,13 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.sensing.fingertip_task import CombinedFingertips, DeadElectrodes, FingertipPipeline, FingertipTask
+from shearloop.daemon.sensing.fingertip_task import (
+    CombinedFingertips,
+    DeadElectrodes,
+    FingertipPipeline,
+    FingertipStates,
+    FingertipTask,
+)
 from shearloop.daemon.sensing.frame_estimator import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import Frame
@@ -124,7 +130,7 @@ def fingertip(
     in_one_read: int = 1,
 ) -> FingertipTask:
     own = estimates("right", publisher, estimator)
-    return FingertipTask(Board(in_one_read), own, publisher, combined)
+    return FingertipTask(Board(in_one_read), own, publisher, FingertipStates(Clock(), combined), combined)
 
 
 async def test_each_frame_is_estimated_and_then_published_in_order():

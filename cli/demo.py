@@ -67,7 +67,9 @@ def run(args: argparse.Namespace) -> int:
     # Mistakes, and another daemon, are found before anything is built and served.
     settings = open_settings(config)
     check_ports(config, settings.host if settings is not None else None)
-    port = args.port if args.port is not None else PAGE_PORT if is_free(HOST, PAGE_PORT) else 0
+    port = args.port
+    if port is None:
+        port = PAGE_PORT if is_free(HOST, PAGE_PORT) else 0
     if port and not is_free(HOST, port):
         raise UserError(f"the page cannot be served on {HOST}:{port}, which is taken; give another --port")
     if args.play is None and not config.autostart:

@@ -388,8 +388,12 @@ def fit_interval_regressor(
     point, truth = fit(features, values, strength), values[rows]
     residuals = reported - truth
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
-    inflation = 1.0 if isinstance(point, CurveMean) else _INFLATION
-    inflation = student_inflation(len(np.unique(rows))) if left_out else inflation
+    if left_out:
+        inflation = student_inflation(len(np.unique(rows)))
+    elif isinstance(point, CurveMean):
+        inflation = 1.0
+    else:
+        inflation = _INFLATION
     of_loads = _inflation_of_twists(values, twists) if twists else None
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
@@ -431,7 +435,8 @@ def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: I
         if len(kept) and np.ptp(values[kept]) > 0 and np.abs(values[out]).max() > least:
             part = refit(kept)
             gain = loaded_log_gain(reported_values(part, part.predict(features[out])), values[out])
-            gains += [] if gain is None else [gain]
+            if gain is not None:
+                gains.append(gain)
     return gains
 
 

@@ -253,13 +253,17 @@ def later_levels(values: FloatArray) -> list[tuple[IntArray, IntArray]]:
     Where too few other values remain, the level stays.
     """
     near = NEAR_LEVEL * float(np.ptp(values))
-    parts: dict[tuple[int, bytes], tuple[IntArray, list[int]]] = {}
+    found: list[tuple[IntArray, IntArray]] = []
     for earlier, later in later_origins(len(values)):
+        # Later rows with the same earlier ones are one part.
+        parts: dict[bytes, tuple[IntArray, list[int]]] = {}
         for row in later.tolist():
             rest = earlier[np.abs(values[earlier] - values[row]) > near]
             kept = rest if len(rest) >= LEAST_BEFORE_ORIGIN else earlier
-            parts.setdefault((len(earlier), kept.tobytes()), (kept, []))[1].append(row)
-    return [(kept, np.array(rows)) for kept, rows in parts.values()]
+            _, rows = parts.setdefault(kept.tobytes(), (kept, []))
+            rows.append(row)
+        found += [(kept, np.array(rows)) for kept, rows in parts.values()]
+    return found
 
 
 def later_splits(n: int) -> Iterator[tuple[IntArray, IntArray]]:

@@ -202,7 +202,11 @@ class EstimatorSession:
         after = adapted.outputs["torque"]
         grip.corrected = _Corrected(after, self._tool)
         rows = np.concatenate(find_twists(truth))
-        return Adaptation(correction, *(LoadedFit.of(one, features[rows], truth[rows]) for one in (before, after)))
+        return Adaptation(
+            correction,
+            LoadedFit.of(before, features[rows], truth[rows]),
+            LoadedFit.of(after, features[rows], truth[rows]),
+        )
 
     def estimate(self, frame: TactileFrame) -> Estimate:
         """Return the estimate of a frame of the calibration's sides.

@@ -147,13 +147,12 @@ def fit_without(recipe: Recipe, recordings: Sequence[FrameSeries], block: Block)
 def find_blocks(kind: Kind, recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
     """Return the blocks of a kind; raises UserError for recordings that have fewer than two."""
     is_raw = all(one.kind == "raw" for one in recordings)
-    if is_raw is (kind == "levels"):
-        other = "twists of a recording have no levels; leave out grips, twists or tools" if is_raw else (
-            f"slices show no {kind}; use --leave-out levels"
-        )  # fmt: skip
-        raise UserError(other)
     if kind == "levels":
+        if is_raw:
+            raise UserError("twists of a recording have no levels; leave out grips, twists or tools")
         return _levels(recordings)
+    if not is_raw:
+        raise UserError(f"slices show no {kind}; use --leave-out levels")
     if kind == "twists":
         return _twists(recordings, names)
     return _grips(recordings, names) if kind == "grips" else _tools(recordings, names)
@@ -222,8 +221,10 @@ def _twists(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Blo
         edges = [grip.start, *middles, grip.stop]
         for nth, (first, stop) in enumerate(itertools.pairwise(edges), 1):
             fitted = [np.ones(len(one.t_s), dtype=np.bool_) for one in recordings]
-            fitted[number][first:stop] = len(twists) == 1
-            fitted[number] &= len(twists) > 1
+            if len(twists) > 1:
+                fitted[number][first:stop] = False
+            else:
+                fitted[number][:] = False
             blocks.append(Block(f"twist {nth} of {name}", tuple(fitted), (Span(number, first, stop),)))
     if len(blocks) < 2:
         raise UserError("there is one twist, which leaves nothing to fit; record ten")
@@ -299,13 +300,11 @@ def _advice(kind: Kind, recordings: Sequence[FrameSeries], tracks: Sequence[Sequ
     if ratio >= 1.0:
         return "The sensor adds nothing to a stopwatch: use both fingertips, or twists that differ."
     if kind != "levels" and len(recordings) < _ENOUGH_GRIPS:
-        return f"{_COUNTS[len(recordings)]} only: record three, because the gain changes from grip to grip."
+        grips = "One grip" if len(recordings) == 1 else "Two grips"
+        return f"{grips} only: record three, because the gain changes from grip to grip."
     if coverage is not None and coverage < _LEAST_COVERAGE:
         return f"The intervals hold too few truths: record more {kind}."
     return "Nothing stands out: judge it on a recording of another day."
-
-
-_COUNTS = {1: "One grip", 2: "Two grips"}
 
 
 def sentences_of(result: LeftOut, loaded_nm: float = LOADED_NM) -> list[str]:

@@ -132,8 +132,10 @@ def _stable_name(device: str, serial_number: str | None) -> str:
 
     Two boards without a serial number can have the same name by identity; by socket they differ.
     """
-    folders = [UDEV_LINKS["by-id"], UDEV_LINKS["by-path"]][0 if serial_number else 1 :]
-    links = [link for folder in (OWN_LINKS, *folders) if folder.is_dir() for link in sorted(folder.iterdir())]
+    folders = [OWN_LINKS, UDEV_LINKS["by-path"]]
+    if serial_number:
+        folders.insert(1, UDEV_LINKS["by-id"])
+    links = [link for folder in folders if folder.is_dir() for link in sorted(folder.iterdir())]
     for link in (OWN_LINKS / (serial_number or "-"), *links):
         if link.exists() and os.path.realpath(link) == os.path.realpath(device):
             return str(link)

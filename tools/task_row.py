@@ -12,8 +12,12 @@ LINK_ERRORS = ("unreachable", "silent", "lost")
 def task_row(name: str, facts: Mapping[str, Any]) -> tuple[str, str, str, str]:
     """Return the name of a task of `health`, its state, its rate, and its notes: restarts, errors, the latest error."""
     down = facts.get("connected") is False
-    state = "DEAD" if facts.get("alive") is False else "not connected" if down else "alive"
-    state = "done" if facts.get("done") else state
+    if facts.get("done"):
+        state = "done"
+    elif facts.get("alive") is False:
+        state = "DEAD"
+    else:
+        state = "not connected" if down else "alive"
     notes = [f"restarted {times(facts['restarts'])}"] if facts.get("restarts") else []
     errors = dict(facts.get("errors") or {})
     lost = sum(errors.pop(kind, 0) for kind in LINK_ERRORS) or (facts.get("connections") or 1) - 1

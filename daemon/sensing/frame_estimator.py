@@ -94,7 +94,7 @@ class FrameEstimator:
             window_s=period_s * self._averaged_frames,
             measures_torque=self.measures_torque,
             # The first torque after a grip needs the lagged frames too.
-            warm_up_s=_WARM_UP_SHARE * (self.calibration.estimator.motion.n_needed) * period_s,
+            warm_up_s=_WARM_UP_SHARE * self.calibration.estimator.motion.n_needed * period_s,
             has_gain=self.measures_torque,
         )
 

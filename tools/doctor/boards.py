@@ -55,9 +55,12 @@ class Received(Generic[ValueT]):
     @property
     def rate_hz(self) -> float | None:
         """Lines per second; None for fewer than two reads with lines. The first read holds what had waited."""
-        (begin_ns, _), (end_ns, _) = (self.lines[0], self.lines[-1]) if self.lines else ((0, 0), (0, 0))
-        after = sum(count for _, count in self.lines[1:])
-        return after * 1e9 / (end_ns - begin_ns) if end_ns > begin_ns else None
+        if not self.lines:
+            return None
+        arrivals_ns = [arrival_ns for arrival_ns, _ in self.lines]
+        lasted_ns = arrivals_ns[-1] - arrivals_ns[0]
+        n_after_first = sum(count for _, count in self.lines[1:])
+        return n_after_first * 1e9 / lasted_ns if lasted_ns > 0 else None
 
 
 async def listen(path: str, parser: Parser[ValueT], seconds: float, greeting: bytes = b"") -> Received[ValueT]:

@@ -248,6 +248,28 @@ def channel_slots() -> np.ndarray:
     return slots
 
 
+def page_content(paged: Row) -> Row:
+    """Return a message's content of a batch for the page, with its arrays as lists."""
+    return {
+        key: np.frombuffer(base64.b64decode(value["float32"]), "<f4").reshape(value["shape"]).tolist()
+        if isinstance(value, dict) and "float32" in value
+        else value
+        for key, value in paged["content"].items()
+    }
+
+
+def check_message(topic: str, shown: Row, published: Row, row: Row | None) -> None:
+    """Hold what is shown of a message to be all that was published, and the recorded row too, if there is one."""
+    assert shown.keys() == {key for key in published if not key.endswith("_shape")}, topic
+    for key, value in shown.items():
+        truth = value_of(published, key)
+        flat = np.array(value, float).round(6).ravel().tolist() if isinstance(truth, list) else value
+        assert same(flat, truth), f"{topic} {key}: {value} is not {truth}"
+        # Unix times of a recording have one offset for the file.
+        kept = row["log_time_ns"] / 1e9 if row is not None and key == "timestamp" else truth
+        assert row is None or same(row.get(key), kept), f"recorded {topic} {key}"
+
+
 def check_live(one: Recorded) -> None:
     """Compare what `listen`, the page and the recording make of each published message."""
     recorded = one.by_stream()
@@ -263,23 +285,8 @@ def check_live(one: Recorded) -> None:
         assert message_line(topic, received)
         store.add(topic, received, float(number))
         (paged,) = json.loads(store.batch(number, float(number)))["messages"]
-        page = {
-            key: np.frombuffer(base64.b64decode(value["float32"]), "<f4").reshape(value["shape"]).tolist()
-            if isinstance(value, dict) and "float32" in value
-            else value
-            for key, value in paged["content"].items()
-        }
-        keys = {key for key in content if not key.endswith("_shape")}
-        assert listened.keys() == page.keys() == keys
-        row = recorded.get(stream)
-        for key in keys:
-            truth = value_of(content, key)
-            for shown in (listened[key], page[key]):
-                flat = np.array(shown, float).round(6).ravel().tolist() if isinstance(truth, list) else shown
-                assert same(flat, truth), f"{topic} {key}: {shown} is not {truth}"
-            # Unix times of a recording have one offset for the file.
-            kept = row["log_time_ns"] / 1e9 if row is not None and key == "timestamp" else truth
-            assert row is None or same(row.get(key), kept), f"recorded {topic} {key}"
+        for shown in (listened, page_content(paged)):
+            check_message(topic, shown, content, recorded.get(stream))
 
 
 def check_replay(one: Recorded) -> None:

@@ -216,7 +216,12 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
 def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[str]:
     done = run.last["phase"] == "done"
     took_s, asked_for = _elapsed_s(run.first, run.last), _was_asked_for(run.last)
-    ended = "done" if done else "stopped as asked" if asked_for else "STOPPED before its end"
+    if done:
+        ended = "done"
+    elif asked_for:
+        ended = "stopped as asked"
+    else:
+        ended = "STOPPED before its end"
     yield f"What happened: {run.first['experiment']!r} was {ended}, after {took_s:.0f} s."
     if not done:
         # The cause alone: the message has every reason.

@@ -156,7 +156,8 @@ def choose_motion(
     loaded = np.concatenate(twists)
     # A single twist does not show which fit another one needs: one direction is the safest.
     can_choose = len(twists) >= _LEAST_TWISTS or len(loaded) > _RARE_LOAD * len(torque_nm)
-    directions, steps = _DIRECTIONS if can_choose else (1,), _STEPS_WITH_POSITION if position else _STEPS
+    directions = _DIRECTIONS if can_choose else (1,)
+    steps = _STEPS_WITH_POSITION if position else _STEPS
     candidates = tuple(itertools.starmap(Candidate, itertools.product(directions, steps, _PENALTIES)))
     fits = [MotionFit(layout, fit_one, position, (one,)) for one in candidates]
     predicted = np.array([_predict_left_out(one, features, torque_nm, left_out) for one in fits])

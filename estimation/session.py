@@ -188,7 +188,9 @@ class EstimatorSession:
             raise CalibrationError(self._tool_reasons[0])
         calibration, grip, known = self._calibration, self._grip, np.isfinite(torque_nm)
         width = len(calibration.gain_regressor().mean_feature)
-        features, truth = np.array([row for _, row in grip.frames]).reshape(-1, width)[known], torque_nm[known]
+        # Without a frame the rows have no width of their own.
+        every = np.array([row for _, row in grip.frames]).reshape(-1, width)
+        features, truth = every[known], torque_nm[known]
         settling = first_twists(truth, np.zeros(len(truth), dtype=np.int64))
         largest_nm = float(np.abs(truth).max(initial=0.0))
         features, truth = features[~settling], truth[~settling]

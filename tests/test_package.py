@@ -12,15 +12,18 @@ import pytest
 import yaml
 
 import shearloop
+from shearloop import estimation
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("bank", "cli", "daemon", "drivers", "emulators", "estimation", "studies", "tools")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
-@pytest.mark.parametrize("name", shearloop.__all__)
-def test_every_public_name_can_be_imported_and_is_documented(name):
-    assert getattr(shearloop, name).__doc__
+@pytest.mark.parametrize(
+    ("package", "name"), [(package, name) for package in (shearloop, estimation) for name in package.__all__]
+)
+def test_every_public_name_can_be_imported_and_is_documented(package, name):
+    assert getattr(package, name).__doc__
 
 
 def test_importing_the_package_imports_no_library():

@@ -181,7 +181,8 @@ class ControlLoop:
         gripped.unmeasured_since_ns = arm.t_ns if arm is not None else None
         if isinstance(action, GripStep):
             gripper = self.inputs.gripper
-            gripped.origin_rad, gripped.force_n = arm.wrist_rad if arm is not None else None, action.force_n
+            gripped.origin_rad = arm.wrist_rad if arm is not None else None
+            gripped.force_n = action.force_n
             # An unexpected object is watched as well.
             gripped.expected = action.expect_object or (gripper is not None and gripper.holding)
 

@@ -155,7 +155,9 @@ SIGNS: Mapping[Direction, int] = {"clockwise": -1, "counterclockwise": 1}
 
 def direction_of(number: float) -> Direction | None:
     """Return the direction of an angle or a torque; None for 0."""
-    return None if number == 0 else "clockwise" if number < 0 else "counterclockwise"
+    if number == 0:
+        return None
+    return "clockwise" if number < 0 else "counterclockwise"
 
 
 class HoldTorqueStep(_Step):

@@ -107,7 +107,9 @@ class ControlLoopRunner:
         """
         self._stop_count += 1
         experiment, unlocking = self._control_loop.running, self.stop_unlocking()
-        stopped = experiment.file.name if experiment is not None else "unlock" if unlocking else None
+        stopped = "unlock" if unlocking else None
+        if experiment is not None:
+            stopped = experiment.file.name
         if stopped is not None or also_idle:
             what = f"{stopped!r} was under way" if stopped is not None else "nothing was under way"
             self._request_stop("the operator stopped it", Fault(FaultCode.OPERATOR_STOP, what))

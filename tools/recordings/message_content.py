@@ -117,10 +117,6 @@ def _is_finite_array(value: list[float | None]) -> bool:
     return all(element is None or math.isfinite(element) for element in value)
 
 
-def _as_floats(value: list[Any]) -> list[float | None]:
-    return [element if element is None else float(element) for element in value]
-
-
 class _Type(NamedTuple):
     expected: str
     fits: Callable[[Any], bool]

@@ -1,6 +1,7 @@
 """Evaluates a calibration on recordings: every frame in order through a session, against the truth."""
 
 import csv
+import io
 import math
 import re
 import time
@@ -17,6 +18,7 @@ from shearloop.bank.bank_file import Bank
 from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.values import winkler_scores
+from shearloop.files import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -190,7 +192,7 @@ def _compare(frames: FloatArray, unit: str) -> Figures:
 def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:
     """Write a CSV row for every frame of each named series; cells without a truth or an estimate are empty."""
     values = [f"{quantity}{end}_{unit}" for quantity, unit in _UNITS.items() for end in _ENDS]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replace_file(path) as binary, io.TextIOWrapper(binary, newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["recording", "frame", "t_s", "truth_nm", *values, "valid", "reason"])
         for track, name in zip(tracks, names, strict=True):

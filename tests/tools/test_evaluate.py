@@ -68,6 +68,15 @@ def test_figures_are_those_of_a_slow_loop(rows, loaded_nm):
         assert figures["winkler_nm"] == pytest.approx(sum(winkler_by_hand(*one) for one in ends) / n, abs=1e-12)
 
 
+def test_a_table_that_cannot_be_written_whole_leaves_the_earlier_one(tmp_path):
+    path, track = tmp_path / "e.csv", track_of([(0.1, (0.08, 0.01, 0.02))])
+    path.write_text("earlier")
+    with pytest.raises(ValueError, match="zip"):
+        write_estimates([track, track], ["a.mcap"], path)
+    assert [one.name for one in tmp_path.iterdir()] == ["e.csv"]
+    assert path.read_text() == "earlier"
+
+
 def test_the_gain_is_along_the_truth():
     rows = [(0.1, (0.08, 0.0, 0.0)), (-0.1, (-0.08, 0.0, 0.0)), (0.0, (0.03, 0.0, 0.0)), (0.2, None)]
     assert figures_by_load([track_of(rows)])["loaded"]["gain"] == pytest.approx(0.8)

@@ -52,8 +52,7 @@ def export_slices(
     """Write the slices of a recorded experiment with the key `slices` into folders of `out`.
 
     Returns the files, and how many holds have no slice by the reason. Existing slices stay. Raises OSError for files
-    that cannot be written, and UserError, before the first file, for a recording that cannot be read or has no such
-    hold.
+    that cannot be written, and UserError for a recording that cannot be read or has no such hold; then no file is new.
     """
     with open_recording(path) as recording:
         table = recording.table
@@ -72,15 +71,23 @@ def export_slices(
             f"{path}: nothing to export; slices need an experiment with the key `slices` that holds angles, as "
             "config/experiments/torque_sweep.yaml"
         )
-    written = [_save_slice(out, one) for one in slices]
-    torques = [one for one in slices if one.diameter_mm is None]
-    if torques:
-        written += _save_raw(out / TORQUE_FOLDER, max(torques, key=lambda one: abs(one.torque_nm)))
+    written: list[Path] = []
+    try:
+        for one in slices:
+            _save_slice(out, one, written)
+        torques = [one for one in slices if one.diameter_mm is None]
+        if torques:
+            _save_raw(out / TORQUE_FOLDER, max(torques, key=lambda one: abs(one.torque_nm)), written)
+    except BaseException:
+        # The next export would number their slices a second time.
+        for file in written:
+            file.unlink(missing_ok=True)
+        raise
     return written, missed
 
 
-def _save_slice(out: Path, one: _Slice) -> Path:
-    """Write a slice under the number after the highest of its folder, and return the file."""
+def _save_slice(out: Path, one: _Slice, written: list[Path]) -> None:
+    """Write a slice under the number after the highest of its folder."""
     name, prefix, torque = TORQUE_FOLDER, "Data_Slice_", "torque_value"
     if one.diameter_mm is not None:
         name, prefix, torque = DIAMETER_FOLDER, f"{one.diameter_mm:.0f}mm_Data_", "mean_torque"
@@ -88,18 +95,17 @@ def _save_slice(out: Path, one: _Slice) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     found = (re.fullmatch(rf"{prefix}(\d+)\.mat", path.name) for path in folder.iterdir())
     number = 1 + max((int(match[1]) for match in found if match), default=0)
-    _save_mat(file := folder / f"{prefix}{number}.mat", data_diff=one.difference[None], **{torque: [[one.torque_nm]]})
-    return file
+    arrays = {"data_diff": one.difference[None], torque: [[one.torque_nm]]}
+    _save_mat(folder / f"{prefix}{number}.mat", written, **arrays)
 
 
-def _save_raw(folder: Path, one: _Slice) -> list[Path]:
-    """Write a slice's frames, clipped like the paper's, and return the files; files of an earlier recording stay."""
+def _save_raw(folder: Path, one: _Slice, written: list[Path]) -> None:
+    """Write a slice's frames, clipped like the paper's; files of an earlier recording stay."""
     raw, homogeneous = folder / RAW_FRAME, folder / RAW_HOMOGENEOUS
     if raw.exists() or homogeneous.exists():
-        return []
-    _save_mat(raw, clipped_data=np.clip(one.line, 0.0, CLIPPED_V)[None])
-    _save_mat(homogeneous, clipped_data_hom=np.clip(one.homogeneous_line, 0.0, CLIPPED_V)[None])
-    return [raw, homogeneous]
+        return
+    _save_mat(raw, written, clipped_data=np.clip(one.line, 0.0, CLIPPED_V)[None])
+    _save_mat(homogeneous, written, clipped_data_hom=np.clip(one.homogeneous_line, 0.0, CLIPPED_V)[None])
 
 
 class _Sweep:
@@ -196,9 +202,11 @@ class _Sweep:
         )
 
 
-def _save_mat(path: Path, **arrays: Any) -> None:
+def _save_mat(path: Path, written: list[Path], **arrays: Any) -> None:
+    """Write a file, and add it to those that are written."""
     with replace_file(path) as file:
         savemat(file, arrays)  # type: ignore[arg-type]  # the stubs allow only names
+    written.append(path)
 
 
 def _half_period_ns(frames: Collection[tuple[int, FloatArray]]) -> float:

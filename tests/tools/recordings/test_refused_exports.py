@@ -1,5 +1,8 @@
 """An export that a later message ends leaves no file of its own, and changes none that was there."""
 
+import errno
+import os
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +65,32 @@ def test_the_last_message_is_strange(form, topic, changes, problem, tmp_path, ra
         assert f"{spoilt}: a message cannot be used: {topic}" in said
         assert problem in said
         assert files(folder) == before
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_disk_is_full(form, tmp_path, ran, mistake, monkeypatch):
+    if form in ("parquet", "lerobot"):
+        pytest.importorskip("pyarrow", reason="needs the extra `export`")
+    whole, folder = sweep(tmp_path / "whole").end_with("load.torque"), tmp_path / "out"
+    folder.mkdir()
+    arguments = ("recording", "export", whole, "--format", form, "--out", folder / "x")
+    ran(*arguments)
+    before, flushed, fsync = files(folder), list[int](), os.fsync
+
+    def full(handle: int) -> None:
+        # The first file is on the disk, but for exports of a single one.
+        flushed.append(handle)
+        if stat.S_ISREG(os.fstat(handle).st_mode) and (len(flushed) > 2 or form in ("mat", "rrd")):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert "the export cannot be written: No space left on device" in mistake(*arguments)
+    after = files(folder)
+    assert not [name for name in after if name.endswith(".tmp")]
+    if form == "slices":
+        assert after == before
+    assert after.keys() == before.keys()
 
 
 def test_a_later_matlab_file_is_not_overwritten(tmp_path, mistake, monkeypatch):

@@ -71,13 +71,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.bank_file import Bank
     from shearloop.cli.options import read_judged
     from shearloop.estimation.load_delay import load_delay_warning
-    from shearloop.tools.evaluate import (
-        estimate_in_worker,
-        figures_by_load,
-        figures_of,
-        invalid_reasons,
-        write_estimates,
-    )
+    from shearloop.tools.evaluate import estimate_in_worker, figures_by_load, figures_of, write_estimates
     from shearloop.tools.frame_series import check_no_copies, part_of
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
@@ -115,9 +109,7 @@ def run(args: argparse.Namespace) -> int:
     by_load, figures = figures_by_load(tracks, args.loaded_nm), figures_of(tracks)
     sentences = [f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less."]
     sentences += _lines({**by_load, "all": figures})
-    for reason in invalid_reasons(tracks):
-        frames = f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}"
-        sentences.append(f"{frames}: {reason.sentence}")
+    sentences += _invalid_lines(tracks)
     return print_result({**by_load, **figures}, sentences, as_json=args.json)
 
 
@@ -138,7 +130,7 @@ def _refuse_recipe(args: argparse.Namespace) -> None:
 def _leave_out(args: argparse.Namespace) -> int:
     """Judge a recipe on the blocks left out of each fit, and print the figures."""
     from shearloop.tools.calibrate import read_parts
-    from shearloop.tools.evaluate import figures_by_load, figures_of, invalid_reasons, write_estimates
+    from shearloop.tools.evaluate import figures_by_load, figures_of, write_estimates
     from shearloop.tools.leave_out import Recipe, judge_left_out, sentences_of
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
@@ -166,9 +158,7 @@ def _leave_out(args: argparse.Namespace) -> int:
     figures = found.figures(args.loaded_nm)
     by_load = figures_by_load(found.all_tracks, args.loaded_nm)
     sentences = _lines({**by_load, "all": figures_of(found.all_tracks)})
-    for reason in invalid_reasons(found.all_tracks):
-        frames = f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}"
-        sentences.append(f"{frames}: {reason.sentence}")
+    sentences += _invalid_lines(found.all_tracks)
     return print_result(figures, [*sentences, *sentences_of(found, args.loaded_nm)], as_json=args.json)
 
 
@@ -180,6 +170,17 @@ def _lines(columns: "Mapping[str, Figures]") -> list[str]:
         if any(group.get(name) is not None for group in columns.values())
     ]
     return table(("figure", *columns, "meaning"), rows)
+
+
+def _invalid_lines(tracks: "Sequence[EstimateTrack]") -> list[str]:
+    """Return why frames have no estimate, with their numbers."""
+    from shearloop.tools.evaluate import invalid_reasons
+
+    lines: list[str] = []
+    for reason in invalid_reasons(tracks):
+        frames = f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}"
+        lines.append(f"{frames}: {reason.sentence}")
+    return lines
 
 
 def _draw(tracks: "Sequence[EstimateTrack]", paths: "Sequence[Path]", calibration: "Calibration", out: Path) -> None:

@@ -53,9 +53,15 @@ class Commands:
         return asking | {name: partial(self._reported, name, handler) for name, handler in self._acting().items()}
 
     def _acting(self) -> Mapping[str, Handler]:
-        named: dict[str, Handler] = {"tare": self._tare, STOP: self._stop, "start": self._start}
-        named |= {"pause": self._pause, "resume": self._resume, "unlock": self._unlock}
-        return {**named, "release": self._release}
+        return {
+            "tare": self._tare,
+            STOP: self._stop,
+            "start": self._start,
+            "pause": self._pause,
+            "resume": self._resume,
+            "unlock": self._unlock,
+            "release": self._release,
+        }
 
     async def _reported(self, name: str, handler: Handler, request: Request) -> Reply:
         """Carry out a command, and report its result."""

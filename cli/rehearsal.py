@@ -64,13 +64,14 @@ class _Stage:
         config = self._config
         robot = self._robot(config.robot) if config.robot is not None else None
         # Without another sensor on the tool, the robot turns it on the skin.
-        on_skin = config.skin is not None and config.gripper is None and not config.fingertips
+        others = config.fingertips or config.load_cell is not None or config.gripper is not None
+        on_skin = config.skin is not None and not others
         if config.skin is not None:
-            self._skin(config.skin, robot if on_skin and config.load_cell is None else None)
-        if robot is not None and not (on_skin and config.load_cell is None):
-            self._rig(robot)
-        elif robot is None:
+            self._skin(config.skin, robot if on_skin else None)
+        if robot is None:
             self._boards()
+        elif not on_skin:
+            self._rig(robot)
         if config.experiment is not None:
             self._content |= {"autostart": True, "stop_when_done": True}
             self._sentences.append(f"{config.experiment} starts by itself, and ends the rehearsal")

@@ -388,12 +388,7 @@ def fit_interval_regressor(
     point, truth = fit(features, values, strength), values[rows]
     residuals = reported - truth
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
-    if left_out:
-        inflation = student_inflation(len(np.unique(rows)))
-    elif isinstance(point, CurveMean):
-        inflation = 1.0
-    else:
-        inflation = _INFLATION
+    inflation = _inflation(point, rows, left_out)
     of_loads = _inflation_of_twists(values, twists) if twists else None
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
@@ -419,6 +414,15 @@ def fit_interval_regressor(
         gains = _gains_of_recordings(features, values, recordings, refit)
         gain = _spread_of_gain(values, recordings, rows, reported, gains, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain, line)
+
+
+def _inflation(point: Regressor, rows: IntArray, left_out: LeftOut) -> float:
+    """Return the factor by which residuals of the left-out rows are widened."""
+    if left_out:
+        return student_inflation(len(np.unique(rows)))
+    if isinstance(point, CurveMean):
+        return 1.0
+    return _INFLATION
 
 
 def _inflation_of_twists(values: FloatArray, twists: LeftOut) -> float:

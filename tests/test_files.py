@@ -3,6 +3,7 @@
 import errno
 import os
 import stat
+from pathlib import Path
 
 import pytest
 
@@ -44,3 +45,10 @@ def test_a_failing_disk_says_that_the_file_is_there(folder_fails, tmp_path):
     with pytest.raises(OSError, match=said), replace_file(tmp_path / "a.yaml") as file:
         file.write(b"new")
     assert (tmp_path / "a.yaml").read_bytes() == b"new"
+
+
+def test_a_file_that_cannot_be_written_is_named_as_the_person_named_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError) as refused, replace_file(Path("missing") / "table.csv"):
+        pass
+    assert refused.value.filename == "missing/table.csv"

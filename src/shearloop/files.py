@@ -56,6 +56,7 @@ def replaced_path(path: Path) -> Iterator[Path]:
         # A pipe or /dev/stdout is written to, not replaced; a folder raises OSError.
         yield path
         return
+    given = path
     # The target of a link is replaced, and the link stays.
     path = path.resolve()
     # A fixed name: the next writer reuses the file of one that was killed.
@@ -66,9 +67,12 @@ def replaced_path(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
         sync_directory(path.parent)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             temporary.unlink()
+        if isinstance(error, OSError) and error.filename in (temporary, str(temporary)):
+            # A person knows the file by the name that they gave.
+            error.filename = str(given)
         raise
 
 

@@ -133,7 +133,7 @@ def pages() -> dict[Path, str]:
         "configuration": configuration,
     }
     found = {SCHEMAS / f"{kind}.json": schema_text(kind) for kind in MODELS}
-    for name in ("configuration.md", "faults.md", "messages.md", "subscribers.md"):
+    for name in ("configuration.md", "faults.md", "messages.md"):
         text = (DOCS / name).read_text(encoding="utf-8")
         for part, write in parts.items():
             begin, end = f"<!-- generated: {part} -->\n", "<!-- end -->"

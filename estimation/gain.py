@@ -19,7 +19,7 @@ from shearloop.estimation.confidence import TWO_SIDED_95
 
 # Standard deviation of the logarithm of the gain between recordings, for one fingertip and for two, and the recordings
 # that it counts as. Cylinders and days recorded twice differ by factors of 0.44 to 1.4 for one fingertip, of 0.86 and
-# 1.2 for two (docs/decisions/0044).
+# 1.2 for two (docs/decisions/0046).
 PRIOR_SPREADS, _PRIOR_RECORDINGS = {1: 0.28, 2: 0.16}, 3
 # The same of a calibration on fewer twists, where nothing shows that the torque repeats. Of two recordings with one
 # twist each the gains differ by factors of 3.0 (right), 2.2 (left) and 1.1 (both).

@@ -71,7 +71,13 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.bank_file import Bank
     from shearloop.cli.options import read_judged
     from shearloop.estimation.load_delay import load_delay_warning
-    from shearloop.tools.evaluate import estimate_in_worker, figures_by_load, figures_of, write_estimates
+    from shearloop.tools.evaluate import (
+        estimate_in_worker,
+        figures_by_load,
+        figures_of,
+        no_better_than_clock,
+        write_estimates,
+    )
     from shearloop.tools.frame_series import check_no_copies, part_of
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
@@ -110,6 +116,8 @@ def run(args: argparse.Namespace) -> int:
     sentences = [f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less."]
     sentences += _lines({**by_load, "all": figures})
     sentences += _invalid_lines(tracks)
+    if against := no_better_than_clock(tracks, args.loaded_nm):
+        sentences.append(against)
     return print_result({**by_load, **figures}, sentences, as_json=args.json)
 
 

@@ -22,7 +22,7 @@ _RESTART = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueProfile:
-    """Mean torque_nm (p,) at rising offsets (p,): seconds from a twist's middle, or slices from a repeat's last."""
+    """Mean torque_nm (p,) at rising offsets (p,): seconds from a twist's middle, or slices from a repeat's end."""
 
     offsets: FloatArray
     torque_nm: FloatArray
@@ -65,12 +65,17 @@ def _middles(series: FrameSeries) -> list[float]:
 
 
 def _places(torque_nm: FloatArray) -> IntArray:
-    """Return the place (n,) of each slice in its repeat: 0 for the last one, negative before.
+    """Return the place (n,) of each slice in its repeat: −1 for the last place of a whole repeat, less before.
 
-    A first repeat may lack its first levels.
+    The first repeat may lack its first slices, the last one its last slices. A whole repeat is the longest one.
     """
     known = np.nan_to_num(torque_nm)
     falls = np.flatnonzero(np.diff(known) < -_RESTART * float(np.ptp(known))) + 1
-    ends = np.append(falls, len(known))
-    own_end: IntArray = ends[np.searchsorted(ends, np.arange(len(known)), side="right")]
-    return np.asarray(np.arange(len(known)) + 1 - own_end)
+    starts = np.array([0, *falls.tolist()])
+    lengths = np.diff([*starts.tolist(), len(known)])
+    whole = int(lengths.max())
+    # The first repeat ends in its place, so it counts as begun earlier.
+    starts[0] += lengths[0] - whole
+    rows = np.arange(len(known))
+    own_start = starts[np.searchsorted(falls, rows, side="right")]
+    return np.asarray(rows - own_start - whole)

@@ -113,6 +113,19 @@ def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_N
     return found
 
 
+def no_better_than_clock(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_NM) -> str:
+    """Return a sentence against an estimate that errs as much as a guess without a sensor, empty for a better one."""
+    ratio = figures_by_load(tracks, loaded_nm)["loaded"]["baseline_ratio"]
+    if ratio is None or ratio < 1.0:
+        return ""
+    if tracks[0].series.kind != "raw":
+        return "The sensor does not beat the place in the sequence: record the levels in random order."
+    sides = tracks[0].series.sides
+    if len(sides) == 1:
+        return f"This fingertip ({sides[0]}) does not beat the stopwatch: use both."
+    return "The sensor does not beat the stopwatch: grip harder, or record twists that differ."
+
+
 @dataclass(frozen=True, slots=True)
 class InvalidReason:
     """Why `frames` were not valid: the most frequent sentence, an example if the numbers in it `differ`."""

@@ -25,7 +25,7 @@ from shearloop.estimation.gain import find_twists
 from shearloop.estimation.regressors import NEAR_LEVEL, later_levels
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import Measured, distinct
-from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of
+from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
 from shearloop.tools.parallel import Executor
 from shearloop.words import counted
 
@@ -291,18 +291,21 @@ def _kept(recordings: Sequence[FrameSeries], rows: Sequence[BoolArray]) -> list[
 
 def _advice(kind: Kind, recordings: Sequence[FrameSeries], tracks: Sequence[Sequence[EstimateTrack]]) -> str:
     """Return one sentence: what to do first for a better calibration."""
-    loaded = figures_by_load([one for each in tracks for one in each])["loaded"]
-    ratio, coverage = loaded["baseline_ratio"], loaded["coverage_95"]
-    if kind == "tools" and len(tracks) < _ENOUGH_TOOLS:
-        return f"{counted(len(tracks), 'tool')} only: record four, because three others tell the gain of one left out."
-    if ratio is None:
+    judged = [one for each in tracks for one in each]
+    loaded = figures_by_load(judged)["loaded"]
+    if loaded["baseline_ratio"] is None:
         return "No loaded frame has an estimate: see why with `shearloop evaluate CAL REC`."
-    if ratio >= 1.0:
-        return "The sensor adds nothing to a stopwatch: use both fingertips, or twists that differ."
+    if kind == "tools":
+        if len(tracks) < _ENOUGH_TOOLS:
+            tools = counted(len(tracks), "tool")
+            return f"{tools} only: record four, because three others tell the gain of one left out."
+        return "Another tool has a gain of its own: correct it with `shearloop adapt` on two twists of known torque."
+    if against := no_better_than_clock(judged):
+        return against
     if kind != "levels" and len(recordings) < _ENOUGH_GRIPS:
         grips = "One grip" if len(recordings) == 1 else "Two grips"
         return f"{grips} only: record three, because the gain changes from grip to grip."
-    if coverage is not None and coverage < _LEAST_COVERAGE:
+    if (coverage := loaded["coverage_95"]) is not None and coverage < _LEAST_COVERAGE:
         return f"The intervals hold too few truths: record more {kind}."
     return "Nothing stands out: judge it on a recording of another day."
 
@@ -314,12 +317,13 @@ def sentences_of(result: LeftOut, loaded_nm: float = LOADED_NM) -> list[str]:
     if loaded["rmse_nm"] is None:
         return [f"{blocks}: too few loaded frames have an estimate.", result.advice]
     coverage, ratio = loaded["coverage_95"], loaded["baseline_ratio"]
+    clock = "the mean of the place in the sequence" if result.kind == "levels" else "a stopwatch with the mean twist"
     return [
         f"{blocks}: loaded frames have an RMSE of {_milli(loaded['rmse_nm'])} mN·m, intervals of "
         f"{_milli(loaded['interval_nm'])} mN·m (median), coverage {coverage:.2f} and a score of "
         f"{_milli(loaded['winkler_nm'])} mN·m.",
         f"Without a sensor: {_milli(loaded['baseline_zero_rmse_nm'])} mN·m for always 0, "
-        f"{_milli(loaded['baseline_profile_rmse_nm'])} mN·m for a stopwatch with the mean twist. Ratio to the better: "
+        f"{_milli(loaded['baseline_profile_rmse_nm'])} mN·m for {clock}. Ratio to the better: "
         f"{'unknown' if ratio is None else f'{ratio:.2f}'}.",
         result.advice,
     ]

@@ -117,6 +117,12 @@ def test_times_are_unchecked_where_no_recording_tells_or_only_roughly(recorded, 
         assert measure_timing([recorded]).uncertainty_s == pytest.approx(unsure_s, abs=1e-3)
 
 
+def test_values_that_waited_in_a_buffer_may_be_seconds_off(recorded):
+    waited = replace(unmoved(recorded), load_doubt="the load's values waited in a buffer")
+    assert measure_timing([waited]).uncertainty_s == 3.0
+    assert measure_timing([waited, recorded]).uncertainty_s == 3.0, "the other recording's delay is not this one's"
+
+
 def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
     dead = replace(recorded, channels=np.zeros_like(recorded.channels))
     garbled = replace(recorded, channels=np.where(np.arange(896) == 3, np.nan, recorded.channels))

@@ -25,6 +25,14 @@ def test_repeated_slices_are_known_by_their_place():
     assert profile.predict(later) == pytest.approx(later.torque_at_frames(), abs=0.008)
 
 
+@pytest.mark.parametrize("stop", range(21, 41))
+def test_a_repeat_that_ends_early_counts_from_its_beginning(stop):
+    played = sliced().between(1, 50)
+    profile = TorqueProfile.fit([played.between(1, 1 + stop)])
+    later = played.between(1 + stop, 50)
+    assert profile.predict(played)[1 + stop :] == pytest.approx(later.torque_at_frames(), abs=0.01)
+
+
 def test_evaluate_says_what_a_sensor_adds():
     calibration = fit("motion_regression", [twisting(cycles=5)], "rig", timing=TRUSTED)
     judged = figures_by_load([estimate_series(calibration, twisting(cycles=4, seed=3, peak_nm=0.03))])["loaded"]

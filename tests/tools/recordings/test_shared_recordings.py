@@ -17,7 +17,7 @@ from scipy.io import savemat
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import Calibration, FrameSeries, fit, measure_timing
+from shearloop.estimation import TRUSTED, Calibration, FrameSeries, fit, measure_timing
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
 from shearloop.estimation.novelty import NoveltyDetector
@@ -332,6 +332,25 @@ def test_a_load_that_one_loop_stamped_early_is_put_right(shared, tmp_path):
     assert max(one["winkler_nm"] for one in found) <= 0.045
     before = replace(other, torque_t_s=other.torque_t_s - 2.7)
     assert figures_of([estimate_series(calibration, before)])["r"] < 0.6
+
+
+@pytest.mark.parametrize("moved_s", [-0.34, 0.3])
+def test_a_delay_that_stays_unsure_widens_the_intervals(shared, tmp_path, moved_s):
+    one, other = (
+        imported(tmp_path / f"{name}.mcap", shared / "recordings/streams" / name)
+        for name in ("20241202_153632", "20241202_171704")
+    )
+    moved = replace(one, torque_t_s=one.torque_t_s + moved_s)
+    timing = measure_timing([moved])
+    assert timing.uncertainty_s > abs(moved_s)
+    loaded = {}
+    for name, times in (("unsure", timing), ("trusted", TRUSTED)):
+        calibration = fit("motion_regression", [moved], "one twist", timing=times)
+        loaded[name] = figures_by_load([estimate_series(calibration, other)])["loaded"]
+    assert loaded["unsure"]["coverage_95"] == 1.0
+    assert loaded["unsure"]["interval_nm"] > loaded["trusted"]["interval_nm"]
+    # A load of up to 50 mN·m: intervals still say something.
+    assert loaded["unsure"]["interval_nm"] < 0.07
 
 
 def test_a_clock_that_is_surely_wrong_is_put_right_at_the_import(shared, twists, tmp_path):

@@ -16,7 +16,6 @@ from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
-from shearloop.estimation.regressors import parabola_top
 
 if TYPE_CHECKING:
     from shearloop.bank.mesh import Mesh
@@ -197,6 +196,15 @@ def image_matrix(mesh: "Mesh", table: ChannelTable) -> FloatArray:
     jacobian = (up - down).T / (2 * _STEP)
     normal = jacobian.T @ jacobian
     return np.asarray(np.linalg.solve(normal + _SMOOTHING * np.diag(np.diag(normal)), jacobian.T))
+
+
+def parabola_top(scores: FloatArray, i: int, grid: FloatArray) -> float:
+    """Return the top of a parabola through a maximum and its neighbours."""
+    if i in (0, len(grid) - 1) or not np.isfinite(scores[[i - 1, i + 1]]).all():
+        return float(grid[i])
+    bend = float(scores[i - 1] - 2 * scores[i] + scores[i + 1])
+    shift = 0.5 * float(scores[i - 1] - scores[i + 1]) / bend if bend < 0 else 0.0
+    return float(grid[i] + shift * (grid[1] - grid[0]))
 
 
 def _drop(heatmap: FloatArray, row: int, column: int) -> float:

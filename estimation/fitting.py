@@ -14,6 +14,7 @@ from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.bank_match import BankMatcher
 from shearloop.estimation.calibration import Assumption, Calibration
+from shearloop.estimation.channel_imputer import ChannelImputer
 from shearloop.estimation.estimator import (
     LEAST_DIAMETERS,
     CalibrationRows,
@@ -27,10 +28,12 @@ from shearloop.estimation.estimator import (
 from shearloop.estimation.estimator_names import EstimatorName, estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator, segment_grip
 from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, first_twists, loaded_log_gain
-from shearloop.estimation.interval_regressor import CensoredRidge, IntervalRegressor, fit_interval_regressor
+from shearloop.estimation.interval_fit import fit_interval_regressor
+from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.left_out import later_levels
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.novelty import NoveltyDetector
-from shearloop.estimation.regressors import ChannelImputer, later_levels
+from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.session_state import ProcessedFrame, SessionState
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct

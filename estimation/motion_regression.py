@@ -17,6 +17,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import TWO_SIDED_95
+from shearloop.estimation.curve import CurveMean
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator import (
     LEAST_LEFT,
@@ -29,17 +30,10 @@ from shearloop.estimation.estimator import (
     Reading,
 )
 from shearloop.estimation.fingertip_validator import FingertipValidator
-from shearloop.estimation.interval_regressor import (
-    LEAST_HALF_WIDTH,
-    CensoredRidge,
-    IntervalRegressor,
-    Intervals,
-    RegressorFit,
-    Ridge,
-    ValueRange,
-    fit_interval_regressor,
-    is_one_sided,
-)
+from shearloop.estimation.interval_fit import RegressorFit, fit_interval_regressor
+from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange
+from shearloop.estimation.left_out import left_out_blocks
 from shearloop.estimation.motion_fit import (
     MEMORY_EDGES,
     MOST_DIRECTIONS,
@@ -50,7 +44,7 @@ from shearloop.estimation.motion_fit import (
     twists_left_out,
 )
 from shearloop.estimation.novelty import fitted_parts
-from shearloop.estimation.regressors import CurveMean, left_out_blocks
+from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
 from shearloop.estimation.session_state import Motion
 
 # The directions of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err

@@ -7,7 +7,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.estimation import Calibration
 from shearloop.estimation.estimator import OutputModel
-from shearloop.estimation.interval_regressor import fit_interval_regressor
+from shearloop.estimation.interval_fit import fit_interval_regressor
 
 Points = tuple[FloatArray, FloatArray]
 

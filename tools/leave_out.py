@@ -22,7 +22,7 @@ from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.fingertip_validator import segment_grip
 from shearloop.estimation.gain import find_twists
-from shearloop.estimation.regressors import NEAR_LEVEL, later_levels
+from shearloop.estimation.left_out import NEAR_LEVEL, later_levels
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import Measured, distinct
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock

@@ -18,11 +18,13 @@ from shearloop.bank.mesh import Mesh
 from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.estimation import Calibration, FrameSeries, Physics
 from shearloop.estimation.bank_match import NOT_TURNED, BankMatcher, RefinedMatcher
+from shearloop.estimation.curve import ranked_channels
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator import PaperEstimator
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.estimation.interval_regressor import IntervalRegressor, Ridge, fit_interval_regressor
-from shearloop.estimation.regressors import ranked_channels
+from shearloop.estimation.interval_fit import fit_interval_regressor
+from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.ridge import Ridge
 from shearloop.studies.charts.chart_data import Split, fitted
 from shearloop.studies.charts.forward_methods import CELLS, SolvedForward, forward_methods
 from shearloop.studies.charts.simulated_loop import GAIN, LOOPS, TrackingError, tracking_errors

@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter1d
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.estimation import TRUSTED, EstimatorSession, fit
 from shearloop.estimation.estimator import CalibrationRows
-from shearloop.estimation.interval_regressor import Ridge
 from shearloop.estimation.motion_regression import fit_cylinders, fit_line
+from shearloop.estimation.ridge import Ridge
 from tests.estimation.conftest import follow, twisting
 
 KNOWN_MM = (10.0, 25.0, 40.0)

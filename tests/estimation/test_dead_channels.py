@@ -9,7 +9,7 @@ import pytest
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
-from shearloop.estimation.regressors import ChannelImputer
+from shearloop.estimation.channel_imputer import ChannelImputer
 from shearloop.estimation.session_state import Motion, SessionState
 from tests.estimation import conftest
 from tests.estimation.conftest import IDLE_S, PERIOD_S, judged, twisting

@@ -15,7 +15,8 @@ from shearloop.estimation.gain import (
     first_twists,
     loaded_log_gain,
 )
-from shearloop.estimation.interval_regressor import CensoredRidge, Ridge, fit_interval_regressor
+from shearloop.estimation.interval_fit import fit_interval_regressor
+from shearloop.estimation.ridge import CensoredRidge, Ridge
 
 TWISTS = np.tile([0.0, 0.0, 0.0, 0.03, 0.05, 0.04, 0.0, 0.0], 10)
 # Of one fingertip.

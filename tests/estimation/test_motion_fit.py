@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from shearloop.estimation.interval_regressor import CensoredRidge, Ridge
 from shearloop.estimation.motion_fit import MEMORY_EDGES, Layout, choose_motion, mean_ridge, twists_left_out
+from shearloop.estimation.ridge import CensoredRidge, Ridge
 
 LAYOUT = Layout(len(MEMORY_EDGES) - 1, 2, 3)
 TWIST = [0.0, 0.0, 0.0, 0.0, 0.0, 0.02, 0.05, 0.04, 0.0, 0.0]

@@ -9,8 +9,10 @@ from scipy.stats import chi2
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.estimation import FrameSeries, fit
 from shearloop.estimation.bank_match import BankMatch
-from shearloop.estimation.interval_regressor import IntervalRegressor, Ridge, fit_interval_regressor
+from shearloop.estimation.interval_fit import fit_interval_regressor
+from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.novelty import NoveltyDetector, ReciprocityCheck
+from shearloop.estimation.ridge import Ridge
 from tests.estimation.conftest import follow, judged, mixed, sliced
 
 ALL = np.ones(896, dtype=np.bool_)

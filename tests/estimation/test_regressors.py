@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.interval_regressor import (
-    CensoredRidge,
-    Intervals,
-    Ridge,
-    best_strength,
-    fit_interval_regressor,
-    student_inflation,
-)
-from shearloop.estimation.regressors import InverseCalibration, later_origins, later_splits, left_out_blocks
+from shearloop.estimation.curve import InverseCalibration
+from shearloop.estimation.interval_fit import best_strength, fit_interval_regressor
+from shearloop.estimation.intervals import Intervals, student_inflation
+from shearloop.estimation.left_out import later_origins, later_splits, left_out_blocks
+from shearloop.estimation.ridge import CensoredRidge, Ridge
 
 
 def test_a_ridge_without_strength_is_least_squares():

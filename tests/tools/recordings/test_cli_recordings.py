@@ -13,8 +13,9 @@ from shearloop.cli.evaluate import _lines
 from shearloop.estimation import Calibration, Estimate, FrameSeries, fit
 from shearloop.estimation.estimator import Estimator, OutputModel, Reading, Regression
 from shearloop.estimation.estimator_names import ESTIMATORS
-from shearloop.estimation.interval_regressor import Ridge, fit_interval_regressor
+from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.load_delay import LoadDelay, LoadTiming
+from shearloop.estimation.ridge import Ridge
 from shearloop.estimation.values import Measured
 from shearloop.tools.calibrate import CalibrationResult
 from shearloop.tools.evaluate import EstimateTrack, InvalidReason, draw_tracks, figures_of, invalid_reasons

@@ -18,10 +18,10 @@ from scipy.io import savemat
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import TRUSTED, Calibration, FrameSeries, fit, measure_timing
+from shearloop.estimation.curve import CurveMean
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
 from shearloop.estimation.novelty import NoveltyDetector
-from shearloop.estimation.regressors import CurveMean
 from shearloop.studies.charts.fault_sweeps import balanced, judge_level
 from shearloop.studies.charts.stability import select_rows
 from shearloop.tools.evaluate import estimate_series, figures_by_load, figures_of

@@ -1,33 +1,25 @@
-"""Frames as a curve over the value, an imputer of dead channels, and ways to leave frames out.
+"""Frames as a curve over the value, with correlated drift: classical calibration by generalised least squares.
 
-`InverseCalibration` models frames as a smooth curve over the value with correlated drift (classical calibration by
-generalised least squares). Unlike a ridge it does not pull estimates towards the mean.
+Unlike a ridge it does not pull estimates towards the mean.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
 
-from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.fingertip_validator import FingertipValidator
+from shearloop.estimation.bank_match import parabola_top
 from shearloop.estimation.values import INLINE
 from shearloop.words import counted
 
-N_BLOCKS = 5
-FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
-# Values within this fraction of their range have one level: a little more than half the distance between ten levels.
-NEAR_LEVEL = 0.06
 # Penalties of the curve's higher terms and of the trend, as this many frames without them. From 10 to 100 for the trend
 # the error on later slices is nearly the same; without a trend it is a sixth larger (docs/decisions/0042).
 _CURVATURE, _TREND, N_TREND = 3.0, 30.0, 2
 # The paper's number: with this many of the 896 channels its regression was four fifths as good as with all.
 N_RANKED = 272
-# Filled frames of the emulated rig, the recorded stream and formulas give estimates within a tenth of their error for
-# 2 to 16 directions.
-_MOST_DIRECTIONS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,15 +140,6 @@ class CurveMean:
         return np.asarray(np.mean([one.predict(features) for one in self.curves], axis=0))
 
 
-def parabola_top(scores: FloatArray, i: int, grid: FloatArray) -> float:
-    """Return the top of a parabola through a maximum and its neighbours."""
-    if i in (0, len(grid) - 1) or not np.isfinite(scores[[i - 1, i + 1]]).all():
-        return float(grid[i])
-    bend = float(scores[i - 1] - 2 * scores[i] + scores[i + 1])
-    shift = 0.5 * float(scores[i - 1] - scores[i + 1]) / bend if bend < 0 else 0.0
-    return float(grid[i] + shift * (grid[1] - grid[0]))
-
-
 def _slope_penalty(frames: FloatArray, columns: FloatArray, penalties: FloatArray) -> float:
     """Return the penalty of the slopes of (n, q) frames over the second of (n, p) columns (empirical Bayes).
 
@@ -179,99 +162,6 @@ def _spread_about_parabola(frames: FloatArray, z: FloatArray) -> FloatArray:
     squares = ((frames - powers @ np.linalg.solve(powers.T @ powers + penalty, powers.T @ frames)) ** 2).mean(axis=0)
     # The median keeps channels that never change finite.
     return np.asarray(np.sqrt(0.5 * squares + 0.5 * np.median(squares) + np.finfo(np.float64).tiny))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ChannelImputer:
-    """Gaussian model of gripped differences, to impute channels that died after the calibration.
-
-    mean (m, c) in volts; modes (k, m, c) in volts, each one standard deviation; precision (m, c) in V⁻² is one
-    over each channel's remaining variance, 0 for channels that were dead at calibration.
-    """
-
-    mean: FloatArray
-    modes: FloatArray
-    precision: FloatArray
-
-    @classmethod
-    def fit(cls, positions: FloatArray, validators: tuple[FingertipValidator, ...]) -> Self:
-        """Fit to the (n, m·c) differences of gripped frames in units of the validators' noises."""
-        noise = np.array([one.noise for one in validators])
-        alive = np.isfinite(noise)
-        mean = positions.mean(axis=0)
-        moved = positions - mean
-        _, s, vt = np.linalg.svd(moved, full_matrices=False)
-        directions = vt[:_MOST_DIRECTIONS]
-        # No channel is known better than its own noise, the unit here.
-        rest = np.maximum((moved - moved @ directions.T @ directions).std(axis=0), 1.0).reshape(noise.shape)
-        scale = np.where(alive, noise, 0.0)
-        spreads = s[:_MOST_DIRECTIONS] / np.sqrt(len(positions))
-        modes = (spreads[:, None] * directions).reshape(-1, *noise.shape) * scale
-        precision = np.where(alive, (rest * noise) ** -2.0, 0.0)
-        return cls(mean.reshape(noise.shape) * scale, modes, precision)
-
-    def impute(self, difference: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return a (m, c) difference in volts with unusable channels at their conditional mean.
-
-        Also return the (k, m, c) independent errors of the imputed channels, one standard deviation each.
-        """
-        k = len(self.modes)
-        modes = self.modes.reshape(k, -1)
-        weighted = modes * np.where(usable, self.precision, 0.0).ravel()
-        # Condition the Gaussian in the modes: a (k, k) system instead of one of all channels.
-        covariance = np.linalg.inv(np.eye(k) + weighted @ modes.T)
-        moved = (covariance @ (weighted @ (difference - self.mean).ravel()) @ modes).reshape(difference.shape)
-        errors = (np.linalg.cholesky(covariance).T @ modes).reshape(self.modes.shape)
-        return np.where(usable, difference, self.mean + moved), np.where(usable, 0.0, errors)
-
-
-def left_out_groups(numbers: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Return (rest, group) for each group of rows, from the group's number of each of (n,) rows."""
-    return [(np.flatnonzero(numbers != one), np.flatnonzero(numbers == one)) for one in np.unique(numbers)]
-
-
-def left_out_blocks(n: int) -> list[tuple[IntArray, IntArray]]:
-    """Return (rest, block) for N_BLOCKS blocks of n rows, each one stretch of time."""
-    return left_out_groups(np.arange(n) * N_BLOCKS // n)
-
-
-def later_origins(n: int) -> list[tuple[IntArray, IntArray]]:
-    """Return (earlier, all later) parts of n rows, from six tenths of the time on: rolling forecasts.
-
-    The list is empty where the first part has too few rows to represent this calibration.
-    """
-    first = round(FIRST_ORIGIN * n)
-    if first < LEAST_BEFORE_ORIGIN:
-        return []
-    return [(np.arange(cut), np.arange(cut, n)) for cut in range(first, n - 1, max(1, n // N_ORIGINS))]
-
-
-def later_levels(values: FloatArray) -> list[tuple[IntArray, IntArray]]:
-    """Return (earlier, later) parts of (n,) values as `later_origins`, without earlier values near the later one.
-
-    Torques repeat. With the same level among the earlier ones, a flexible curve learns the levels and not the torque.
-    Where too few other values remain, the level stays.
-    """
-    near = NEAR_LEVEL * float(np.ptp(values))
-    found: list[tuple[IntArray, IntArray]] = []
-    for earlier, later in later_origins(len(values)):
-        # Later rows with the same earlier ones are one part.
-        parts: dict[bytes, tuple[IntArray, list[int]]] = {}
-        for row in later.tolist():
-            rest = earlier[np.abs(values[earlier] - values[row]) > near]
-            kept = rest if len(rest) >= LEAST_BEFORE_ORIGIN else earlier
-            _, rows = parts.setdefault(kept.tobytes(), (kept, []))
-            rows.append(row)
-        found += [(kept, np.array(rows)) for kept, rows in parts.values()]
-    return found
-
-
-def later_splits(n: int) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield (earlier, later) parts of n rows in time order: fit on the one, validate on the other."""
-    for share in (0.4, 0.6, 0.8):
-        cut, end = round(n * share), round(n * min(share + 0.2, 1.0))
-        if cut >= 2 and end > cut:
-            yield np.arange(cut), np.arange(cut, end)
 
 
 def ranked_channels(frames: FloatArray, values: FloatArray) -> IntArray:

@@ -1,0 +1,98 @@
+"""95 % prediction intervals from residuals on frames left out of a fit.
+
+They are split-conformal in strata of the prediction (Vovk 2012), namely free of load, about to touch, loaded. In each
+stratum the half width is the 95 % quantile of the absolute residuals with the correction for a finite sample, so that
+many easy frames do not narrow the intervals of few hard ones.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy.special import stdtrit
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
+
+LEAST_IN_STRATUM = 20
+_LEAST_RESIDUALS = 5
+# Narrowest interval as a share of the calibrated range: load cells are noisy too.
+LEAST_HALF_WIDTH = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Intervals:
+    """Half widths (s,) of the strata that the (s − 1,) edges divide the predictions into."""
+
+    edges: FloatArray
+    half_widths: FloatArray
+
+    @classmethod
+    def fit(
+        cls,
+        predicted: FloatArray,
+        residuals: FloatArray,
+        edges: tuple[float, ...],
+        inflation: float,
+        least_half_width: float = 0.0,
+        inflation_of_loads: float | None = None,
+    ) -> Self:
+        """Fit to (n,) predictions and their residuals on data left out; a stratum with few of them joins the next.
+
+        The uppermost stratum has an inflation of its own where it is given: loads are fewer.
+        Raises CalibrationError for too few residuals.
+        """
+        if len(residuals) < _LEAST_RESIDUALS:
+            raise CalibrationError(
+                f"too few frames left out of the fit to determine the error: {len(residuals)}; record more repeats"
+            )
+        kept: list[float] = []
+        for edge in sorted(edges):
+            low = kept[-1] if kept else -np.inf
+            inside = np.count_nonzero((predicted > low) & (predicted <= edge))
+            above = np.count_nonzero(predicted > edge)
+            if inside >= LEAST_IN_STRATUM and above >= LEAST_IN_STRATUM:
+                kept.append(float(edge))
+        stratum = np.searchsorted(kept, predicted)
+        widths = [_conformal_quantile(np.abs(residuals[stratum == i])) for i in range(len(kept) + 1)]
+        widths[-1] *= (inflation_of_loads or inflation) / inflation
+        return cls(np.array(kept), np.maximum(inflation * np.array(widths), least_half_width))
+
+    def half_width(self, predicted: float) -> float:
+        """Return half of the 95 % interval's width at this prediction."""
+        return float(self.half_widths[self.edges.searchsorted(predicted)])
+
+
+def student_inflation(n: int) -> float:
+    """Return the factor on a 95 % interval's width if n values determine it (Student 1908)."""
+    return float(stdtrit(n - 1, (1 + LEVEL) / 2)) / TWO_SIDED_95
+
+
+def _conformal_quantile(absolute: FloatArray) -> float:
+    """Return the conformal quantile; of few residuals the Gaussian one, because their largest says too little."""
+    n = len(absolute)
+    if n < 2 * LEAST_IN_STRATUM:
+        return TWO_SIDED_95 * float(np.sqrt((absolute**2).mean()))
+    return float(np.quantile(absolute, min(LEVEL * (n + 1) / n, 1.0), method="higher"))
+
+
+@dataclass(frozen=True, slots=True)
+class ValueRange:
+    """The calibrated values, low to high, and what predictions at their ends may hide.
+
+    Predictions at or below low_end may hide any lower value, those at or above high_end any higher one (−∞ and ∞ where
+    none is hidden); lowest and highest are the furthest values that may occur.
+    """
+
+    low: float
+    high: float
+    lowest: float = -math.inf
+    highest: float = math.inf
+    low_end: float = -math.inf
+    high_end: float = math.inf
+
+    def scaled(self, factor: float) -> "ValueRange":
+        """Return the range of values larger by a factor, where no prediction hides a value."""
+        return ValueRange(*(factor * end for end in (self.low, self.high, self.lowest, self.highest)))

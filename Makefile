@@ -11,7 +11,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CONSTRAINTS ?=
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS))
 
-.PHONY: lock coverage install install-dev system-packages demo demo-python docs docs-site test test-fast lint format clean
+.PHONY: lock coverage notebook install install-dev system-packages demo demo-python docs docs-site test test-fast lint format clean
 
 # Before anything is installed.
 demo-python:
@@ -84,6 +84,13 @@ lint: install-dev
 format: install-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# The notebook with its outputs. It runs in a folder of its own, because it records.
+notebook: install-dev
+	rm -rf build/notebook && mkdir -p build/notebook
+	cp docs/first-recording.ipynb build/notebook/
+	cd build/notebook && ../../$(BIN)/jupyter-execute --inplace first-recording.ipynb
+	cp build/notebook/first-recording.ipynb docs/
 
 # The generated pages.
 docs: $(VENV)/.installed

@@ -44,7 +44,7 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.models import MODELS, GripperModel
-from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.drivers.robotiq.socket_client import REPLY_DEADLINE_S, SocketClient
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
@@ -63,16 +63,26 @@ def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
     return load_device_calibration(config.calibration, LoadCalibration)
 
 
-def make_gripper_client(config: GripperConfig) -> RobotiqClient:
-    """Return the gripper's client, not connected yet."""
+def patience_of(config: DaemonConfig) -> float:
+    """Return the factor on the deadlines of a rig's devices: above 1 for an emulated rig alone."""
+    return EMULATED_PATIENCE if config.emulated else 1.0
+
+
+def make_gripper_client(config: GripperConfig, patience: float = 1.0) -> RobotiqClient:
+    """Return the gripper's client, not connected yet; `patience` is the factor on the deadline of its replies."""
     if config.socket is not None:
-        return SocketClient(config.socket.host, config.socket.port)
+        deadline_s = patience * REPLY_DEADLINE_S
+        return SocketClient(config.socket.host, config.socket.port, reply_deadline_s=deadline_s)
     if config.modbus is not None:
         # Imported here: pymodbus is slow to import and rarely used.
-        from shearloop.drivers.robotiq.modbus_client import ModbusClient
+        from shearloop.drivers.robotiq import modbus_client
 
         path = str(config.modbus.path) if config.modbus.path is not None else None
-        return ModbusClient(serial_number=config.modbus.serial_number, path=path)
+        return modbus_client.ModbusClient(
+            serial_number=config.modbus.serial_number,
+            path=path,
+            reply_deadline_s=patience * modbus_client.REPLY_DEADLINE_S,
+        )
     raise ValueError("a gripper needs a socket or modbus")
 
 
@@ -137,7 +147,6 @@ def make_loop(
         name: min(getattr(config.loop, name), getattr(robot.limits, name).inner)
         for name in ("wrist_speed_rad_per_s", "wrist_acceleration_rad_per_s2")
     }
-    patience = EMULATED_PATIENCE if config.emulated else 1.0
     if config.emulated:
         limited["stale_after_s"] = max(config.loop.stale_after_s, EMULATED_STALE_S)
     loop = config.loop.model_copy(update=limited)
@@ -147,12 +156,12 @@ def make_loop(
         for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
         if fingertip is not None and fingertip.creep is not None
     }
-    return ControlLoop(loop, sources, required, gels, dead_tasks, patience)
+    return ControlLoop(loop, sources, required, gels, dead_tasks, patience_of(config))
 
 
-def make_gripper(config: GripperConfig, loop: ControlLoop, publisher: Publisher) -> GripperTask:
-    """Return the gripper's task; it is not connected yet."""
-    client, calibration = make_gripper_client(config), gripper_calibration(config)
+def make_gripper(config: GripperConfig, loop: ControlLoop, publisher: Publisher, patience: float) -> GripperTask:
+    """Return the gripper's task; it is not connected yet. `patience` is the factor on the deadline of its replies."""
+    client, calibration = make_gripper_client(config, patience), gripper_calibration(config)
     hand = RobotiqGripper(client, calibration, monitor=LinkMonitor(LinkReporter("gripper", loop)))
     measures = config.calibration is not None
     return GripperTask(hand, publisher, loop, FingertipDiameters(COMBINED), measures_diameters=measures)
@@ -229,6 +238,7 @@ def build_sensors(
     def pipeline(name: str, estimator: FrameEstimator) -> FingertipPipeline:
         return FingertipPipeline(name, estimator, publisher, clock, loop, gripper, inputs(name))
 
+    patience = patience_of(config)
     pairs: CombinedFingertips | None = None
     if combined is not None:
         period_s = config.fingertips[combined.calibration.sides[0]].frame_period_s
@@ -238,7 +248,7 @@ def build_sensors(
     states = FingertipStates(clock, pairs)
     for name, estimator in estimators.items():
         own, tareable[name] = config.fingertips[name], (estimates := pipeline(name, estimator))
-        board = EitKit(link(name, own.device), estimator.table.zero_slots, own.frame_period_s, inputs(name))
+        board = EitKit(link(name, own.device), estimator.table.zero_slots, own.frame_period_s, inputs(name), patience)
         states.add(board, estimates)
         tasks[name] = FingertipTask(board, estimates, publisher, states, pairs, own.heatmap == "always")
     if pairs is not None:
@@ -249,7 +259,7 @@ def build_sensors(
         tasks[SKIN_CURRENT] = skin.source
     if (cell := config.load_cell) is not None:
         calibration = load_cell_calibration(cell)
-        lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL))
+        lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL), patience)
         tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
     return Sensors(tasks, tareable, pairs)
 
@@ -266,7 +276,7 @@ def build_rig(
     if settings is None:
         return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
     loop = make_loop(config, settings, sources, supervisor.dead)
-    gripper = make_gripper(config.gripper, loop, publisher) if config.gripper is not None else None
+    gripper = make_gripper(config.gripper, loop, publisher, patience_of(config)) if config.gripper is not None else None
     sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), warns=not config.emulated)
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)

@@ -371,9 +371,10 @@ class EitKit(SerialSensor[Frame]):
         zero_slots: NDArray[np.bool_],
         frame_period_s: float = FRAME_PERIOD_S,
         inputs: InputRecorder | None = None,
+        patience: float = 1.0,
     ) -> None:
         self._frame_parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
-        super().__init__(link, frame_period_s, self._frame_parser, inputs)
+        super().__init__(link, frame_period_s, self._frame_parser, inputs, patience)
 
     @property
     def period_s(self) -> float:

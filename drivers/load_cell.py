@@ -170,10 +170,11 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
         calibration: LoadCalibration,
         rate_hz: float = LOAD_CELL_RATE_HZ,
         inputs: serial_sensor.InputRecorder | None = None,
+        patience: float = 1.0,
     ) -> None:
         self._load_parser = LoadParser(calibration, rate_hz)
         # A fast board may seem silent to a busy computer; reopening would reset it.
-        super().__init__(link, 1.0 / min(rate_hz, LOAD_CELL_RATE_HZ), self._load_parser, inputs)
+        super().__init__(link, 1.0 / min(rate_hz, LOAD_CELL_RATE_HZ), self._load_parser, inputs, patience)
 
     def tare(self, raw_at_rest: float) -> None:
         """Make a raw value the zero of the samples to come."""

@@ -258,9 +258,17 @@ class SerialSensor(Generic[ValueT]):
     silence_hint = ""
 
     def __init__(
-        self, link: Link, period_s: float, parser: Parser[ValueT], inputs: InputRecorder | None = None
+        self,
+        link: Link,
+        period_s: float,
+        parser: Parser[ValueT],
+        inputs: InputRecorder | None = None,
+        patience: float = 1.0,
     ) -> None:
-        """Use the link, not yet open, of a board with a line every `period_s`; `inputs` keeps every parser input."""
+        """Use the link, not yet open, of a board with a line every `period_s`; `inputs` keeps every parser input.
+
+        `patience` is the factor on the longest silence: above 1 for an emulated board, which a busy computer delays.
+        """
         self._link = link
         self._period_s = period_s
         self._parser = parser
@@ -268,7 +276,7 @@ class SerialSensor(Generic[ValueT]):
         self._silence_s = BOOT_S
         # Values of the last read that `readings` has not yielded yet: the parser is ahead of its reader by these.
         self.unread = 0
-        self._patience = 1
+        self._least_patience = self._patience = patience
         self._prompt_values = 0
         self._value_ns = 0
 
@@ -330,7 +338,7 @@ class SerialSensor(Generic[ValueT]):
         self._value_ns = now_ns
         self._prompt_values = self._prompt_values + 1 if waited_s < 0.5 * self._longest_silence_s else 0
         if self._prompt_values >= PROMPT_VALUES:
-            self._patience = 1
+            self._patience = self._least_patience
 
     def _dispatch(self, kind: InputKind, t_ns: int, data: bytes = b"") -> Sequence[ValueT]:
         event = RawEvent(kind, t_ns, data)

@@ -1,8 +1,11 @@
 """An emulated rig survives a busy computer; a real one keeps its deadlines."""
 
+import socket
+
 import pytest
 import yaml
 
+from shearloop.daemon import rig
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import Watched, detect_faults
@@ -10,6 +13,7 @@ from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyMo
 from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs, TorqueSource
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.rig import EMULATED_PATIENCE, make_loop, open_settings
+from shearloop.drivers.errors import DeviceLostError
 from shearloop.errors import UserError
 from tests.fixtures.daemons import robot_at
 
@@ -46,7 +50,9 @@ def test_only_an_emulated_rig_has_longer_deadlines(tmp_path):
     content = {"fingertips": {"right": {"device": {"path": str(tmp_path / "right")}}}, "robot": "ur.yaml"}
     found = {}
     for emulated in (False, True):
-        (tmp_path / "rig.yaml").write_text(yaml.safe_dump({**content, "emulated": emulated}))
+        (tmp_path / "rig.yaml").write_text(
+            yaml.safe_dump({**content, "emulated": emulated, "load_cell": {"device": {"path": "load"}}})
+        )
         config = load_daemon_config(tmp_path / "rig.yaml")
         settings = open_settings(config)
         loop = make_loop(config, settings, {"right": EIT}, {})
@@ -57,3 +63,24 @@ def test_only_an_emulated_rig_has_longer_deadlines(tmp_path):
     robot_at("192.168.1.10", tmp_path)
     with pytest.raises(UserError, match="is not this computer"):
         open_settings(load_daemon_config(tmp_path / "rig.yaml"))
+
+
+@pytest.mark.parametrize(("emulated", "deadline"), [(False, "0.01 s"), (True, "0.1 s")])
+async def test_the_gripper_of_an_emulated_rig_may_answer_later(emulated, deadline, tmp_path, monkeypatch):
+    monkeypatch.setattr(rig, "REPLY_DEADLINE_S", 0.01)
+    # The kernel accepts the connection, and no one answers.
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        content = {
+            "gripper": {"socket": {"host": "127.0.0.1", "port": port}},
+            "emulated": emulated,
+            "load_cell": {"device": {"path": "load"}},
+        }
+        (tmp_path / "rig.yaml").write_text(yaml.safe_dump({**content, "robot": "ur.yaml"}))
+        robot_at("127.0.0.1", tmp_path)
+        config = load_daemon_config(tmp_path / "rig.yaml")
+        client = rig.make_gripper_client(config.gripper, rig.patience_of(config))
+        await client.connect()
+        with pytest.raises(DeviceLostError, match=f"within {deadline}"):
+            await client.read()
+        await client.close()

@@ -10,6 +10,7 @@ import pytest
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers.connection import Link, LinkEvent, LinkMonitor, Port, Received
+from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.serial_sensor import BOOT_S, LONGEST_PATIENCE, SILENT_PERIODS, SerialSensor
@@ -123,6 +124,14 @@ async def test_a_board_that_is_slower_than_configured_is_waited_for_longer_each_
     assert link.waits_s[0] == max(BOOT_S, base_s)
     assert link.waits_s[7] == max(BOOT_S, LONGEST_PATIENCE * base_s)
     assert link.waits_s == sorted(link.waits_s)
+
+
+async def test_an_emulated_board_is_waited_for_longer():
+    link = PlayedLink(reads=[(0.1, b"0.01\n")])
+    device = LoadCell(link, LoadCalibration.of_torque_lines(), patience=10.0)
+    await played(device, link, losses=1)
+    # It opens, sends one value, and is silent.
+    assert link.waits_s[1] == pytest.approx(10.0 * SILENT_PERIODS / LOAD_CELL_RATE_HZ)
 
 
 class _EnoughError(Exception):

@@ -49,6 +49,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices", nargs="*")
     text = "make a calibration without each of these in turn, and judge it there: no CAL, all are recordings"
     parser.add_argument("--leave-out", choices=("grips", "twists", "levels", "tools"), help=text)
+    text = "with --leave-out: each fit chooses its settings too, so that no choice has seen the block that judges it"
+    parser.add_argument("--nested", action="store_true", help=text)
     add_recipe(parser)
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     text = "share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
@@ -130,6 +132,7 @@ def _refuse_recipe(args: argparse.Namespace) -> None:
         ("--load-cell-delay-s", args.load_cell_delay_s is not None),
         ("--tool-mm", args.tool_mm is not None),
         ("--assume-full-range", args.assume_full_range),
+        ("--nested", args.nested),
     ):
         if given:
             raise UserError(f"{option} is for --leave-out: the calibration is made already; leave it out")
@@ -147,6 +150,10 @@ def _leave_out(args: argparse.Namespace) -> int:
     check_recipe(args, paths)
     if args.plot or args.out is not None:
         raise UserError("--plot and --out draw one calibration; leave them out with --leave-out")
+    if args.nested and (args.estimator != DEFAULT or any(path.is_dir() for path in paths)):
+        raise UserError(
+            f"--nested is for recordings and the estimator {DEFAULT}: only its fit has settings; leave it out"
+        )
     if args.estimates is not None:
         check_overwrite(args.estimates, "a table")
     read = read_parts(
@@ -154,7 +161,9 @@ def _leave_out(args: argparse.Namespace) -> int:
         tool_mm=args.tool_mm,
     )  # fmt: skip
     bank, mesh = (None if path is None else path.resolve() for path in (args.bank, args.mesh))
-    recipe = Recipe(args.estimator, bank, mesh, read.timing.uncertainty_s, full_range=args.assume_full_range)
+    recipe = Recipe(
+        args.estimator, bank, mesh, read.timing.uncertainty_s, full_range=args.assume_full_range, nested=args.nested
+    )
     with open_executor(args.cluster) as pool:
         found = judge_left_out(args.leave_out, recipe, read.parts, [path.name for path in read.paths], pool)
     if args.estimates is not None:

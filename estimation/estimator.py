@@ -100,7 +100,7 @@ class Material:
     """What an estimator is prepared from: the scale (m, c) of its differences, knowledge before calibration, and
     the channels.
 
-    Raw recordings have validators, and the (n, m, c) frames of each grip.
+    Raw recordings have validators, and the (n, m, c) frames of each grip. With `nested` the fit chooses its settings.
     """
 
     scale: FloatArray
@@ -108,6 +108,7 @@ class Material:
     table: ChannelTable
     validators: tuple[FingertipValidator, ...] = ()
     grips: Sequence[FloatArray] = ()
+    nested: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -54,12 +54,14 @@ def fit(
     *,
     timing: LoadTiming | None = None,
     full_range: bool = False,
+    nested: bool = False,
 ) -> Calibration:
     """Calibrate an estimator on recordings of one kind, in time order; `source` describes them in words.
 
     Slices with torque give a torque, those with diameters a diameter. `timing` is measured on the recordings where it
     is not given. With `full_range` the user guarantees that no torque exceeds the slices: intervals do not extend
-    further. Raises CalibrationError for recordings that do not determine the calibration, and for missing physics.
+    further. With `nested` a fit of motion chooses its settings too, instead of the usual ones. Raises CalibrationError
+    for recordings that do not determine the calibration, and for missing physics.
     """
     physics, kind = physics or Physics(), estimator_class(name)
     sides = _check_recordings(recordings)
@@ -71,7 +73,7 @@ def fit(
         timing = timing or measure_timing(recordings)
     table = recordings[0].table
     slices = Material(np.ones((len(sides), table.n_channels)), physics, table)
-    material = _material(chosen, physics) if is_raw else slices
+    material = replace(_material(chosen, physics), nested=nested) if is_raw else slices
     tools = _tools_of(recordings)
     blank = Calibration(
         estimator=kind.prepare(material),

@@ -8,6 +8,7 @@ by it.
 """
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -15,7 +16,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.estimation.gain import find_twists
 from shearloop.estimation.interval_regressor import reported_values
 from shearloop.estimation.left_out import LeftOut, left_out_groups
@@ -28,49 +29,77 @@ MOST_DIRECTIONS = 3
 _DIRECTIONS, _STEPS, _PENALTIES = (1, 2, 3), (10, 12), (1e-5, 1e-4)
 # Where the gel holds its position, that position shows a long twist, and the shortest memory serves.
 _STEPS_WITH_POSITION = (8,)
-# Fits with a left-out error within this factor of the minimum are averaged.
-_NEARLY_AS_GOOD = 1.25
 # Minimum number of twists that are left out one by one, and maximum number of parts; more twists are grouped.
 _LEAST_TWISTS, _MOST_PARTS = 3, 10
 # Below this fraction of loaded frames, the frames left out hold few twists.
 _RARE_LOAD, _FRAMES_OF_FEW_TWISTS = 0.5, 2
-# The slope is divided out if left-out loads err by less than this fraction: a poor estimate has no sure slope. On the
-# recorded stream both fingertips have 0.08, right 0.11, left 0.25.
-_SURE_SLOPE = 0.15
-
 # Fits (n, d) features to (n,) values with a penalty.
 LinearFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Ridge]
 
 
 @dataclass(frozen=True, slots=True)
+class Settings:
+    """How fits are chosen and averaged. `window` is the number of the window that directions come from.
+
+    Fits with a left-out error within the factor `nearly_as_good` of the minimum are averaged. The slope is divided out
+    if left-out loads err by less than the fraction `sure_slope`, because a poor estimate has no sure slope. On the
+    recorded stream both fingertips have 0.08, right 0.11, left 0.25.
+    """
+
+    window: int = 0
+    nearly_as_good: float = 1.25
+    sure_slope: float = 0.15
+
+
+# Settings that a nested choice tries in each of the windows.
+_NEARLY_AS_GOOD, _SURE_SLOPES = (1.0, 1.25, 1.5), (0.0, 0.15, math.inf)
+
+
+@dataclass(frozen=True, slots=True)
 class Layout:
-    """What the columns of the features of motion are: steps of the memory × sides × directions, then positions."""
+    """What the columns of the features of motion are: steps of the memory × sides × directions, then positions.
+
+    The directions are MOST_DIRECTIONS of each window, one window after the other.
+    """
 
     n_steps: int
     n_sides: int
     n_directions: int
 
-    def columns(self, n_steps: int, n_directions: int, *, position: bool) -> BoolArray:
-        """Return which columns (d,) belong to the nearest steps, the first directions, and perhaps their positions."""
-        shape = self.n_steps, self.n_sides, self.n_directions
-        step, _, direction = np.indices(shape)
-        moved = (step < n_steps) & (direction < n_directions)
-        positions = np.indices(shape[1:])[1] < n_directions
-        return np.concatenate([moved.ravel(), positions.ravel() & position])
+    @property
+    def n_windows(self) -> int:
+        """The number of windows that directions come from."""
+        return max(self.n_directions // MOST_DIRECTIONS, 1)
+
+    def columns(self, n_steps: int, n_directions: int, window: int = 0, *, position: bool) -> BoolArray:
+        """Return which columns (d,) belong to the nearest steps and a window's first directions.
+
+        With `position` the positions along these directions belong to them too.
+        """
+        first = window * MOST_DIRECTIONS
+        number = np.arange(self.n_directions)
+        used = (number >= first) & (number < first + n_directions)
+        moved = np.broadcast_to(used, (self.n_steps, self.n_sides, self.n_directions)).copy()
+        moved[n_steps:] = False
+        return np.concatenate([moved.ravel(), np.tile(used & position, self.n_sides)])
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One choice of directions per fingertip, steps of the memory, and penalty."""
+    """One choice of directions per fingertip, steps of the memory, penalty, and the directions' window."""
 
     n_directions: int
     n_steps: int
     penalty: float
+    window: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionFit:
-    """The chosen candidates; the slope of their mean, the fit, on frames left out; and its mean squared error there."""
+    """The chosen candidates; the slope of their mean, the fit, on frames left out; and its mean squared error there.
+
+    The candidates have one window.
+    """
 
     layout: Layout
     fit_one: LinearFit
@@ -90,9 +119,15 @@ class MotionFit:
         return max(one.n_steps for one in self.candidates)
 
     @property
+    def first_direction(self) -> int:
+        """The number of the first direction of the candidates' window."""
+        return self.candidates[0].window * MOST_DIRECTIONS
+
+    @property
     def columns(self) -> BoolArray:
         """Which columns (d,) of the features are used."""
-        return self.layout.columns(self.n_steps, self.n_directions, position=self.position)
+        window = self.candidates[0].window
+        return self.layout.columns(self.n_steps, self.n_directions, window, position=self.position)
 
     def fit(self, features: FloatArray, values: FloatArray, _strength: float = 0.0) -> Ridge:
         """Return the mean of the candidates' fits to (n, d) features and (n,) values, divided by the slope."""
@@ -107,7 +142,7 @@ class MotionFit:
         return replace(found, mean=found.mean[self.columns], weights=found.weights[self.columns])
 
     def _fit_candidate(self, one: Candidate, features: FloatArray, values: FloatArray) -> Ridge:
-        columns = self.layout.columns(one.n_steps, one.n_directions, position=self.position)
+        columns = self.layout.columns(one.n_steps, one.n_directions, one.window, position=self.position)
         found = self.fit_one(features[:, columns], values, one.penalty)
         mean, weights = np.zeros((2, features.shape[1]))
         mean[columns], weights[columns] = found.mean, found.weights
@@ -152,23 +187,74 @@ def choose_motion(
     *,
     position: bool,
 ) -> MotionFit:
-    """Return the fit of (n, d) features, with all of the layout's columns, to (n,) torques."""
+    """Return the fit of (n, d) features, with all of the layout's columns, to (n,) torques.
+
+    With directions of several windows, window and settings are chosen too.
+    """
     twists = find_twists(torque_nm)
     loaded = np.concatenate(twists)
     # A single twist does not show which fit another one needs: one direction is the safest.
     can_choose = len(twists) >= _LEAST_TWISTS or len(loaded) > _RARE_LOAD * len(torque_nm)
     directions = _DIRECTIONS if can_choose else (1,)
     steps = _STEPS_WITH_POSITION if position else _STEPS
-    candidates = tuple(itertools.starmap(Candidate, itertools.product(directions, steps, _PENALTIES)))
+    windows = range(layout.n_windows if can_choose else 1)
+    combinations = itertools.product(directions, steps, _PENALTIES, windows)
+    candidates = tuple(itertools.starmap(Candidate, combinations))
     fits = [MotionFit(layout, fit_one, position, (one,)) for one in candidates]
     predicted = np.array([_predict_left_out(one, features, torque_nm, left_out) for one in fits])
-    reported = partial(reported_values, fits[0].fit(features, torque_nm))
-    squares = ((reported(predicted) - torque_nm)[:, loaded] ** 2).mean(axis=1)
-    good = squares <= _NEARLY_AS_GOOD**2 * squares.min() if can_choose else np.ones(len(fits), dtype=np.bool_)
-    left_out_nm = reported(predicted[good].mean(axis=0))
-    slope = _shrinkage(left_out_nm[loaded], torque_nm[loaded]) if can_choose else 1.0
+    judged = _LeftOutFits(
+        predicted,
+        np.array([one.window for one in candidates]),
+        torque_nm,
+        partial(reported_values, fits[0].fit(features, torque_nm)),
+    )
+    good, slope = np.ones(len(fits), dtype=np.bool_), 1.0
+    if can_choose:
+        settings = Settings() if len(windows) == 1 else judged.best_settings(loaded, left_out)
+        good, slope = judged.choose(settings, loaded)
+    left_out_nm = judged.mean(good, np.arange(len(torque_nm)))
     error = float(((left_out_nm - torque_nm) ** 2).mean())
     return MotionFit(layout, fit_one, position, tuple(itertools.compress(candidates, good)), slope, error)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LeftOutFits:
+    """Raw predictions (k, n) of k fits on frames left out, each one's window (k,), and the (n,) torques.
+
+    `reported` turns raw predictions into the torques that they mean.
+    """
+
+    predicted: FloatArray
+    windows: IntArray
+    torque_nm: FloatArray
+    reported: Callable[[FloatArray], FloatArray]
+
+    def mean(self, good: BoolArray, rows: IntArray) -> FloatArray:
+        """Return the torques of rows by the mean of the good fits (k,)."""
+        return self.reported(self.predicted[good][:, rows].mean(axis=0))
+
+    def choose(self, settings: Settings, rows: IntArray) -> tuple[BoolArray, float]:
+        """Return which fits (k,) are averaged, and the slope of their mean, as these loaded rows show it."""
+        truth = self.torque_nm[rows]
+        squares = ((self.reported(self.predicted[:, rows]) - truth) ** 2).mean(axis=1)
+        squares[self.windows != settings.window] = np.inf
+        good = squares <= settings.nearly_as_good**2 * squares.min()
+        return good, _shrinkage(self.mean(good, rows), truth, settings.sure_slope)
+
+    def best_settings(self, loaded: IntArray, left_out: LeftOut) -> Settings:
+        """Return the settings with the minimum error on each part's loaded rows, where the other parts choose."""
+        parts = [np.intersect1d(part, loaded) for _, part in left_out]
+        numbers = np.unique(self.windows).tolist()
+        choices = itertools.starmap(Settings, itertools.product(numbers, _NEARLY_AS_GOOD, _SURE_SLOPES))
+
+        def squared_error(settings: Settings) -> float:
+            errors: list[FloatArray] = []
+            for own in parts:
+                good, slope = self.choose(settings, np.setdiff1d(loaded, own))
+                errors.append(self.mean(good, own) / slope - self.torque_nm[own])
+            return float((np.concatenate(errors) ** 2).sum())
+
+        return min(choices, key=squared_error)
 
 
 def _predict_left_out(one: MotionFit, features: FloatArray, values: FloatArray, left_out: LeftOut) -> FloatArray:
@@ -179,9 +265,13 @@ def _predict_left_out(one: MotionFit, features: FloatArray, values: FloatArray, 
     return predicted
 
 
-def _shrinkage(predicted: FloatArray, truth: FloatArray) -> float:
-    """Return the slope of (n,) predictions over the truth of loaded frames, 1 where they are too poor to show it."""
+def _shrinkage(predicted: FloatArray, truth: FloatArray, sure: float) -> float:
+    """Return the slope of (n,) predictions over the truth of loaded frames.
+
+    It is 1 where they err by more than the fraction `sure` of the truth, both as root mean squares.
+    """
     power = float(truth @ truth)
-    if float(((predicted - truth) ** 2).sum()) > _SURE_SLOPE**2 * power:
+    along = float(predicted @ truth)
+    if along <= 0 or float(((predicted - truth) ** 2).sum()) > sure**2 * power:
         return 1.0
-    return float(predicted @ truth) / power
+    return along / power

@@ -48,8 +48,8 @@ from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
 from shearloop.estimation.session_state import Motion
 
 # The directions of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err
-# more, over 12 frames later twists do (docs/decisions/0044).
-_DIRECTION_FRAMES = 8
+# more, over 12 frames later twists do (docs/decisions/0044). A nested choice tries all three.
+_DIRECTION_FRAMES, _NESTED_DIRECTION_FRAMES = (8,), (8, 6, 12)
 # An estimate needs this many frames of the grip before its own, 6.5 s. An older part of the memory counts as the oldest
 # of them, so that the memory costs no twist.
 _LEAST_LAGS = 12
@@ -87,15 +87,18 @@ class TemporalFeatures(Motion):
     uses_position: bool = False
 
     @classmethod
-    def fit(cls, parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...]) -> Self:
-        """Fit the main directions of motion to each recording's (n, m, c) gripped frames."""
-        directions = []
-        for layer, one in enumerate(validators):
-            moved = np.vstack(
-                [(part[_DIRECTION_FRAMES:, layer] - part[:-_DIRECTION_FRAMES, layer]) / one.noise for part in parts]
-            )
-            rows = np.linalg.svd(moved, full_matrices=False)[2][:MOST_DIRECTIONS] / one.noise
-            directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
+    def fit(
+        cls, parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...], *, nested: bool = False
+    ) -> Self:
+        """Fit the main directions of motion to each recording's (n, m, c) gripped frames.
+
+        With `nested` they are of the motion over several times, for the fit to choose.
+        """
+        windows = _NESTED_DIRECTION_FRAMES if nested else _DIRECTION_FRAMES
+        directions = [
+            np.vstack([_main_directions([part[:, layer] for part in parts], one.noise, frames) for frames in windows])
+            for layer, one in enumerate(validators)
+        ]
         return cls(np.array(directions), np.array(MEMORY_EDGES), uses_position=True)
 
     @property
@@ -116,7 +119,8 @@ class TemporalFeatures(Motion):
 
     def reduced(self, to: MotionFit) -> Self:
         """Return the features that a fit uses."""
-        directions = self.directions[:, : to.n_directions].copy()
+        first = to.first_direction
+        directions = self.directions[:, first : first + to.n_directions].copy()
         return replace(self, directions=directions, edges=self.edges[: to.n_steps + 1], uses_position=to.position)
 
     def project(self, channels: FloatArray) -> FloatArray:
@@ -152,6 +156,13 @@ class TemporalFeatures(Motion):
         return np.concatenate([moved, from_idle]) if self.uses_position else moved
 
 
+def _main_directions(parts: Sequence[FloatArray], noise: FloatArray, frames: int) -> FloatArray:
+    """Return the main directions (p, c), in units of noise (c,), of the motion over `frames` in each part (n, c)."""
+    moved = np.vstack([(part[frames:] - part[:-frames]) / noise for part in parts])
+    rows = np.linalg.svd(moved, full_matrices=False)[2][:MOST_DIRECTIONS] / noise
+    return np.asarray(rows * np.sign(rows.sum(axis=1, keepdims=True)))
+
+
 @dataclass(frozen=True, eq=False)
 class MotionRegression(Estimator):
     """A ridge on the gel's motion over the last frames; for slices a curve of frames over the value.
@@ -173,7 +184,8 @@ class MotionRegression(Estimator):
         """Return the estimator with the directions of the grips' motion."""
         if not material.validators:
             return cls(material.scale, material.table)
-        return cls(material.scale, material.table, temporal=TemporalFeatures.fit(material.grips, material.validators))
+        temporal = TemporalFeatures.fit(material.grips, material.validators, nested=material.nested)
+        return cls(material.scale, material.table, temporal=temporal)
 
     @property
     def motion(self) -> Motion:

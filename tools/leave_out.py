@@ -41,19 +41,26 @@ _LEAST_COVERAGE = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a calibration is made: estimator, files of bank and mesh, and the known facts of torques and their times."""
+    """How a calibration is made: estimator, files of bank and mesh, and the known facts of torques and their times.
+
+    With `nested` each fit chooses its settings too, which else are those of `shearloop calibrate`.
+    """
 
     estimator: EstimatorName
     bank: Path | None = None
     mesh: Path | None = None
     timing_uncertainty_s: float = 0.0
     full_range: bool = False
+    nested: bool = False
 
     def fit(self, recordings: Sequence[FrameSeries]) -> Calibration:
         """Return the calibration of recordings; raises CalibrationError as `fit` does."""
         physics = Physics(bank=self.open_bank(), mesh=load_mesh(self.mesh) if self.mesh else None)
         timing = LoadTiming(uncertainty_s=self.timing_uncertainty_s)
-        return fit(self.estimator, recordings, "left out", physics, timing=timing, full_range=self.full_range)
+        return fit(
+            self.estimator, recordings, "left out", physics,
+            timing=timing, full_range=self.full_range, nested=self.nested,
+        )  # fmt: skip
 
     def open_bank(self) -> Bank | None:
         """Return the bank, None without one."""

@@ -43,6 +43,8 @@ def test_calibrate_judges_or_names_the_command(limit_s, slices_folder, tmp_path,
         ("--leave-out grips a.mcap --plot", "leave them out with --leave-out"),
         ("--leave-out grips a.mcap a.mcap", "given twice"),
         ("--leave-out grips nowhere.mcap", "cannot be read"),
+        ("a.cal b.mcap --nested", "--nested is for --leave-out"),
+        ("--leave-out twists a.mcap --nested --estimator regression", "--nested is for recordings and the estimator"),
     ],
 )
 def test_a_mistake_ends_in_one_sentence(arguments, said, mistake):

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from shearloop.estimation.motion_fit import MEMORY_EDGES, Layout, choose_motion, mean_ridge, twists_left_out
+from shearloop.estimation.motion_fit import (
+    MEMORY_EDGES,
+    MOST_DIRECTIONS,
+    Layout,
+    choose_motion,
+    mean_ridge,
+    twists_left_out,
+)
 from shearloop.estimation.ridge import CensoredRidge, Ridge
 
 LAYOUT = Layout(len(MEMORY_EDGES) - 1, 2, 3)
@@ -62,6 +69,22 @@ def test_what_shrinks_is_divided_out():
 
     chosen = choose_motion(features, torque_nm, LAYOUT, shrinking, twists_left_out(torque_nm), position=False)
     assert chosen.slope == pytest.approx(0.9, abs=0.03)
+
+
+def test_a_nested_choice_takes_the_window_whose_directions_follow_the_torque():
+    windows = Layout(len(MEMORY_EDGES) - 1, 2, 3 * MOST_DIRECTIONS)
+    rng = np.random.default_rng(4)
+    torque_nm = np.tile(TWIST, 8)
+    features = rng.normal(0, 0.05, (len(torque_nm), len(windows.columns(12, 3, position=True))))
+    features[:, windows.columns(12, 1, 2, position=False)] += torque_nm[:, None] / 0.05
+    left_out = twists_left_out(torque_nm)
+    chosen = choose_motion(features, torque_nm, windows, CensoredRidge.fit, left_out, position=False)
+    assert {one.window for one in chosen.candidates} == {2}
+    assert chosen.first_direction == 2 * MOST_DIRECTIONS
+    predicted = chosen.fit(features, torque_nm).predict(features)
+    assert np.abs(np.maximum(predicted, 0.0) - torque_nm).max() < 0.01
+    used = features[:, chosen.columns]
+    assert used.shape[1] == 2 * chosen.n_directions * chosen.n_steps
 
 
 def test_a_mean_of_ridges_predicts_the_mean():

@@ -23,6 +23,7 @@ from shearloop.tools.parallel import SerialExecutor
 from tests.estimation.conftest import sliced, twisting
 
 RECIPE = Recipe("motion_regression")
+NESTED = replace(RECIPE, nested=True)
 
 
 def of_tool(diameter_mm: float, seed: int) -> FrameSeries:
@@ -51,14 +52,14 @@ def corrupted(recordings, block):
     return found
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_block_is_not_in_its_own_fit(kind, tmp_path):
+@pytest.mark.parametrize(("kind", "recipe"), [*((kind, RECIPE) for kind in KINDS), ("twists", NESTED)])
+def test_a_block_is_not_in_its_own_fit(kind, recipe, tmp_path):
     recordings = MATERIAL[kind]()
     names = [f"{number}.mcap" for number in range(len(recordings))]
     for number, block in enumerate(find_blocks(kind, recordings, names)[:2]):
         own, other = tmp_path / f"{number}.cal", tmp_path / f"{number}_other.cal"
-        fit_without(RECIPE, recordings, block).save(own)
-        fit_without(RECIPE, corrupted(recordings, block), block).save(other)
+        fit_without(recipe, recordings, block).save(own)
+        fit_without(recipe, corrupted(recordings, block), block).save(other)
         assert own.read_bytes() == other.read_bytes(), block.name
 
 

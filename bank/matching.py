@@ -47,6 +47,9 @@ class Match:
 class Matcher(ABC):
     """Scores differences against all valid cells of a bank; keeps no state between calls."""
 
+    # The basis model of the bank that it was made from.
+    model = ""
+
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Take (K, S, n) difference signals, (K, S) validity, and the (K,) and (S,) grids.
 
@@ -66,7 +69,9 @@ class Matcher(ABC):
     @classmethod
     def from_bank(cls, bank: Bank) -> Self:
         """Return the matcher of an opened bank."""
-        return cls(bank.signals, bank.valid, bank.k_grid, bank.sigma_grid)
+        made = cls(bank.signals, bank.valid, bank.k_grid, bank.sigma_grid)
+        made.model = bank.model
+        return made
 
     def heatmap(self, difference: ArrayLike) -> FloatArray:
         """Return the (K, S) scores, 0 to 1, of one (n,) difference; NaN in invalid cells. Errors as `heatmaps`."""

@@ -25,7 +25,7 @@ import zmq
 
 from benchmarks import common
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.sensing.frame_estimator import COMBINED
+from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.emulators.boards import format_line
 from shearloop.tools.recordings.reader import read_recording

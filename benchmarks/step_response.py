@@ -27,7 +27,7 @@ from shearloop.emulators.emulated_rig import SIDES
 from shearloop.emulators.gripper import Gripper
 from shearloop.emulators.scene import Joint, Scene, Twin, TwinSettings
 from shearloop.emulators.synthetic_frames import RigFrames
-from shearloop.estimation import Calibration, EstimatorSession, TactileFrame
+from shearloop.estimation import Calibration, Session, TactileFrame
 from shearloop.studies.charts import simulated_loop as sim
 from shearloop.studies.emulated_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from shearloop.tools.creep import Stretch, fit_creep
@@ -85,7 +85,7 @@ class RigPlant(sim.Plant):
     """The emulated rig with both boards' frames as a plant; an estimator's torques are the measurements."""
 
     frames: RigFrames = field(kw_only=True)
-    tracker: EstimatorSession = field(kw_only=True)
+    tracker: Session = field(kw_only=True)
     scene: Scene = field(init=False)
     not_valid: int = 0
     estimated: int = 0
@@ -247,7 +247,7 @@ def estimator_in_the_loop(bank: Path, calibration: Calibration, seeds: Sequence[
     for seed in seeds:
         plant = RigPlant(
             sim.SimulatedTool(), sim.EIT, np.random.default_rng((30, seed)),
-            frames=RigFrames(bank, seed), tracker=EstimatorSession(calibration),
+            frames=RigFrames(bank, seed), tracker=Session(calibration),
         )  # fmt: skip
         torque_nm, controller = step(plant, scenario)
         rows.append(torque_nm)

@@ -21,20 +21,10 @@ from shearloop.daemon.messaging.addresses import is_loopback_host
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.rig_memory import RigMemory, memory_path
-from shearloop.daemon.sensing.fingertip_task import (
-    CombinedFingertips,
-    FingertipPipeline,
-    FingertipStates,
-    FingertipTask,
-)
-from shearloop.daemon.sensing.frame_estimator import (
-    COMBINED,
-    FrameEstimator,
-    open_combined,
-    open_estimator,
-    torque_sources,
-)
+from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, FingertipStates
+from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
+from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, torque_sources
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, ReplayedSkin, SkinTask
 from shearloop.daemon.supervisor import Supervisor, Task
 from shearloop.drivers.calibration_files import load_device_calibration
@@ -49,6 +39,7 @@ from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
+from shearloop.estimation import Session
 
 # An emulated rig cannot hurt: its deadlines are longer by this factor, so that it survives a busy computer.
 EMULATED_PATIENCE = 10.0
@@ -211,7 +202,7 @@ class Sensors:
 
     tasks: Mapping[str, Task]
     tareable: Mapping[str, Tareable]
-    combined: CombinedFingertips | None
+    combined: CombinedTask | None
 
 
 def build_sensors(
@@ -220,8 +211,8 @@ def build_sensors(
     clock: Clock,
     recorder: Recorder | None,
     loop: ControlLoop | None,
-    estimators: Mapping[str, FrameEstimator],
-    combined: FrameEstimator | None,
+    sessions: Mapping[str, Session],
+    combined: Session | None,
     gripper: GripperTask | None,
 ) -> Sensors:
     """Return all sensors, which publish, are recorded, and drive the control loop, where there is one.
@@ -235,24 +226,30 @@ def build_sensors(
     def link(name: str, device: SerialDevice) -> SerialLink:
         return SerialLink(**device.model_dump(), monitor=LinkMonitor(LinkReporter(name, loop)))
 
-    def pipeline(name: str, estimator: FrameEstimator) -> FingertipPipeline:
-        return FingertipPipeline(name, estimator, publisher, clock, loop, gripper, inputs(name))
-
     patience = patience_of(config)
-    pairs: CombinedFingertips | None = None
+    pairs: CombinedTask | None = None
     if combined is not None:
-        period_s = config.fingertips[combined.calibration.sides[0]].frame_period_s
-        pairs = CombinedFingertips(pipeline(COMBINED, combined), period_s)
+        sides = combined.calibration.sides
+        period_s = config.fingertips[sides[0]].frame_period_s
+        pairs = CombinedTask(
+            COMBINED, combined, publisher, clock, loop, gripper, inputs(COMBINED),
+            period_s=period_s, pairing=FramePairing(sides, period_s),
+        )  # fmt: skip
     tasks: dict[str, Task] = {}
     tareable: dict[str, Tareable] = {}
     states = FingertipStates(clock, pairs)
-    for name, estimator in estimators.items():
-        own, tareable[name] = config.fingertips[name], (estimates := pipeline(name, estimator))
-        board = EitKit(link(name, own.device), estimator.table.zero_slots, own.frame_period_s, inputs(name), patience)
-        states.add(board, estimates)
-        tasks[name] = FingertipTask(board, estimates, publisher, states, pairs, own.heatmap == "always")
+    for name, session in sessions.items():
+        own = config.fingertips[name]
+        zero_slots = session.calibration.table.zero_slots
+        board = EitKit(link(name, own.device), zero_slots, own.frame_period_s, inputs(name), patience)
+        task = BoardTask(
+            name, session, publisher, clock, loop, gripper, inputs(name),
+            board=board, states=states, combined=pairs, always_heatmap=own.heatmap == "always",
+        )  # fmt: skip
+        states.add(task)
+        tasks[name] = tareable[name] = task
     if pairs is not None:
-        tareable[COMBINED] = pairs.pipeline
+        tareable[COMBINED] = pairs
     if config.skin is not None:
         sources = {name: inputs(name) for name in ReplayedSkin.sources}
         tareable[SKIN] = tasks[SKIN] = skin = SkinTask(config.skin, publisher, clock, loop, sources)
@@ -268,16 +265,16 @@ def build_rig(
     config: DaemonConfig, publisher: Publisher, clock: Clock, recorder: Recorder | None, supervisor: Supervisor
 ) -> tuple[Sensors, Rig | None]:
     """Return all sensors, and robot, gripper and control loop, if there is a robot."""
-    estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
+    sessions = {name: open_session(fingertip, name) for name, fingertip in config.fingertips.items()}
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
-    sources = torque_sources(config, estimators, combined)
+    sources = torque_sources(config, sessions, combined)
     settings = open_settings(config)
     check_experiment(config, sources, settings)
     if settings is None:
-        return build_sensors(config, publisher, clock, recorder, None, estimators, combined, None), None
+        return build_sensors(config, publisher, clock, recorder, None, sessions, combined, None), None
     loop = make_loop(config, settings, sources, supervisor.dead)
     gripper = make_gripper(config.gripper, loop, publisher, patience_of(config)) if config.gripper is not None else None
-    sensors = build_sensors(config, publisher, clock, recorder, loop, estimators, combined, gripper)
+    sensors = build_sensors(config, publisher, clock, recorder, loop, sessions, combined, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), warns=not config.emulated)
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, settings.limits, gripper_model(config))

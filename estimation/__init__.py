@@ -1,15 +1,16 @@
-"""Estimators: `fit` makes a calibration from recordings; an `EstimatorSession` turns frames into estimates with it."""
+"""Estimators: `fit` makes a calibration from recordings; a `Session` turns frames into estimates with it."""
 
 from typing import TYPE_CHECKING
 
 from shearloop.faces import importer
 
 if TYPE_CHECKING:
+    from shearloop.estimation.adaptation import Adaptation
     from shearloop.estimation.calibration import Calibration
     from shearloop.estimation.estimator import Estimator, Physics
     from shearloop.estimation.fitting import adapt, fit
     from shearloop.estimation.load_delay import TRUSTED, LoadTiming, measure_timing
-    from shearloop.estimation.session import Adaptation, EstimatorSession
+    from shearloop.estimation.session import Session
     from shearloop.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, combine, torque_at
 
 __all__ = [
@@ -18,11 +19,11 @@ __all__ = [
     "Calibration",
     "Estimate",
     "Estimator",
-    "EstimatorSession",
     "FrameSeries",
     "LoadTiming",
     "Measured",
     "Physics",
+    "Session",
     "TactileFrame",
     "adapt",
     "combine",
@@ -32,15 +33,15 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Adaptation": "shearloop.estimation.session:Adaptation",
+    "Adaptation": "shearloop.estimation.adaptation:Adaptation",
     "Calibration": "shearloop.estimation.calibration:Calibration",
     "Estimate": "shearloop.estimation.values:Estimate",
     "Estimator": "shearloop.estimation.estimator:Estimator",
-    "EstimatorSession": "shearloop.estimation.session:EstimatorSession",
     "FrameSeries": "shearloop.estimation.values:FrameSeries",
     "LoadTiming": "shearloop.estimation.load_delay:LoadTiming",
     "Measured": "shearloop.estimation.values:Measured",
     "Physics": "shearloop.estimation.estimator:Physics",
+    "Session": "shearloop.estimation.session:Session",
     "TRUSTED": "shearloop.estimation.load_delay:TRUSTED",
     "TactileFrame": "shearloop.estimation.values:TactileFrame",
     "adapt": "shearloop.estimation.fitting:adapt",

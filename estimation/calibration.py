@@ -125,6 +125,16 @@ class Calibration:
         return cls(PaperEstimator(np.ones((1, table.n_channels)), table), "raw", (), "", bank_identity)
 
     @property
+    def table(self) -> ChannelTable:
+        """The fingertip's channels."""
+        return self.estimator.table
+
+    @property
+    def measures_torque(self) -> bool:
+        """Whether it gives torques, and not only diameters or positions in a bank."""
+        return self.torque is not None
+
+    @property
     def outputs(self) -> dict[Quantity, OutputModel]:
         """The model of each quantity that the estimator gives."""
         models: dict[Quantity, OutputModel | None] = {"torque": self.torque, "diameter": self.diameter}

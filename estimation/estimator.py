@@ -26,12 +26,13 @@ from shearloop.estimation.bank_match import (
 )
 from shearloop.estimation.channel_imputer import ChannelImputer
 from shearloop.estimation.fingertip_validator import FingertipValidator
+from shearloop.estimation.grip_memory import Motion
 from shearloop.estimation.interval_fit import RegressorFit, fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.left_out import later_origins, left_out_groups
 from shearloop.estimation.novelty import NoveltyDetector
 from shearloop.estimation.ridge import STRENGTHS, Ridge
-from shearloop.estimation.session_state import Motion, ProcessedFrame
+from shearloop.estimation.values import ProcessedFrame
 
 if TYPE_CHECKING:
     from shearloop.bank.mesh import Mesh

@@ -34,9 +34,9 @@ from shearloop.estimation.left_out import later_levels
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.novelty import NoveltyDetector
 from shearloop.estimation.ridge import CensoredRidge
-from shearloop.estimation.session_state import ProcessedFrame, SessionState
+from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
-from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
+from shearloop.estimation.values import FrameSeries, Measured, ProcessedFrame, TactileFrame, check_finite, distinct
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75
@@ -248,11 +248,11 @@ def _replay(
     """Return the frames that an estimate would be made of, processed as in a session; None without any."""
     estimator, rows, grip = calibration.estimator, [], 0
     for recording, series in enumerate(recordings):
-        state = SessionState(calibration.validators, estimator.motion)
+        session = Session(calibration, matcher=matcher)
         grip, was_held = grip + 1, False
         truths = zip(series.torque_at_frames(), series.diameter_mm, strict=True)
         for i, (t_s, channels, truth) in enumerate(zip(series.t_s.tolist(), series.channels, truths, strict=True)):
-            processed = state.process(TactileFrame.of(t_s, channels))
+            processed = session.process(TactileFrame.of(t_s, channels))
             if was_held and not processed.held_frames:
                 grip += 1
             was_held = processed.held_frames > 0

@@ -30,6 +30,7 @@ from shearloop.estimation.estimator import (
     Reading,
 )
 from shearloop.estimation.fingertip_validator import FingertipValidator
+from shearloop.estimation.grip_memory import Motion
 from shearloop.estimation.interval_fit import RegressorFit, fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange
@@ -45,7 +46,6 @@ from shearloop.estimation.motion_fit import (
 )
 from shearloop.estimation.novelty import fitted_parts
 from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
-from shearloop.estimation.session_state import Motion
 
 # The directions of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err
 # more, over 12 frames later twists do (docs/decisions/0044). A nested choice tries all three.

@@ -1,103 +1,55 @@
-"""A session with a calibration: frames in, estimates out, causally."""
+"""A session: the state of one run with a calibration. Frames in, estimates out, causally.
+
+A frame passes the timer, the checks of its channels, the idle frames, the grips, and the memory of this grip. Its
+features then go through the models of the calibration.
+"""
 
 import math
-from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Self
+from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
+from shearloop.estimation.adaptation import Adaptation, GripGain
 from shearloop.estimation.bank_match import BankMatch, BankMatcher
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation.defaults import BASELINE_FRAMES, MAX_GAP_S
+from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading
-from shearloop.estimation.fingertip_validator import FingertipValidator
-from shearloop.estimation.gain import GainCorrection, find_twists, first_twists
-from shearloop.estimation.session_state import PaperState, ProcessedFrame, SessionState, SliceState
-from shearloop.estimation.values import Estimate, Measured, TactileFrame
+from shearloop.estimation.fingertip_validator import (
+    LARGEST_JUMPING_SHARE,
+    FingertipSet,
+    FingertipValidator,
+    GripDetector,
+)
+from shearloop.estimation.frame_checks import ChannelChecks, FrameTimer
+from shearloop.estimation.grip_memory import GripMemory
+from shearloop.estimation.idle_frames import IdleFrames
+from shearloop.estimation.values import Estimate, Measured, ProcessedFrame, TactileFrame
 from shearloop.words import counted
 
-REPEATED_FRAME = ("the board sent the same frame again",)
+_REPEATED_FRAME = ("the board sent the same frame again",)
 _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _UNKNOWN = (None, None, None)
 _UNCALIBRATED = ("no calibration is configured: k and sigma have no torque",)
 _AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
 
-# Frames of a grip that can correct its gain: ten minutes.
-_ADAPTED_FRAMES = 1200
-
 # A value, and its 95 % interval: how far it extends below and above, or its ends.
 _Interval = tuple[float, float, float]
+# Searches a whole bank. It has no state, so sessions may share one.
+BankSearch: TypeAlias = PrunedMatcher | PrunedZeroLagMatcher
 
 
-@dataclass(frozen=True, slots=True)
-class LoadedFit:
-    """Estimates under load against a known torque: mean estimate over the torque, and root mean square error.
+class Session:
+    """State of one run: `estimate` takes every frame of the calibration's sides, in order."""
 
-    spread is the standard deviation of the gain's logarithm that the intervals allow for.
-    """
-
-    gain: float
-    rmse_nm: float
-    spread: float
-
-    @classmethod
-    def of(cls, model: OutputModel, features: FloatArray, torque_nm: FloatArray) -> Self:
-        """Compare the model on (n, d) features with the torques (n,)."""
-        found = np.array([model.regressor.predict(row)[0] for row in features])
-        gain = float((found * np.sign(torque_nm)).sum() / np.abs(torque_nm).sum())
-        return cls(gain, float(np.sqrt(((found - torque_nm) ** 2).mean())), model.regressor.gain.between)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Adaptation:
-    """A correction of this grip's gain, and the loaded frames that it was made from, before and after it."""
-
-    correction: GainCorrection
-    before: LoadedFit
-    after: LoadedFit
-
-
-@dataclass(slots=True, eq=False)
-class _Grip:
-    """The latest frames of a grip with a torque: times and features; and the correction of its gain."""
-
-    frames: deque[tuple[float, FloatArray]] = field(default_factory=lambda: deque(maxlen=_ADAPTED_FRAMES))
-    corrected: "_Corrected | None" = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Corrected:
-    """The torque's model with the gain of a grip, and the held tool that it was made with."""
-
-    model: OutputModel
-    tool: Measured | None
-
-    def for_tool(self, tool: Measured | None, whole: Calibration) -> OutputModel:
-        """Return the model for a newly measured tool, by the law of the tools in the `whole` calibration.
-
-        The correction is the fingertip's, and the law the tool's: a torque on another diameter is as much larger as
-        without the correction. A diameter within the uncertainty of the earlier one is the same tool's.
-        """
-        law, before, regressor = whole.tools, self.tool, self.model.regressor
-        if law is None or tool is None or before is None or tool == before:
-            return self.model
-        gain_before, gain = law.gain(before.value), law.gain(tool.value)
-        if gain_before is None or gain is None:
-            # Such a tool has no torque.
-            return self.model
-        same_tool = abs(tool.value - before.value) <= tool.half_width + before.half_width
-        spread = regressor.gain.between if same_tool else math.hypot(regressor.gain.between, law.spread)
-        return replace(self.model, regressor=regressor.scaled(gain / gain_before, spread))
-
-
-class EstimatorSession:
-    """One session: `estimate` takes every frame in order and keeps the state that it needs."""
+    # Frames that an estimate averages.
+    averaged_frames = 1
 
     def __init__(
         self,
@@ -105,19 +57,19 @@ class EstimatorSession:
         bank: Bank | None = None,
         *,
         matcher: BankMatcher | None = None,
+        search: BankSearch | None = None,
         period_s: float = np.inf,
         baseline_frames: int = BASELINE_FRAMES,
-        average_frames: int = 1,
-        max_gap_s: float = MAX_GAP_S,
     ) -> None:
         """Begin a session; raises CalibrationError for a bank that is missing or another one.
 
-        `matcher` replaces the calibration's own on the bank. `period_s` is the board's frame period, where known. The
-        paper's method averages the first `baseline_frames` and the latest `average_frames`.
+        `matcher` replaces the calibration's own on the bank. `search` adds a position in a bank to estimates without
+        one, and gives the heatmap. `period_s` is the board's frame period, where known. A tare averages
+        `baseline_frames`.
         """
         self.calibration = calibration
+        self.search = search
         self._period_s = period_s
-        self._averaging = (average_frames, max_gap_s)
         self._baseline_frames = baseline_frames
         self._matcher = matcher or calibration.matcher(bank)
         self.set_tool(None)
@@ -143,24 +95,30 @@ class EstimatorSession:
 
     def reset(self, idle_frames: int = 0) -> None:
         """Forget the session: the next frame is its first, and the next `idle_frames` usable ones are untouched."""
-        calibration = self.calibration
-        self._state: SessionState | PaperState | SliceState
-        if calibration.kind != "raw":
-            self._state = SliceState()
-        elif not calibration.sides:
-            self._state = PaperState(idle_frames or self._baseline_frames, *self._averaging)
-        else:
-            motion = calibration.estimator.motion
-            self._state = SessionState(calibration.validators, motion, self._period_s, idle_frames)
+        self._begin(idle_frames)
         # The (m, c) difference to the idle frame behind the last estimate, None where there was none.
         self.difference: FloatArray | None = None
-        self._latest: FloatArray = np.full(calibration.estimator.scale.shape, np.nan)
-        self._grip = _Grip()
+        self._latest: FloatArray = np.full(self.calibration.estimator.scale.shape, np.nan)
+        self._gain = GripGain()
+
+    def _begin(self, idle_frames: int) -> None:
+        """Forget all frames."""
+        calibration = self.calibration
+        if calibration.kind != "raw":
+            return
+        motion, fingertips = calibration.estimator.motion, FingertipSet(calibration.validators)
+        self._fingertips = fingertips
+        self._motion = motion
+        self._timer = FrameTimer(self._period_s)
+        self._checks = ChannelChecks(fingertips, motion)
+        self._idle = IdleFrames(fingertips, idle_frames)
+        self._grips = [GripDetector(one) for one in fingertips.sides]
+        self._memory = GripMemory(motion, fingertips.idle.shape)
 
     @property
     def fixed(self) -> dict[str, object]:
         """What follows from the configuration, and is no state."""
-        return {"calibration": self.calibration, "matcher": self._matcher}
+        return {"calibration": self.calibration, "matcher": self._matcher, "search": self.search}
 
     @property
     def why_no_torque(self) -> str:
@@ -170,45 +128,26 @@ class EstimatorSession:
     @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
-        return self._state.taring
+        return self.calibration.kind == "raw" and self._idle.taring
 
     @property
     def grip_t_s(self) -> FloatArray:
         """The times (n,) of this grip's frames; `adapt` takes their torques."""
-        return np.array([t_s for t_s, _ in self._grip.frames])
+        return self._gain.t_s
 
     def adapt(self, torque_nm: FloatArray) -> Adaptation:
         """Correct the gain until the next grip or tare, by torques (n,) measured at `grip_t_s`, NaN where unknown.
 
-        The first twist after the grip settles the gel and is left out. Always starts from the calibration's gain.
-        Raises CalibrationError as `Calibration.correct_gain` does, for a tool without a torque, and without a second
-        twist.
+        Raises CalibrationError as `GripGain.correct` does, and for a tool without a torque.
         """
         if self._tool_reasons:
             raise CalibrationError(self._tool_reasons[0])
-        calibration, grip, known = self._calibration, self._grip, np.isfinite(torque_nm)
-        width = len(calibration.gain_regressor().mean_feature)
-        # Without a frame the rows have no width of their own.
-        every = np.array([row for _, row in grip.frames]).reshape(-1, width)
-        features, truth = every[known], torque_nm[known]
-        settling = first_twists(truth, np.zeros(len(truth), dtype=np.int64))
-        largest_nm = float(np.abs(truth).max(initial=0.0))
-        features, truth = features[~settling], truth[~settling]
-        if settling.any() and not find_twists(truth, largest_nm):
-            raise CalibrationError(
-                "the first twist after a grip settles the gel and shows another gain than the later ones; twist again, "
-                "then adapt"
-            )
-        before = self._models()["torque"]
-        adapted, correction = calibration.correct_gain(features, truth)
-        after = adapted.outputs["torque"]
-        grip.corrected = _Corrected(after, self._tool)
-        rows = np.concatenate(find_twists(truth))
-        return Adaptation(
-            correction,
-            LoadedFit.of(before, features[rows], truth[rows]),
-            LoadedFit.of(after, features[rows], truth[rows]),
-        )
+        return self._gain.correct(self._calibration, self._tool, self.calibration, torque_nm)
+
+    def heatmap(self) -> FloatArray | None:
+        """Return the (K, S) scores of the first side's last difference, None without a bank or a difference."""
+        difference = self._first_difference()
+        return None if self.search is None or difference is None else self.search.heatmap(difference)
 
     def estimate(self, frame: TactileFrame) -> Estimate:
         """Return the estimate of a frame of the calibration's sides.
@@ -221,20 +160,106 @@ class EstimatorSession:
                 f"the calibration is of {shape[0]} sides ({', '.join(self.calibration.sides)}), and the frame has the "
                 f"shape {frame.channels.shape}"
             )
+        if frame.repeated:
+            return Estimate(valid=False, reasons=_REPEATED_FRAME)
         self.difference = None
         # Noise makes every side of a new frame differ, except where no channel has a signal.
         repeats = ((frame.channels == self._latest).all(axis=1) & frame.channels.any(axis=1)).any()
         self._latest = frame.channels
         if repeats and self.calibration.kind == "raw":
-            return Estimate(valid=False, reasons=REPEATED_FRAME)
-        processed = self._state.process(frame)
+            return Estimate(valid=False, reasons=_REPEATED_FRAME)
+        processed = self.process(frame)
         if not processed.held_frames:
-            self._grip = _Grip()
+            self._gain = GripGain()
         if processed.reasons:
             return Estimate(valid=False, reasons=processed.reasons)
         self.difference = processed.difference
         estimate = self._predict(processed, frame.t_s)
+        estimate = self._with_position(estimate)
         return replace(estimate, lag_s=processed.lag_s) if processed.lag_s else estimate
+
+    def process(self, frame: TactileFrame) -> ProcessedFrame:
+        """Take the next frame and return its difference to the idle frame, or the reasons against it."""
+        if self.calibration.kind != "raw":
+            return ProcessedFrame(np.abs(frame.channels), (), frame.usable)
+        checks, idle = self._checks, self._idle
+        missing = self._timer.missing_before(frame.t_s)
+        if missing is None:
+            # The last frames do not show how the gel has moved. In a tare, compare with its last frame: a tool may
+            # have been gripped or released in the gap.
+            self._memory.forget()
+            for grip in self._grips:
+                grip.forget_steps()
+            checks.restart(idle.last_tare_frame())
+            missing = 0
+        channels, usable, reasons, jumping_shares = checks.check(frame)
+        if any(reasons):
+            # One garbled frame is no other fingertip: skip it like a disturbed one.
+            checks.skip()
+            self._memory.skip(missing)
+            return ProcessedFrame.refused(usable, *filter(None, reasons))
+        if (jumping_shares > LARGEST_JUMPING_SHARE).any():
+            self._bridge(channels, missing)
+            return ProcessedFrame.refused(usable, self._fingertips.disturbance(jumping_shares))
+        is_first = checks.before is None
+        if is_first and not idle.begun:
+            checks.begin(usable)
+        checks.accept(channels)
+        if idle.taring:
+            return ProcessedFrame.refused(usable, idle.add_to_tare(channels))
+        if is_first:
+            return ProcessedFrame.refused(usable, "there is no earlier frame to compare with")
+        if not self._memory.positions:
+            # Follow the idle frame while nothing is gripped; a session that begins gripped keeps the calibration's.
+            for layer in idle.idle_sides(channels):
+                restored = checks.restore(layer, channels, frame)
+                idle.follow(layer, channels[layer], restart=restored)
+        return self._check_grip(channels, usable, missing)
+
+    def _bridge(self, channels: FloatArray, missing: int) -> None:
+        """Skip a disturbed frame; if it agrees with the one before, the change is real and the past is void."""
+        if self._checks.confirm(channels):
+            # In a tare, the tool was gripped or released meanwhile.
+            self._memory.forget()
+            self._idle.restart_tare()
+        else:
+            self._memory.skip(missing)
+
+    def _check_grip(self, channels: FloatArray, usable: BoolArray, missing: int) -> ProcessedFrame:
+        """Return the difference of a frame, with the memory of its grip."""
+        idle, sides, loose = self._idle, self._fingertips.sides, []
+        from_idle = channels - idle.baselines
+        if not usable.all():
+            from_idle = self._motion.impute(from_idle, usable, sides, from_idle=True)
+        # At the calibration's gain. It does not change while gripped.
+        difference = from_idle / idle.gains
+        for layer, (one, grip) in enumerate(zip(sides, self._grips, strict=True)):
+            known = idle.baselines[layer], idle.gains[layer], idle.least_scores[layer]
+            if not grip.update(channels[layer], *known):
+                loose.append(one.side)
+        if loose:
+            self._memory.forget()
+            reason = f"no grip at the {' and '.join(loose)} fingertip"
+            return ProcessedFrame(difference, (reason,), usable, held_frames=0)
+        memory = self._memory
+        # Motion is read in volts: after a release a gel's idle voltages recover for minutes, which is no gain.
+        if reason := memory.remember(channels, from_idle, difference, missing):
+            return ProcessedFrame(difference, (reason,), usable)
+        return ProcessedFrame(
+            difference, (), usable, memory.mean_difference, memory.features, memory.held_frames, idle.complete
+        )
+
+    def _first_difference(self) -> FloatArray | None:
+        return self.difference[0] if self.difference is not None and self.difference[0].any() else None
+
+    def _with_position(self, estimate: Estimate) -> Estimate:
+        """Return an estimate with its position in the searched bank."""
+        if self.search is None or not estimate.valid or estimate.k is not None:
+            return estimate
+        if (difference := self._first_difference()) is None:
+            return estimate
+        match = self.search.match(difference)
+        return replace(estimate, k=match.k, sigma=match.sigma, score=match.score, runner_up=match.runner_up)
 
     def _predict(self, frame: ProcessedFrame, t_s: float) -> Estimate:
         calibration = self.calibration
@@ -251,7 +276,7 @@ class EstimatorSession:
         if match is not None and match.ambiguous:
             return _estimate({}, _AMBIGUOUS, match)
         if "torque" in outputs:
-            self._grip.frames.append((t_s, features[calibration.estimator.columns["torque"]]))
+            self._gain.frames.append((t_s, features[calibration.estimator.columns["torque"]]))
         values: dict[Quantity, _Interval] = {}
         for quantity, model in outputs.items():
             value, against = self._predict_quantity(quantity, model, reading, features, errors)
@@ -266,16 +291,11 @@ class EstimatorSession:
             values.clear()
         return _estimate(values, reasons, match)
 
-    def _models(self) -> dict[Quantity, OutputModel]:
-        """Return the model of each quantity for the held tool, with the grip's gain."""
-        models, corrected = self._calibration.outputs, self._grip.corrected
-        return models if corrected is None else models | {"torque": corrected.for_tool(self._tool, self.calibration)}
-
     def _select_outputs(self, frame: ProcessedFrame) -> tuple[dict[Quantity, OutputModel], dict[str, None]]:
         """Return the models to apply to a frame, and the reasons against the others, in order."""
         outputs: dict[Quantity, OutputModel] = {}
         reasons: dict[str, None] = dict.fromkeys(() if self.calibration.outputs else _UNCALIBRATED)
-        for quantity, model in self._models().items():
+        for quantity, model in self._gain.models(self._calibration, self._tool, self.calibration).items():
             if quantity == "diameter" and not frame.has_baseline:
                 # The gel's position means nothing without its idle position.
                 continue

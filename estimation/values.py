@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 import numpy as np
 
@@ -109,12 +109,14 @@ class FrameSeries:
 class TactileFrame:
     """Frames of m sides at one time: t_s in seconds (middle of the acquisition), channels (m, c) in volts.
 
-    usable (m, c) is False at dead and saturated channels. Do not change the arrays afterwards.
+    usable (m, c) is False at dead and saturated channels, `repeated` True where a board sent a frame again. Do not
+    change the arrays afterwards.
     """
 
     t_s: float
     channels: FloatArray
     usable: BoolArray
+    repeated: bool = False
 
     @classmethod
     def of(cls, t_s: float, channels: FloatArray, usable: BoolArray | None = None) -> "TactileFrame":
@@ -126,6 +128,31 @@ class TactileFrame:
             channels = np.where(finite, channels, 0.0)
             usable = finite if usable is None else finite & usable
         return cls(t_s, channels, np.ones(channels.shape, dtype=np.bool_) if usable is None else usable)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProcessedFrame:
+    """A frame after the session's checks, with the reasons against it.
+
+    difference (m, c) is to the idle frame, mean_difference its mean over the grip's last held_frames, 0 after a
+    release. motion holds features of the last frames' motion. usable (m, c) excludes channels that the board or the
+    frame itself shows to be lost or saturated. has_baseline is whether every fingertip was seen idle, lag_s the lag of
+    an average.
+    """
+
+    difference: FloatArray
+    reasons: tuple[str, ...]
+    usable: BoolArray
+    mean_difference: FloatArray = field(default_factory=lambda: np.zeros(0))
+    motion: FloatArray = field(default_factory=lambda: np.zeros(0))
+    held_frames: int = 1
+    has_baseline: bool = True
+    lag_s: float = 0.0
+
+    @classmethod
+    def refused(cls, usable: BoolArray, *reasons: str) -> Self:
+        """Return a frame with reasons against it, without a difference."""
+        return cls(np.zeros(usable.shape), reasons, usable)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, EmulatorConfig, SkinConfig
     from shearloop.daemon.control.experiment_schema import Mistake
     from shearloop.daemon.control.plan import Plan
-    from shearloop.daemon.sensing.frame_estimator import FrameEstimator
     from shearloop.drivers.robotiq.models import GripperModel
     from shearloop.drivers.ur.settings import UrLimits, UrSettings
+    from shearloop.estimation import Calibration
     from shearloop.yaml_files import Document
 
 # Raises UserError for an emulator of a configuration that cannot be started; the emulators are no affair of this room.
@@ -53,9 +53,9 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
     from shearloop.daemon.control.samples import TorqueSource
     from shearloop.daemon.experiment_files import read_document
     from shearloop.daemon.rig import check_experiment, experiment_mistakes, gripper_model
-    from shearloop.daemon.sensing.frame_estimator import COMBINED, open_combined, open_estimator, torque_sources
+    from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, torque_sources
 
-    parts, estimators, combined = Parts(), {}, None
+    parts, sessions, combined = Parts(), {}, None
     with parts.of("emulators"):
         check_emulators(config.emulators, path)
     if config.curve is not None:
@@ -63,15 +63,16 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
             parts.texts["keys"] = f"{_clients(config.curve)} may connect"
     for name, fingertip in config.fingertips.items():
         with parts.of(name):
-            estimator = estimators[name] = open_estimator(fingertip, name)
-            grids, torque = estimator.grids, _torque(estimator)
-            bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
-            parts.texts[name] = f"{bank}, {torque}"
+            session = sessions[name] = open_session(fingertip, name)
+            bank, search = "no bank", session.search
+            if search is not None:
+                bank = f"bank {fingertip.bank} of {search.k_grid.size} × {search.sigma_grid.size} cells"
+            parts.texts[name] = f"{bank}, {_torque(session.calibration)}"
     if config.combined is not None:
         with parts.of(COMBINED):
             combined = open_combined(config.combined, config.fingertips)
             sides = " and ".join(combined.calibration.sides)
-            parts.texts[COMBINED] = f"{sides} together, {_torque(combined)}"
+            parts.texts[COMBINED] = f"{sides} together, {_torque(combined.calibration)}"
     if config.skin is not None:
         with parts.of("skin"):
             parts.texts["skin"] = _skin(config.skin)
@@ -84,7 +85,7 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
         name: TorqueSource(name=name, period_s=1.0, measures_torque=bool(file), has_gain=bool(file))
         for name, file in files.items()
     }
-    sources = unopened | torque_sources(config, estimators, combined)
+    sources = unopened | torque_sources(config, sessions, combined)
     with parts.of("experiment"):
         warm_up_s = max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0)
         if config.experiment is not None:
@@ -139,10 +140,10 @@ def _add_plan(
         parts.plans.append(plan_of(document.model(ExperimentFile), robot, gripper, refused, warm_up_s))
 
 
-def _torque(estimator: "FrameEstimator") -> str:
-    if not estimator.measures_torque:
+def _torque(calibration: "Calibration") -> str:
+    if not calibration.measures_torque:
         return "without torque: no calibration is configured"
-    assumed = estimator.calibration.assumption_text
+    assumed = calibration.assumption_text
     return f"with torque, assuming that {assumed}" if assumed else "with torque"
 
 

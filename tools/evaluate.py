@@ -15,7 +15,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.bank_file import Bank
-from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
+from shearloop.estimation import Calibration, Estimate, FrameSeries, Session, TactileFrame
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.values import winkler_scores
 from shearloop.files import replace_file
@@ -55,7 +55,7 @@ class EstimateTrack:
 def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> EstimateTrack:
     """Estimate every frame of a series in order, as live; raises CalibrationError for a series of other sides."""
     chosen = series.select_sides(calibration.sides)
-    session = EstimatorSession(calibration, bank)
+    session = Session(calibration, bank)
     session.set_tool(chosen.tool_mm)
     estimates, latency = [], []
     for t_s, channels in zip(chosen.t_s, chosen.channels, strict=True):

@@ -29,7 +29,7 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging.messages import LoopState, Scalar
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL, McapFile
-from shearloop.daemon.sensing.frame_estimator import channel_table
+from shearloop.daemon.sensing.sessions import channel_table
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.errors import UserError
 from shearloop.files import read_file

@@ -12,7 +12,7 @@ Match a frame against a bank of simulated signals:
 Estimate the torque along a recording:
 
     calibration = shearloop.Calibration.load("fingertip.cal")
-    session = shearloop.EstimatorSession(calibration, bank)
+    session = shearloop.Session(calibration, bank)
     [series] = shearloop.read_series("twists.mcap", calibration.sides)
     for t_s, channels in zip(series.t_s, series.channels):
         estimate = session.estimate(shearloop.TactileFrame.of(t_s, channels))
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from shearloop.bank.pruned_matching import PrunedMatcher as Matcher
     from shearloop.daemon.messaging.client import Subscriber
     from shearloop.daemon.messaging.keys import ClientKeys
-    from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
+    from shearloop.estimation import Calibration, Estimate, FrameSeries, Physics, Session, TactileFrame, fit
     from shearloop.studies.emulated_calibration import emulate_recordings
     from shearloop.tools.evaluate import estimate_series, figures_by_load
     from shearloop.tools.frame_series import read_series
@@ -50,10 +50,10 @@ __all__ = [
     "Calibration",
     "ClientKeys",
     "Estimate",
-    "EstimatorSession",
     "FrameSeries",
     "Matcher",
     "Physics",
+    "Session",
     "Subscriber",
     "TactileFrame",
     "emulate_recordings",
@@ -69,7 +69,7 @@ _HOMES = {
     "Calibration": "shearloop.estimation:Calibration",
     "ClientKeys": "shearloop.daemon.messaging.keys:ClientKeys",
     "Estimate": "shearloop.estimation:Estimate",
-    "EstimatorSession": "shearloop.estimation:EstimatorSession",
+    "Session": "shearloop.estimation:Session",
     "FrameSeries": "shearloop.estimation:FrameSeries",
     "Matcher": "shearloop.bank.pruned_matching:PrunedMatcher",
     "Physics": "shearloop.estimation:Physics",

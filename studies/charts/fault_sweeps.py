@@ -13,7 +13,7 @@ from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers.eit_kit import ADC_STEP_V
 from shearloop.emulators.synthetic_frames import MEAN_V
-from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame
+from shearloop.estimation import Calibration, Estimate, FrameSeries, Physics, Session, TactileFrame
 from shearloop.estimation.bank_match import ElectrodeNumbering
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.fingertip_validator import channel_noise
@@ -200,7 +200,7 @@ def judge_level(estimates: Sequence[Estimate], truth_nm: FloatArray, level: floa
     return FaultLevel(level, float(error.mean()), float(error.std()), valid, false_valid)
 
 
-def estimate_frames(tracker: EstimatorSession, series: FrameSeries, usable: BoolArray | None = None) -> list[Estimate]:
+def estimate_frames(tracker: Session, series: FrameSeries, usable: BoolArray | None = None) -> list[Estimate]:
     """Return the estimates of frames with usable channels (n, m, 896), as in a live session that starts with them."""
     tracker.reset()
     masks = repeat(None) if usable is None else usable
@@ -225,7 +225,7 @@ def balanced(truth_nm: FloatArray) -> FloatArray:
     return np.where(loaded | np.isin(np.arange(len(truth_nm)), kept), truth_nm, np.nan)
 
 
-def sweep(tracker: EstimatorSession, scene: FaultScene, fault: FrameFault) -> FaultCurve:
+def sweep(tracker: Session, scene: FaultScene, fault: FrameFault) -> FaultCurve:
     """Return an estimator's curve through one fault; slices are drawn several times, as chance picks electrodes."""
     truth = true_torques(scene.series)
     levels = []
@@ -252,7 +252,7 @@ def misaligned(
         calibrations = fitted(replace(split, past=late), [name], physics)
         if not calibrations:
             return FaultLevel(shift_s)
-        estimates = estimate_frames(EstimatorSession(calibrations[0], physics.bank), judged)
+        estimates = estimate_frames(Session(calibrations[0], physics.bank), judged)
         return judge_level(estimates, true_torques(judged), shift_s)
 
     fault = "calibrated on misaligned times"
@@ -292,7 +292,7 @@ def sweeps(
 def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration) -> list[FaultCurve]:
     """Return one estimator's curves through all faults; a worker opens the bank's file by its path."""
     scene, path = shared
-    tracker = EstimatorSession(calibration, Bank.open(path))
+    tracker = Session(calibration, Bank.open(path))
     return [sweep(tracker, scene, fault) for fault in FAULTS]
 
 

@@ -16,7 +16,7 @@ from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.bank.mesh import Mesh
 from shearloop.errors import UserError
-from shearloop.estimation import Calibration, EstimatorSession, FrameSeries, Physics, TactileFrame, bank_match, fit
+from shearloop.estimation import Calibration, FrameSeries, Physics, Session, TactileFrame, bank_match, fit
 from shearloop.estimation.bank_match import NOT_TURNED
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.studies.charts import skin_loop
@@ -129,7 +129,7 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
         torque_nm_of = parabola(split, partial(matched_sigma, locator))
         torques[name] = np.array([torque_nm_of(one) for one in path])
     for calibration in calibrations:
-        tracker = EstimatorSession(calibration, bank)
+        tracker = Session(calibration, bank)
         estimates = [tracker.estimate(TactileFrame.of(0.0, one[None])) for one in path]
         torques[calibration.estimator.name] = values_of(estimates)[0]
     found = []
@@ -228,7 +228,7 @@ def judge_others(
     except BankError as error:
         return FaultLevel(limit_nm), None, str(error)
     others = select_rows(series, judged)
-    estimates = estimate_frames(EstimatorSession(calibration, bank), others)
+    estimates = estimate_frames(Session(calibration, bank), others)
     _, low_nm, high_nm = values_of([one for one in estimates if one.valid])
     width_nm = float(np.median(high_nm - low_nm)) if len(low_nm) else None
     return judge_level(estimates, others.torque_nm, limit_nm), width_nm, ""
@@ -255,7 +255,7 @@ def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -
     k_grid, sigma_grid = (np.unique(each) for each in np.array([place for *_, places in rims for place in places]).T)
     # The same idle frame as the slices': its noise is in every difference.
     slices = SyntheticSlices(played_bank(scratch, Grid(k_grid, sigma_grid)))
-    trackers = [EstimatorSession(calibration, bank) for calibration in calibrations]
+    trackers = [Session(calibration, bank) for calibration in calibrations]
     for name, unit, settings, places in rims:
         series = [slices.series([(k, s, 1.0)] * _FRAMES, np.full(_FRAMES, torque_of(s))) for k, s in places]
         for tracker in trackers:

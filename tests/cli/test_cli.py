@@ -33,7 +33,7 @@ from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, 
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.run_summary import RunSummary
-from shearloop.daemon.sensing.frame_estimator import COMBINED
+from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.tools.task_row import task_row
 from tests.paper_curve import paper_curve

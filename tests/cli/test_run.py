@@ -1,6 +1,7 @@
 """A daemon as it runs, how it ends that was to end with its experiment, and what one does after a crash."""
 
 import asyncio
+import itertools
 import os
 import pty
 import signal
@@ -20,8 +21,8 @@ from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.sensing.frame_estimator import FrameEstimator
 from shearloop.errors import UserError
+from shearloop.estimation import Session
 from tests.emulator_process import own_address
 from tests.fixtures.daemons import (
     DEADLINE_S,
@@ -150,15 +151,14 @@ async def test_stop_cancels_a_waiting_experiment_and_keeps_the_daemon(robotless)
 
 
 async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, monkeypatch):
-    estimate = FrameEstimator.estimate
-    deaths = iter([True])
+    estimate, frames = Session.estimate, itertools.count()
 
-    async def fragile(self: FrameEstimator, frame: Any) -> Any:
-        if frame.seq == 3 and next(deaths, False):
+    def fragile(self: Session, frame: Any) -> Any:
+        if next(frames) == 3:
             raise RuntimeError("a bug")
-        return await estimate(self, frame)
+        return estimate(self, frame)
 
-    monkeypatch.setattr(FrameEstimator, "estimate", fragile)
+    monkeypatch.setattr(Session, "estimate", fragile)
     async with running_daemon(config()) as daemon:
         estimates = collector(daemon, "eit.estimate")
         async with emulated_kit(tmp_path, 40):

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.bank_file import Bank, BankDefinition, write_bank
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame, fit
+from shearloop.estimation import Calibration, Estimate, FrameSeries, Session, TactileFrame, fit
 
 PERIOD_S = 0.54
 IDLE_S, CYCLE_S = 20.0, 30.0
@@ -126,11 +126,9 @@ def judged(estimates: list[Estimate], played: FrameSeries) -> Judged:
     return Judged(len(rows), r, rmse, inside.mean(), float(np.median(high - low)))
 
 
-def follow(
-    calibration: Calibration | EstimatorSession, played: FrameSeries, usable: BoolArray | bool = True
-) -> list[Estimate]:
+def follow(calibration: Calibration | Session, played: FrameSeries, usable: BoolArray | bool = True) -> list[Estimate]:
     """Return the estimates of a session; `usable` is of each (m, 896) frame, or of all (n, m, 896)."""
-    session = calibration if isinstance(calibration, EstimatorSession) else EstimatorSession(calibration)
+    session = calibration if isinstance(calibration, Session) else Session(calibration)
     masks = np.broadcast_to(usable, played.channels.shape)
     frames = zip(played.t_s, played.channels, masks, strict=True)
     return [session.estimate(TactileFrame.of(float(t), *each)) for t, *each in frames]

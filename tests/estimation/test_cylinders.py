@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.estimation import TRUSTED, EstimatorSession, fit
+from shearloop.estimation import TRUSTED, Session, fit
 from shearloop.estimation.estimator import CalibrationRows
 from shearloop.estimation.motion_regression import fit_cylinders, fit_line
 from shearloop.estimation.ridge import Ridge
@@ -111,7 +111,7 @@ def test_a_diameter_is_of_this_grip_alone():
     """It is read from the mean place of a grip, and each grip has its own."""
     of = partial(cylinder, (1,), 2e-4)
     calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", timing=TRUSTED)
-    tracker, read = EstimatorSession(calibration), []
+    tracker, read = Session(calibration), []
     for number, mm in enumerate((12.0, 38.0)):
         later = of(mm, 10 + number)
         later = replace(later, t_s=later.t_s + number * (later.t_s[-1] + 0.54))

@@ -8,9 +8,9 @@ import pytest
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
+from shearloop.estimation import Calibration, Estimate, FrameSeries, Physics, Session, TactileFrame, fit
 from shearloop.estimation.channel_imputer import ChannelImputer
-from shearloop.estimation.session_state import Motion, SessionState
+from shearloop.estimation.estimator import Regression
 from tests.estimation import conftest
 from tests.estimation.conftest import IDLE_S, PERIOD_S, judged, twisting
 
@@ -29,7 +29,7 @@ def calibration(request, recorded, bank) -> Calibration:
     return fit(request.param, [recorded], "rig", Physics(bank=bank))
 
 
-def without(channels: np.ndarray, start: int, series: FrameSeries, tracker: EstimatorSession) -> list[Estimate]:
+def without(channels: np.ndarray, start: int, series: FrameSeries, tracker: Session) -> list[Estimate]:
     """Return the estimates of a session of which (896,) channels of the first side are dead from a frame on."""
     usable = np.ones(series.channels.shape, dtype=np.bool_)
     usable[start:, 0, channels] = False
@@ -40,7 +40,7 @@ def without(channels: np.ndarray, start: int, series: FrameSeries, tracker: Esti
 def _n_valid_of_whole(calibration: Calibration, bank: Bank) -> int:
     """Return how many torques of a session of which no channel dies are valid."""
     series = twisting(seed=3, cycles=3)
-    return judged(without(~ELECTRODE, len(series.t_s), series, EstimatorSession(calibration, bank)), series).n
+    return judged(without(~ELECTRODE, len(series.t_s), series, Session(calibration, bank)), series).n
 
 
 @pytest.mark.parametrize("start", [0, DEATH])
@@ -48,14 +48,14 @@ def _n_valid_of_whole(calibration: Calibration, bank: Bank) -> int:
 def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank, dead, start):
     series = twisting(seed=3, cycles=3)
     whole = _n_valid_of_whole(calibration, bank)
-    found = judged(without(DEAD[dead], start, series, EstimatorSession(calibration, bank)), series)
+    found = judged(without(DEAD[dead], start, series, Session(calibration, bank)), series)
     assert whole > 120
     assert found.n > 0.95 * whole
     assert found.coverage > 0.88
 
 
 def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibration, bank):
-    series, tracker, seen = twisting(seed=3, cycles=3), EstimatorSession(calibration, bank), []
+    series, tracker, seen = twisting(seed=3, cycles=3), Session(calibration, bank), []
     for t_s, channels in zip(series.t_s, series.channels, strict=True):
         usable = np.ones(channels.shape, dtype=np.bool_)
         usable[0, ELECTRODE] = len(seen) < DEATH
@@ -77,7 +77,7 @@ def test_torques_that_the_dead_channels_alone_told_of_are_refused(monkeypatch, s
     monkeypatch.setattr(conftest, "tip", felt_by_one_electrode)
     calibration = fit("regression", [twisting(tips=(1,))], "rig")
     series = twisting(seed=3, cycles=3, tips=(1,))
-    found = without(ELECTRODE, start, series, EstimatorSession(calibration))
+    found = without(ELECTRODE, start, series, Session(calibration))
     assert judged(found, series).coverage > 0.95
     assert not any(one.valid for one in found[DEATH:])
     refused = [one for one in found[DEATH:] if "dead or saturated" in one.reasons[0]]
@@ -89,7 +89,7 @@ def test_torques_that_the_dead_channels_alone_told_of_are_refused(monkeypatch, s
         )
     # Other channels told nothing of it, and some of those that did leave a guess: the interval holds it (else 11 %).
     for dead in (DEAD["a fifth"] & ~ELECTRODE, DEAD["an electrode that measures"]):
-        found = judged(without(dead, DEATH, series, EstimatorSession(calibration)), series)
+        found = judged(without(dead, DEATH, series, Session(calibration)), series)
         assert found.n > 120
         assert found.coverage > 0.92
 
@@ -99,8 +99,8 @@ def test_channels_that_were_dead_at_calibration_refuse_nothing_and_change_nothin
         return replace(series, channels=np.where(ELECTRODE, 0.2, series.channels))
 
     calibration, series = fit("regression", [still(recorded)], "rig"), still(twisting(seed=3, cycles=3))
-    expected = without(~ELECTRODE, len(series.t_s), series, EstimatorSession(calibration))
-    found = without(ELECTRODE, 0, series, EstimatorSession(calibration))
+    expected = without(~ELECTRODE, len(series.t_s), series, Session(calibration))
+    found = without(ELECTRODE, 0, series, Session(calibration))
     assert sum(one.valid for one in expected) > 120
     for one, other in zip(found, expected, strict=True):
         assert one.valid == other.valid
@@ -150,7 +150,7 @@ def torques(estimates: list[Estimate]) -> np.ndarray:
 def test_channels_that_the_session_began_without_say_nothing_when_they_come_back(motion_calibration, kind):
     """Their idle voltages are not known: what is measured from made-up ones would be wrong, and pass for certain."""
     series, back = twisting(seed=3, cycles=2), GRIPPED + 30
-    trackers = [EstimatorSession(motion_calibration, period_s=PERIOD_S) for _ in range(2)]
+    trackers = [Session(motion_calibration, period_s=PERIOD_S) for _ in range(2)]
     found, expected = (
         [tracker.estimate(frame) for frame in session_without(slice(0, end), kind, series)]
         for tracker, end in zip(trackers, (back, None), strict=True)
@@ -164,10 +164,11 @@ def test_channels_that_the_session_began_without_say_nothing_when_they_come_back
 @pytest.mark.parametrize("with_motion", [True, False])
 def test_channels_that_come_back_while_idle_are_used_from_then_on(motion_calibration, with_motion, kind):
     calibration, series = motion_calibration, twisting(seed=3, cycles=2)
-    motion = calibration.estimator.motion if with_motion else Motion()
-    memory = SessionState(calibration.validators, motion, period_s=PERIOD_S)
+    if not with_motion:
+        calibration = replace(calibration, estimator=Regression(calibration.estimator.scale))
+    memory = Session(calibration, period_s=PERIOD_S)
     moments = [memory.process(frame) for frame in session_without(slice(0, 12), kind, series)]
-    whole = SessionState(calibration.validators, motion, period_s=PERIOD_S)
+    whole = Session(calibration, period_s=PERIOD_S)
     expected = [whole.process(frame) for frame in session_without(slice(0, 0), kind, series)]
     gripped = [(one, other) for one, other in zip(moments, expected, strict=True) if not other.reasons]
     assert len(gripped) > 60
@@ -182,11 +183,11 @@ def test_channels_that_come_back_while_idle_are_used_from_then_on(motion_calibra
 def test_a_channel_that_reads_0_is_masked_without_being_told(calibration, bank, start):
     """Recordings and callers of the library hand over channels alone."""
     series = twisting(seed=3, cycles=2)
-    expected = without(ELECTRODE, start, series, EstimatorSession(calibration, bank))
+    expected = without(ELECTRODE, start, series, Session(calibration, bank))
     silent = np.zeros(series.channels.shape, dtype=np.bool_)
     silent[start:, 0, ELECTRODE] = True
     zeros = replace(series, channels=np.where(silent, 0.0, series.channels))
-    found = conftest.follow(EstimatorSession(calibration, bank), zeros)
+    found = conftest.follow(Session(calibration, bank), zeros)
     assert sum(one.valid for one in found) > 60
     np.testing.assert_array_equal(torques(found), torques(expected))
 

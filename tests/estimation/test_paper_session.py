@@ -5,9 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from shearloop.bank.matching import Match, best_match
-from shearloop.estimation import Calibration, Estimate, EstimatorSession, TactileFrame
+from shearloop.estimation import Calibration, Estimate, Session, TactileFrame
 from shearloop.estimation.bank_match import PaperMatcher
-from shearloop.estimation.session_state import PaperState
+from shearloop.estimation.paper_session import PaperSession, UntouchedFrames
 from tests.paper_curve import paper_curve
 
 K_GRID, SIGMA_GRID = np.linspace(3.0, 4.0, 11), np.linspace(1.0, 2.0, 11)
@@ -36,15 +36,15 @@ def noisy(signal: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
     return HOMOGENEOUS + signal + RANDOM.normal(0.0, 0.002, 896)
 
 
-def estimated(session: EstimatorSession, number: int, channels: NDArray[np.float64], unusable: int = 0) -> Estimate:
+def estimated(session: Session, number: int, channels: NDArray[np.float64], unusable: int = 0) -> Estimate:
     return session.estimate(TactileFrame.of(0.541 * number, channels[None], np.arange(896)[None] >= unusable))
 
 
-def tared(matcher: OneCell, calibration: Calibration | None = None, average: int = 1) -> EstimatorSession:
+def tared(matcher: OneCell, calibration: Calibration | None = None, average: int = 1) -> Session:
     """Return a session that has its idle frame."""
-    session = EstimatorSession(
+    session = PaperSession(
         calibration or paper_curve("bank", torque=TORQUE, diameter=DIAMETER),
-        matcher=PaperMatcher(matcher),
+        PaperMatcher(matcher),
         average_frames=average,
     )
     for number in range(10):
@@ -54,24 +54,27 @@ def tared(matcher: OneCell, calibration: Calibration | None = None, average: int
     return session
 
 
+def uncalibrated(baseline_frames: int, **options: int) -> PaperSession:
+    matcher = PaperMatcher(OneCell())
+    return PaperSession(Calibration.uncalibrated("bank"), matcher, baseline_frames=baseline_frames, **options)
+
+
 def test_the_baseline_is_the_mean_of_its_frames_and_has_their_noise():
-    state = PaperState(400, 1, 3.0)
-    for number in range(400):
-        state.process(TactileFrame.of(float(number), noisy()[None]))
-    assert not state.taring
-    np.testing.assert_allclose(state._idle_frame, HOMOGENEOUS, atol=6 * 0.002 / 20)
-    assert np.median(state._noise) == pytest.approx(0.002, rel=0.02)
+    untouched = UntouchedFrames(400)
+    untouched.frames.extend(noisy() for _ in range(400))
+    assert not untouched.missing
+    np.testing.assert_allclose(untouched.idle_frame, HOMOGENEOUS, atol=6 * 0.002 / 20)
+    assert np.median(untouched.noise) == pytest.approx(0.002, rel=0.02)
 
 
 def test_channels_that_do_not_move_have_the_converters_noise():
-    state = PaperState(2, 1, 3.0)
-    for number in range(2):
-        state.process(TactileFrame.of(float(number), HOMOGENEOUS[None]))
-    np.testing.assert_allclose(state._noise, 0.00215 / np.sqrt(12))
+    untouched = UntouchedFrames(2)
+    untouched.frames.extend([HOMOGENEOUS, HOMOGENEOUS])
+    np.testing.assert_allclose(untouched.noise, 0.00215 / np.sqrt(12))
 
 
 def test_a_channel_that_reads_0_in_some_frames_disturbs_neither_idle_frame_nor_average():
-    state, silent = PaperState(10, 4, 3.0), np.arange(896) < 56
+    state, silent = uncalibrated(10, average_frames=4), np.arange(896) < 56
     for number in range(30):
         channels = np.where(silent & (number % 3 == 2), 0.0, noisy(PATTERN if number > 9 else 0.0))
         processed = state.process(TactileFrame.of(float(number), channels[None]))
@@ -81,7 +84,7 @@ def test_a_channel_that_reads_0_in_some_frames_disturbs_neither_idle_frame_nor_a
 
 
 def test_a_channel_that_read_0_when_the_tare_began_stays_out_until_the_next_tare():
-    state, silent = PaperState(3, 1, 3.0), np.arange(896) < 56
+    state, silent = uncalibrated(3), np.arange(896) < 56
     for number in range(6):
         channels = np.where(silent & (number == 0), 0.0, noisy(PATTERN if number > 2 else 0.0))
         processed = state.process(TactileFrame.of(float(number), channels[None]))
@@ -144,8 +147,9 @@ def test_the_latest_frames_are_averaged_and_a_tare_forgets_them():
 def test_frames_before_a_gap_are_not_averaged_with_those_after_it():
     matcher = OneCell()
     session = tared(matcher, average=2)
-    estimated(session, 10, noisy(PATTERN))
-    after = noisy(-PATTERN)
+    before, after = noisy(PATTERN), noisy(-PATTERN)
+    estimated(session, 10, before)
     estimate = estimated(session, 5000, after)
-    np.testing.assert_allclose(matcher.asked[-1] + session._state._idle_frame, after, atol=1e-12)
+    idle_frame = before - matcher.asked[0]
+    np.testing.assert_allclose(matcher.asked[-1] + idle_frame, after, atol=1e-12)
     assert estimate.lag_s == 0

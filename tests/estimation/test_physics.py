@@ -6,7 +6,7 @@ import pytest
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.forward import ForwardModel
-from shearloop.estimation import EstimatorSession, Physics, TactileFrame, fit
+from shearloop.estimation import Physics, Session, TactileFrame, fit
 from shearloop.estimation.bank_match import (
     NOT_TURNED,
     ElectrodeNumbering,
@@ -74,14 +74,14 @@ def test_torque_by_the_place_in_the_bank(bank, name):
     frames = np.exp(-0.5 * ((channel - 2.0) / (0.3 * sigma[:, None])) ** 2) + np.abs(rng.normal(0, 0.01, (32, 896)))
     whole = slices_of(frames, torque)
     calibration = fit(name, [whole.between(0, 24)], "earlier", Physics(bank=bank))
-    tracker = EstimatorSession(calibration, bank)
+    tracker = Session(calibration, bank)
     for i in range(24, 32):
         estimate = tracker.estimate(TactileFrame.of(float(i), frames[i][None]))
         assert estimate.torque_nm == pytest.approx(torque[i], abs=0.015)
         assert estimate.sigma == pytest.approx(sigma[i], abs=0.15)
         assert estimate.score > 0.95
     with pytest.raises(CalibrationError, match="needs its bank"):
-        EstimatorSession(calibration)
+        Session(calibration)
 
 
 def test_another_bank_is_refused(bank):
@@ -89,7 +89,7 @@ def test_another_bank_is_refused(bank):
     series = slices_of(rng.normal(1, 0.1, (20, 896)), rng.uniform(0, 1, 20))
     calibration = fit("bank", [series], "x", Physics(bank=bank))
     with pytest.raises(CalibrationError, match="name the bank it was made with"):
-        EstimatorSession(calibration, dataclasses.replace(bank, geometry_hash="0" * 64))
+        Session(calibration, dataclasses.replace(bank, geometry_hash="0" * 64))
 
 
 def test_an_image_shows_where_and_which_way(fingertip):

@@ -7,7 +7,7 @@ import pytest
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import TRUSTED, EstimatorSession, FrameSeries, Measured, TactileFrame, fit, fitting
+from shearloop.estimation import TRUSTED, FrameSeries, Measured, Session, TactileFrame, fit, fitting
 from shearloop.estimation.fingertip_validator import mask_unmeasured
 from shearloop.estimation.gain import ToolLaw, find_twists
 from tests.estimation.conftest import follow, judged, kept, twisting
@@ -54,7 +54,7 @@ def test_another_session_takes_its_own_baseline(motion_calibration, grip, gain, 
 def test_three_idle_frames_are_a_baseline_for_an_outright_grip(motion_calibration, tared):
     other = twisting(seed=22)
     first = int(np.flatnonzero(other.t_s > 20)[0]) - 3
-    tracker = EstimatorSession(motion_calibration)
+    tracker = Session(motion_calibration)
     if tared:
         tracker.tare(3)
     valid = [one.valid for one in follow(tracker, other.between(first, 230))]
@@ -148,7 +148,7 @@ def test_squeezing_alone_is_no_torque(motion_calibration):
 
 def test_a_frame_of_other_sides_is_refused(motion_calibration):
     with pytest.raises(CalibrationError, match=r"of 2 sides \(right, left\)"):
-        EstimatorSession(motion_calibration).estimate(TactileFrame.of(0.0, np.zeros((1, 896))))
+        Session(motion_calibration).estimate(TactileFrame.of(0.0, np.zeros((1, 896))))
 
 
 def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(motion_calibration):
@@ -183,7 +183,7 @@ def test_tools_that_turn_differently_give_no_torque_where_their_diameters_are_on
 def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration):
     twisted = twisting(seed=5)
     calibration = replace(motion_calibration, tool_mm=20.0)
-    tracker, plain = EstimatorSession(calibration), EstimatorSession(calibration)
+    tracker, plain = Session(calibration), Session(calibration)
     held = {60: Measured(22.9, 0.1), 70: Measured(23.2, 0.1), 80: Measured(23.2, 0.5), 90: Measured(14.0, 1.0)}
     held[100] = None
     refused, same = [], []
@@ -204,7 +204,7 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration):
     assert tracker.why_no_torque == ""
     tracker.set_tool(Measured(14.0, 1.0))
     assert tracker.why_no_torque.startswith("the tool has 14 mm")
-    unknown = EstimatorSession(motion_calibration)
+    unknown = Session(motion_calibration)
     unknown.set_tool(Measured(14.0, 0.1))
     assert any(one.valid for one in follow(unknown, twisted))
 
@@ -220,7 +220,7 @@ def adapted_sessions(calibration, *tools):
     twisted = twisting(seed=5)
     frames = [TactileFrame.of(float(t_s), one) for t_s, one in zip(twisted.t_s, twisted.channels, strict=True)]
     half = len(frames) // 2
-    sessions = [EstimatorSession(replace(calibration, tools=LAW)) for _ in tools]
+    sessions = [Session(replace(calibration, tools=LAW)) for _ in tools]
     for session, tool in zip(sessions, tools, strict=True):
         session.set_tool(Measured(20.0, 0.5))
         for frame in frames[:half]:
@@ -274,7 +274,7 @@ def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(motion_
     every, left_out = lost
     part = kept(whole, ~np.isin(np.arange(len(whole.t_s)) % every, list(left_out)))
     period_s = float(whole.t_s[1] - whole.t_s[0])
-    estimates = follow(EstimatorSession(motion_calibration, period_s=period_s), part)
+    estimates = follow(Session(motion_calibration, period_s=period_s), part)
     assert not any(one.valid for one in estimates)
     assert any("are missing" in why for one in estimates for why in one.reasons)
 
@@ -282,7 +282,7 @@ def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(motion_
 def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(motion_calibration):
     whole = twisting(seed=5)
     fast = replace(whole, t_s=whole.t_s / 5, torque_t_s=whole.torque_t_s / 5)
-    configured = follow(EstimatorSession(motion_calibration, period_s=0.54), fast)
+    configured = follow(Session(motion_calibration, period_s=0.54), fast)
     assert [one.torque_nm for one in configured] == [one.torque_nm for one in follow(motion_calibration, whole)]
 
 
@@ -390,7 +390,7 @@ def test_a_session_settles_with_one_twist_and_adapts_by_the_next(motion_calibrat
     first, second, *_ = find_twists(torque_nm)
     torque_nm[first] *= 0.5
     torque_nm[second] *= 1.3
-    session, begin, end = EstimatorSession(motion_calibration), first[-1] + 1, second[-1] + 1
+    session, begin, end = Session(motion_calibration), first[-1] + 1, second[-1] + 1
 
     def torque_of_grip():
         return np.interp(session.grip_t_s, whole.t_s, torque_nm)

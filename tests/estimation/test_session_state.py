@@ -5,8 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from shearloop.estimation import EstimatorSession
-from shearloop.estimation.session_state import SessionState
+from shearloop.estimation import Session
 from shearloop.estimation.values import TactileFrame
 
 UP, DOWN = np.linspace(0, 1, 21), np.linspace(1, 0, 21)[1:]
@@ -26,8 +25,7 @@ def process(like):
     """Return what plays shares of a grip to a session, every half second from a time on, and returns what it says."""
 
     def play(session, shares, start_s=0.0, step_s=0.5):
-        take = session.estimate if isinstance(session, EstimatorSession) else session.process
-        return [take(like(start_s + step_s * i, share)) for i, share in enumerate(shares)]
+        return [session.process(like(start_s + step_s * i, share)) for i, share in enumerate(shares)]
 
     return play
 
@@ -35,12 +33,18 @@ def process(like):
 @pytest.fixture
 def taring(motion_calibration):
     """Return what begins a session with so many frames for its zero."""
-    return lambda n: SessionState(motion_calibration.validators, motion_calibration.estimator.motion, idle_frames=n)
+
+    def begin(n):
+        session = Session(motion_calibration)
+        session.tare(n)
+        return session
+
+    return begin
 
 
 def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(motion_calibration, like):
     """A zero that is asked for while a tool is held, which is let go and gripped again before it is complete."""
-    tracker, reasons = EstimatorSession(motion_calibration), []
+    tracker, reasons = Session(motion_calibration), []
     n_lags = motion_calibration.estimator.motion.n_needed - 1
     before = [*np.zeros(12), *UP, *np.ones(n_lags)]
     for i, share in enumerate([*before, *DOWN, *UP, *np.ones(n_lags + 1)]):
@@ -56,7 +60,7 @@ def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(motion_calibra
 
 def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(motion_calibration, process):
     """What a grip was before a zero says nothing of the next one, which comes before an idle frame was seen again."""
-    tracker = EstimatorSession(motion_calibration)
+    tracker = Session(motion_calibration)
     n_lags = motion_calibration.estimator.motion.n_needed - 1
     process(tracker, [*np.zeros(12), *UP, *np.ones(n_lags + 1)])
     tracker.tare(10)
@@ -105,10 +109,10 @@ def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(motion_calibration, 
 def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(
     motion_calibration, process, like, spoilt, kind
 ):
-    tracker, rng = EstimatorSession(motion_calibration), np.random.default_rng(4)
+    tracker, rng = Session(motion_calibration), np.random.default_rng(4)
     n_lags = motion_calibration.estimator.motion.n_needed - 1
     shares = [*np.zeros(12), *UP, *np.ones(n_lags + 2)]
-    assert process(tracker, shares)[-1].valid
+    assert not process(tracker, shares)[-1].reasons
     for i in range(len(shares), len(shares) + spoilt):
         frame = like(0.5 * i, 1.0)
         if kind == "garbled":
@@ -123,17 +127,17 @@ def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(
 @pytest.mark.parametrize("lost", [2, 3, 4])
 def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(motion_calibration, process, lost):
     """A frame is put halfway where one is missing: with more of them lost, all before would be of another time."""
-    tracker = EstimatorSession(motion_calibration, period_s=0.27)
+    tracker = Session(motion_calibration, period_s=0.27)
     n_lags = motion_calibration.estimator.motion.n_needed - 1
     shares = [*np.zeros(12), *UP, *np.ones(n_lags + 2)]
-    assert process(tracker, shares, step_s=0.27)[-1].valid
+    assert not process(tracker, shares, step_s=0.27)[-1].reasons
     after = [one.reasons for one in process(tracker, [1.0, 1.0], 0.27 * (len(shares) + lost), 0.27)]
     assert after[0] == ("there is no earlier frame to compare with",)
     assert after[1] == (f"gripped too recently: {n_lags} more frames are needed",)
 
 
 def test_a_board_that_turns_out_slower_than_its_first_frames_is_followed(motion_calibration, like):
-    tracker = EstimatorSession(motion_calibration)
+    tracker = Session(motion_calibration)
     times = [*0.1 * np.arange(12), *(2.0 + 0.5 * np.arange(60))]
     shares = [*np.zeros(20), *UP, *np.ones(31)]
     reasons = [tracker.estimate(like(t_s, share)).reasons for t_s, share in zip(times, shares, strict=True)]
@@ -165,7 +169,7 @@ def test_what_is_valid_is_of_one_grip_and_hardly_made_up(motion_calibration):
     @example(session=[*[("gap", False)] * 4, ("good", False), ("late", False), ("gap", False), *[("good", True)] * 6,
                       *[("good", False)] * 20], period_s=np.inf)  # fmt: skip
     def holds(session, period_s):
-        memory, rng = SessionState(guards, motion, period_s), np.random.default_rng(0)
+        memory, rng = Session(motion_calibration, period_s=period_s), np.random.default_rng(0)
         t_s, held, before, other, account, steps_s = 0.0, False, None, None, [], []
         for kind, changes in [*begun, *session]:
             step_s = STEPS_S.get(kind, 0.5)
@@ -212,9 +216,9 @@ def test_motion_is_read_without_the_gain_of_the_idle_frame(motion_calibration):
     held = [gripped + 0.05 * (gripped - idle) * np.sin(0.3 * i) for i in range(2 * motion.n_lags)]
 
     def features(idle_share, held_share=1.0):
-        state = SessionState(guards, motion)
+        session = Session(motion_calibration)
         frames = [*[idle_share * idle] * 12, *(held_share * one for one in held)]
-        return [state.process(TactileFrame.of(0.5 * i, one + 1e-13 * i)) for i, one in enumerate(frames)][-1]
+        return [session.process(TactileFrame.of(0.5 * i, one + 1e-13 * i)) for i, one in enumerate(frames)][-1]
 
     remembered, fresh, scaled = features(0.95), features(1.0), features(1.1, 1.1)
     assert not remembered.reasons

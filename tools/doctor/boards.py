@@ -12,8 +12,8 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.channels import ChannelTable
 from shearloop.daemon.config import AdcConfig, FingertipConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.rig import load_cell_calibration
-from shearloop.daemon.sensing.frame_estimator import fingertip_table
 from shearloop.daemon.sensing.load_cell_task import COUNTS_REASON
+from shearloop.daemon.sensing.sessions import fingertip_table
 from shearloop.drivers.connection import SerialPort, find_port
 from shearloop.drivers.eit_kit import START, Frame, FrameParser
 from shearloop.drivers.errors import DriverError

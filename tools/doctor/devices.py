@@ -14,7 +14,7 @@ from shearloop.daemon.config import DaemonConfig, GripperConfig, SerialDevice
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
-from shearloop.daemon.sensing.frame_estimator import fingertip_table
+from shearloop.daemon.sensing.sessions import fingertip_table
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.ur.control_box import REMOTE_CURE, check_ports, query_controller, untested_sentence

@@ -26,21 +26,23 @@ from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.rig import load_cell_calibration
-from shearloop.daemon.sensing.fingertip_task import (
-    FramePairing,
+from shearloop.daemon.sensing.fingertip_messages import (
     adapted_message,
     estimate_message,
     frame_message,
     torques_from_bytes,
 )
-from shearloop.daemon.sensing.frame_estimator import COMBINED, FrameEstimator, open_combined, open_estimator
+from shearloop.daemon.sensing.fingertip_task import estimate_frames
+from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
+from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session
 from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
 from shearloop.daemon.sensing.snapshots import SnapshotError, restored
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
+from shearloop.estimation import Session
 from shearloop.tools.recordings.message_content import ContentError
 from shearloop.tools.recordings.reader import open_recording, reading
 from shearloop.yaml_files import validated
@@ -246,18 +248,19 @@ class Replay:
         # Per source: the difference between recorded and replayed numbers of frames or samples, and the latest frame.
         self._number_offset: dict[str, int] = {}
         self._latest_frame: dict[str, int] = {}
-        self._estimators: dict[str, FrameEstimator] = {
-            name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
+        self._sessions: dict[str, Session] = {
+            name: open_session(fingertip, name) for name, fingertip in config.fingertips.items()
         }
         self._frame_parsers = {
             name: FrameParser(
-                self._estimators[name].table.zero_slots, nominal_period_ns=round(fingertip.frame_period_s * 1e9)
+                self._sessions[name].calibration.table.zero_slots,
+                nominal_period_ns=round(fingertip.frame_period_s * 1e9),
             )
             for name, fingertip in config.fingertips.items()
         }
         self._pairing: FramePairing | None = None
         if config.combined is not None:
-            self._estimators[COMBINED] = combined = open_combined(config.combined, config.fingertips)
+            self._sessions[COMBINED] = combined = open_combined(config.combined, config.fingertips)
             sides = combined.calibration.sides
             self._pairing = FramePairing(sides, config.fingertips[sides[0]].frame_period_s)
         self._load_parser: LoadParser | None = None
@@ -271,7 +274,7 @@ class Replay:
     def _sources(self) -> set[str]:
         """The sources of the messages that are computed."""
         load_cell = (LOAD_CELL,) if self._load_parser is not None else ()
-        return {*self._estimators, *load_cell, *((SKIN,) if self._skin is not None else ())}
+        return {*self._sessions, *load_cell, *((SKIN,) if self._skin is not None else ())}
 
     async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> None:
         """Replay all events `speed` times as fast as they happened; math.inf does not wait at all."""
@@ -332,10 +335,9 @@ class Replay:
     def _restore(self, source: str, text: bytes) -> None:
         """Continue a source from its recorded state; raises UserError for one that does not fit."""
         try:
-            if source in self._estimators:
-                session = self._estimators[source].session
-                state = restored(text, session.fixed)
-                self._estimators[source].continue_from(state["session"])
+            if source in self._sessions:
+                state = restored(text, self._sessions[source].fixed)
+                self._sessions[source] = state["session"]
                 if source in self._frame_parsers:
                     self._frame_parsers[source] = state["parser"]
                 else:
@@ -367,28 +369,28 @@ class Replay:
         return replace(message, sample=message.sample + self._number_offset[SKIN])
 
     async def _estimate(self, source: str, *frames: Frame) -> None:
-        estimator, number = self._estimators[source], frames[0].seq
+        session, number = self._sessions[source], frames[0].seq
         for first, kind, value in self._events.before_frames.get(source, ()):
             # Of a later file's tools, the first may be held since the file before.
             if kind is InputKind.TOOL and self._latest_frame.get(source, -1) < first <= number:
-                estimator.session.set_tool(value)
+                session.set_tool(value)
             elif kind is InputKind.TARE and first == number:
-                estimator.session.tare()
+                session.tare()
             elif kind is InputKind.ADAPT and first == number:
                 self._adapt(source, frames, *value)
         self._latest_frame[source] = number
-        estimate = await estimator.estimate(*frames)
+        estimate = await estimate_frames(session, frames)
         # The replayed latency is 0; the recording holds the live one.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)
         self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))
 
     def _adapt(self, source: str, frames: tuple[Frame, ...], reference: str, torque_nm: FloatArray) -> None:
-        estimator = self._estimators[source]
-        if len(estimator.session.grip_t_s) != len(torque_nm):
+        session = self._sessions[source]
+        if len(session.grip_t_s) != len(torque_nm):
             reason = "the recording begins in the middle of the grip, so the correction of its gain is left out"
             structlog.get_logger().warning(reason, source=source, frame=frames[0].seq)
             return
-        self._publisher.publish(adapted_message(source, frames, reference, estimator.session.adapt(torque_nm)))
+        self._publisher.publish(adapted_message(source, frames, reference, session.adapt(torque_nm)))
 
 
 def _live_event(topic: str, content: dict[str, Any]) -> RecordedEvent:

@@ -1,6 +1,7 @@
-"""The tasks of one fingertip and of a pair: order, tares, and errors of the estimator."""
+"""The tasks of one fingertip and of a pair: order, tares, and errors of the session."""
 
 import asyncio
+import threading
 from collections.abc import AsyncGenerator
 from types import SimpleNamespace
 from typing import Any
@@ -14,19 +15,15 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.sensing.fingertip_task import (
-    CombinedFingertips,
-    DeadElectrodes,
-    FingertipPipeline,
-    FingertipStates,
-    FingertipTask,
-)
-from shearloop.daemon.sensing.frame_estimator import COMBINED
+from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes, FingertipStates
+from shearloop.daemon.sensing.fingertip_task import FingertipTask
+from shearloop.daemon.sensing.frame_pairing import FramePairing
+from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import ActionError
-from shearloop.estimation import Estimate
+from shearloop.estimation import Estimate, TactileFrame
 from tests.running import running
 
 MS = 1_000_000
@@ -55,33 +52,36 @@ class RecordingPublisher:
         return [number for *found, number in self.messages if found == [topic, source]]
 
 
-class FakeEstimator:
-    """Estimates nothing; frame `fails` raises, frame `waits` waits for `go_on`. Keeps the frames after tares."""
+class FakeSession:
+    """Estimates nothing; frame `fails` raises, frame `waits` waits for `go_on`. Keeps the frames after tares.
+
+    Like a search of a bank, an estimate runs in a thread if a frame waits.
+    """
 
     taring = False
     reason = "nothing"
-    table = PAPER_TABLE
     why_no_torque = ""
+    calibration = SimpleNamespace(sides=("right", "left"), table=PAPER_TABLE)
 
     def __init__(self, fails: int = -1, waits: int = -1) -> None:
         self.fails, self.waits = fails, waits
-        self.begun, self.go_on = asyncio.Event(), asyncio.Event()
+        self.begun, self.go_on = threading.Event(), threading.Event()
+        self.search = None if waits < 0 else self
         self.tared_before: list[int] = []
         self._tared = False
-        self.session = self
-        self.calibration = SimpleNamespace(sides=("right", "left"))
 
     def tare(self) -> None:
         self._tared = True
 
-    async def estimate(self, one: Frame, *_others: Frame) -> Estimate:
-        if one.seq == self.fails:
+    def estimate(self, frame: TactileFrame) -> Estimate:
+        number = round(frame.channels[0, 0])
+        if number == self.fails:
             raise ZeroDivisionError("nothing to divide")
-        if one.seq == self.waits:
+        if number == self.waits:
             self.begun.set()
-            await self.go_on.wait()
+            assert self.go_on.wait(60.0)
         if self._tared:
-            self.tared_before.append(one.seq)
+            self.tared_before.append(number)
         self._tared = False
         return Estimate(valid=False, reasons=(self.reason,))
 
@@ -109,43 +109,46 @@ class Board:
 
 
 def frame(number: int, arrives_ns: int | None = None) -> Frame:
-    """Return a frame that was acquired in one period, sent in 80 ms, and arrived."""
+    """Return a frame that was acquired in one period, sent in 80 ms, and arrived; its channels hold its number."""
     arrival_ns = number * PERIOD_NS if arrives_ns is None else arrives_ns
     mid_ns = arrival_ns - 80 * MS - PERIOD_NS // 2
     times = {"t_begin_ns": mid_ns - PERIOD_NS // 2, "t_mid_ns": mid_ns, "t_arrival_ns": arrival_ns}
     flags = {"saturated": NONE, "dead": NONE, "repeated": False}
-    return Frame(channels=np.full(896, 0.1), raw=np.zeros(1024), seq=number, **times, **flags)
+    return Frame(channels=np.full(896, float(number)), raw=np.zeros(1024), seq=number, **times, **flags)
 
 
 def estimates(
-    name: str, publisher: RecordingPublisher, estimator: FakeEstimator, clock: Clock | None = None, **options: Any
-) -> FingertipPipeline:
-    return FingertipPipeline(name, estimator, publisher, clock or Clock(), **options)
+    name: str, publisher: RecordingPublisher, session: FakeSession, clock: Clock | None = None, **options: Any
+) -> FingertipTask:
+    return FingertipTask(name, session, publisher, clock or Clock(), **options)
+
+
+def pairs(publisher: RecordingPublisher) -> CombinedTask:
+    pairing = FramePairing(("right", "left"), PERIOD_S)
+    return CombinedTask(COMBINED, FakeSession(), publisher, Clock(), period_s=PERIOD_S, pairing=pairing)
 
 
 def fingertip(
-    publisher: RecordingPublisher,
-    estimator: FakeEstimator,
-    combined: CombinedFingertips | None = None,
-    in_one_read: int = 1,
-) -> FingertipTask:
-    own = estimates("right", publisher, estimator)
-    return FingertipTask(Board(in_one_read), own, publisher, FingertipStates(Clock(), combined), combined)
+    publisher: RecordingPublisher, session: FakeSession, combined: CombinedTask | None = None, in_one_read: int = 1
+) -> BoardTask:
+    states = FingertipStates(Clock(), combined)
+    board = Board(in_one_read)
+    return BoardTask("right", session, publisher, Clock(), board=board, states=states, combined=combined)
 
 
 async def test_each_frame_is_estimated_and_then_published_in_order():
     publisher = RecordingPublisher(8)
-    async with running(fingertip(publisher, FakeEstimator()).run()):
+    async with running(fingertip(publisher, FakeSession()).run()):
         await publisher.enough.wait()
     expected = [(topic, "right", number) for number in range(4) for topic in ("eit.estimate", "eit.frame")]
     assert publisher.messages == expected
 
 
 async def test_the_loop_is_told_why_a_valid_estimate_has_no_torque():
-    class DiameterAlone(FakeEstimator):
+    class DiameterAlone(FakeSession):
         why_no_torque = "there is no torque without the tool's diameter"
 
-        async def estimate(self, *_frames: Frame) -> Estimate:
+        def estimate(self, _frame: TactileFrame) -> Estimate:
             return Estimate(valid=True, diameter_mm=20.0, diameter_low_mm=18.0, diameter_high_mm=22.0)
 
     heard: list[TorqueSample] = []
@@ -156,14 +159,14 @@ async def test_the_loop_is_told_why_a_valid_estimate_has_no_torque():
 
 async def test_an_error_of_the_estimator_ends_the_task():
     with pytest.raises(ZeroDivisionError):
-        await fingertip(RecordingPublisher(), FakeEstimator(fails=0)).run()
+        await fingertip(RecordingPublisher(), FakeSession(fails=0)).run()
 
 
 async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free():
-    publisher, slow = RecordingPublisher(), FakeEstimator(waits=0)
-    combined = CombinedFingertips(estimates(COMBINED, publisher, FakeEstimator()), PERIOD_S)
+    publisher, slow = RecordingPublisher(), FakeSession(waits=0)
+    combined = pairs(publisher)
     async with running(fingertip(publisher, slow, combined, in_one_read=2).run()):
-        await slow.begun.wait()
+        await asyncio.to_thread(slow.begun.wait)
         combined.add("left", [frame(1)])
         await combined.process_pairs()
         assert publisher.numbers("eit.estimate", COMBINED) == [1], "its partner has arrived in the same read"
@@ -172,21 +175,21 @@ async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free(
 
 @pytest.mark.parametrize("since_ms", [1, 100, 540, 621])
 async def test_a_tare_begins_with_the_first_frame_acquired_after_it(since_ms):
-    clock, estimator, raw = FixedClock(), FakeEstimator(), list[RawEvent]()
-    task = estimates("right", RecordingPublisher(), estimator, clock, inputs=SimpleNamespace(record=raw.append))
+    clock, session, raw = FixedClock(), FakeSession(), list[RawEvent]()
+    task = estimates("right", RecordingPublisher(), session, clock, inputs=SimpleNamespace(record=raw.append))
     asked_ns = clock.t_ns
     task.tare()
     for seq in range(5):
         clock.t_ns = asked_ns + since_ms * MS + seq * PERIOD_NS
         await task.process(frame(seq, clock.t_ns))
-    (first,) = estimator.tared_before
+    (first,) = session.tared_before
     began_ns = asked_ns + since_ms * MS + first * PERIOD_NS - PERIOD_NS - 80 * MS
     assert asked_ns <= began_ns < asked_ns + PERIOD_NS, "no later frame is skipped"
     assert [(one.kind, one.data) for one in raw] == [(InputKind.TARE, str(first).encode())], "as a replay finds it"
 
 
 async def test_a_gain_that_no_twist_shows_is_left_with_the_reason():
-    class Untwisted(FakeEstimator):
+    class Untwisted(FakeSession):
         grip_t_s = np.zeros(0)
 
         def adapt(self, torque_nm: np.ndarray) -> None:
@@ -203,7 +206,7 @@ async def test_a_gain_that_no_twist_shows_is_left_with_the_reason():
 
 
 async def test_a_correction_that_crashes_fails_its_step_and_not_the_fingertip():
-    class Crashing(FakeEstimator):
+    class Crashing(FakeSession):
         grip_t_s = np.zeros(0)
 
         def adapt(self, _torque_nm: np.ndarray) -> None:
@@ -220,29 +223,29 @@ async def test_a_correction_that_crashes_fails_its_step_and_not_the_fingertip():
 
 
 async def test_a_pair_with_one_earlier_frame_is_not_part_of_the_tare():
-    clock, estimator = FixedClock(), FakeEstimator()
-    task = estimates(COMBINED, RecordingPublisher(), estimator, clock)
+    clock, session = FixedClock(), FakeSession()
+    task = estimates(COMBINED, RecordingPublisher(), session, clock)
     task.tare()
     for seq in range(3):
         arrives_ns = clock.t_ns + 630 * MS + seq * PERIOD_NS
         await task.process(frame(seq, arrives_ns), frame(seq, arrives_ns - 200 * MS))
-    assert estimator.tared_before == [1]
+    assert session.tared_before == [1]
 
 
 async def test_a_second_tare_replaces_the_first():
-    clock, estimator = FixedClock(), FakeEstimator()
-    task = estimates("right", RecordingPublisher(), estimator, clock)
+    clock, session = FixedClock(), FakeSession()
+    task = estimates("right", RecordingPublisher(), session, clock)
     for seq in range(5):
         if seq < 2:
             task.tare()
         clock.t_ns += PERIOD_NS
         await task.process(frame(seq, clock.t_ns))
-    assert estimator.tared_before == [2]
+    assert session.tared_before == [2]
 
 
 async def test_waiting_for_a_tare_ends_when_it_is_complete():
-    clock, estimator = FixedClock(), FakeEstimator()
-    task = estimates("right", RecordingPublisher(), estimator, clock)
+    clock, session = FixedClock(), FakeSession()
+    task = estimates("right", RecordingPublisher(), session, clock)
     async with running(task.tare_and_wait(60.0)) as (waiting,):
         await asyncio.sleep(0)
         await task.process(frame(0, clock.t_ns))
@@ -253,13 +256,13 @@ async def test_waiting_for_a_tare_ends_when_it_is_complete():
 
 
 async def test_tare_that_times_out_says_why_its_frames_were_refused():
-    clock, estimator = FixedClock(), FakeEstimator()
-    estimator.taring = True
-    task = estimates("right", RecordingPublisher(), estimator, clock)
+    clock, session = FixedClock(), FakeSession()
+    session.taring = True
+    task = estimates("right", RecordingPublisher(), session, clock)
     async with running(task.tare_and_wait(0.2)) as (waiting,):
         await asyncio.sleep(0)
         for seq, reason in enumerate(("3 channels jumped", "nothing", "5 channels jumped", "7 channels jumped"), 2):
-            estimator.reason = reason
+            session.reason = reason
             await task.process(frame(seq, clock.t_ns + seq * PERIOD_NS))
         error = await waiting
     said = "the idle frame of right could not be taken within 0.2 s"
@@ -267,7 +270,7 @@ async def test_tare_that_times_out_says_why_its_frames_were_refused():
     async with running(task.tare_and_wait(0.01)) as (waiting,):
         assert (await waiting).endswith("no frame came")
     await task.process(frame(9, clock.t_ns + 9 * PERIOD_NS))
-    assert estimator.tared_before == [2], "a later frame may be of a gripped tool"
+    assert session.tared_before == [2], "a later frame may be of a gripped tool"
 
 
 def test_the_configured_frame_period_is_the_boards():

@@ -3,7 +3,7 @@ from typing import NamedTuple
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.sensing.fingertip_task import _MAX_APART_PERIODS, FramePairing
+from shearloop.daemon.sensing.frame_pairing import _MAX_APART_PERIODS, FramePairing
 
 PERIOD_S, PERIOD_NS = 0.54, 540_000_000
 

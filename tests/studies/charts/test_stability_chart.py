@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shearloop.errors import UserError
-from shearloop.estimation import Estimate, EstimatorSession, Physics, fit
+from shearloop.estimation import Estimate, Physics, Session, fit
 from shearloop.studies.charts import fault_sweeps, stability
 from shearloop.studies.charts.chart_data import Split, fitted
 from shearloop.tools.evaluate import estimate_series, figures_of
@@ -64,7 +64,7 @@ def test_unreported_lost_electrodes_never_pass_silently(stream, bank):
     (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
     scene = fault_sweeps.scene_for(stream, bank)
     lost = next(fault for fault in fault_sweeps.FAULTS if fault.name == "lost electrodes, unreported")
-    found = fault_sweeps.sweep(EstimatorSession(calibration, bank), scene, lost)
+    found = fault_sweeps.sweep(Session(calibration, bank), scene, lost)
     assert found.levels[0].valid > 0.7
     assert found.breaks_at is None
     assert found.levels[-1].valid == 0.0

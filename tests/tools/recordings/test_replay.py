@@ -22,9 +22,9 @@ from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.messaging.messages import EitEstimate, wire_map, with_packed_arrays
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.schema import message_json, recorded_topic
-from shearloop.daemon.sensing.fingertip_task import FingertipPipeline
+from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.drivers.serial_sensor import InputKind
-from shearloop.estimation import EstimatorSession, Measured
+from shearloop.estimation import Measured, Session
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.message_content import read_content
 from shearloop.tools.recordings.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
@@ -40,7 +40,7 @@ RELATIVE = 1e-9
 class Gripper:
     """Holds a tool while the number of estimates is within a range."""
 
-    def __init__(self, estimates: FingertipPipeline, tool: Measured, held: range) -> None:
+    def __init__(self, estimates: FingertipTask, tool: Measured, held: range) -> None:
         self._estimates, self._tool, self._held = estimates, tool, held
         self.diameters = FingertipDiameters("combined")
 
@@ -251,7 +251,7 @@ HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
 async def record_experiments(config: Path) -> list[dict[str, Any]]:
     """Run a daemon through two experiments; return what was published as estimates."""
     async with recording_daemon(config) as (daemon, _, published, until):
-        recorder, right = daemon.recorder, daemon.sensors.tasks["right"].pipeline
+        recorder, right = daemon.recorder, daemon.sensors.tasks["right"]
         right.gripper = Gripper(right, OTHER_TOOL, range(HELD, 10 * ENOUGH))
         recorder.record_experiment("first")
         await until(BEGUN)
@@ -269,13 +269,13 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     (zeroed,) = (frame for frame, kind, _ in before if kind is InputKind.TARE)
     assert zeroed >= ZEROED
     held: list[object] = []
-    set_tool = EstimatorSession.set_tool
+    set_tool = Session.set_tool
 
-    def noted(self: EstimatorSession, tool: Measured | None) -> None:
+    def noted(self: Session, tool: Measured | None) -> None:
         held.append(tool)
         set_tool(self, tool)
 
-    monkeypatch.setattr(EstimatorSession, "set_tool", noted)
+    monkeypatch.setattr(Session, "set_tool", noted)
     again, _ = asyncio.run(replayed(later, math.inf))
     assert held == [None, OTHER_TOOL], "the second one came before the file began"
     estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}

@@ -1,4 +1,4 @@
-"""Estimators as the configuration opens them, on frames of boards."""
+"""Sessions as the configuration opens them, on frames of boards."""
 
 import asyncio
 from dataclasses import replace
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from shearloop.bank.errors import BankError
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
-from shearloop.daemon.sensing.frame_estimator import FrameEstimator, open_combined, open_estimator
+from shearloop.daemon.sensing.fingertip_task import estimate_frames
+from shearloop.daemon.sensing.sessions import open_combined, open_session
 from shearloop.drivers.eit_kit import Frame
 from shearloop.errors import UserError
-from shearloop.estimation import Calibration, Estimate, FrameSeries, fit
+from shearloop.estimation import Calibration, Estimate, FrameSeries, Session, fit
 from shearloop.tools.check import _torque
 from tests.estimation.conftest import IDLE_S, PERIOD_S, twisting
 
@@ -55,16 +56,16 @@ def frame(
     )  # fmt: skip
 
 
-def estimated(estimator: FrameEstimator, *frames: Frame) -> Estimate:
+def estimated(session: Session, *frames: Frame) -> Estimate:
     """Return the estimate of frames of one time."""
-    return asyncio.run(estimator.estimate(*frames))
+    return asyncio.run(estimate_frames(session, frames))
 
 
-def torques(estimator: FrameEstimator, played: FrameSeries, **flags: NDArray[np.bool_]) -> list[float | None]:
+def torques(session: Session, played: FrameSeries, **flags: NDArray[np.bool_]) -> list[float | None]:
     """Return the torque of every pair, None where there is none."""
     found = []
     for number, pair in enumerate(played.channels):
-        estimate = estimated(estimator, *(frame(number, channels, **flags) for channels in pair))
+        estimate = estimated(session, *(frame(number, channels, **flags) for channels in pair))
         assert estimate.valid == (estimate.torque_nm is not None)
         found.append(estimate.torque_nm)
     return found
@@ -72,7 +73,7 @@ def torques(estimator: FrameEstimator, played: FrameSeries, **flags: NDArray[np.
 
 def test_both_fingertips_together_follow_another_session(calibration):
     played = twisting(seed=3)
-    found = torques(FrameEstimator(calibration, fingertip()), played)
+    found = torques(Session(calibration), played)
     truth = played.torque_at_frames()
     errors = [value - true for value, true in zip(found, truth, strict=True) if value is not None]
     assert len(errors) > 0.6 * len(found)
@@ -82,46 +83,47 @@ def test_both_fingertips_together_follow_another_session(calibration):
 
 def test_a_tare_averages_the_frames_that_follow(calibration):
     played = twisting(seed=3)
-    estimator = FrameEstimator(calibration, fingertip(baseline_frames=5))
-    estimator.session.tare()
+    session = Session(calibration, baseline_frames=5)
+    session.tare()
     for number in range(5):
-        assert estimator.session.taring
-        estimate = estimated(estimator, *(frame(number, channels) for channels in played.channels[number]))
+        assert session.taring
+        estimate = estimated(session, *(frame(number, channels) for channels in played.channels[number]))
         assert estimate.reasons == (f"taking the idle frame, {number + 1} of 5",)
-    assert not estimator.session.taring
-    assert any(value is not None for value in torques(estimator, played.between(5, len(played.t_s))))
+    assert not session.taring
+    assert any(value is not None for value in torques(session, played.between(5, len(played.t_s))))
 
 
 def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_is_refused(calibration):
     played = twisting(seed=4)
     dead = np.random.default_rng(0).uniform(size=896) < 0.1
-    found = torques(FrameEstimator(calibration, fingertip()), played, dead=dead)
+    found = torques(Session(calibration), played, dead=dead)
     assert np.count_nonzero([value is not None for value in found]) > 0.6 * len(found)
     elsewhere = replace(played, channels=np.where(dead, 0.3, played.channels))
-    again = torques(FrameEstimator(calibration, fingertip()), elsewhere, dead=dead)
+    again = torques(Session(calibration), elsewhere, dead=dead)
     assert again == found, "the values of dead channels do not matter"
     pair = [frame(0, channels, repeated=True) for channels in played.channels[0]]
-    estimate = estimated(FrameEstimator(calibration, fingertip()), *pair)
+    estimate = estimated(Session(calibration), *pair)
     assert estimate.reasons == ("the board sent the same frame again",)
 
 
-def test_a_bank_adds_k_sigma_and_heatmaps(calibration, tiny_bank):
-    estimator = FrameEstimator(calibration, fingertip(bank=str(tiny_bank), matching="zero_lag"))
+def test_a_bank_adds_k_sigma_and_heatmaps(files, tiny_bank):
+    tips = {side: fingertip(bank=str(tiny_bank), matching="zero_lag") for side in ("right", "left")}
+    session = open_combined(CombinedConfig(calibration=files["combined"]), tips)
     played = twisting(seed=3)
     gripped = int((IDLE_S + 12.0) / PERIOD_S)
     for number in range(gripped):
-        estimate = estimated(estimator, *(frame(number, channels) for channels in played.channels[number]))
+        estimate = estimated(session, *(frame(number, channels) for channels in played.channels[number]))
     assert estimate.valid
-    heatmap = estimator.heatmap()
+    heatmap = session.heatmap()
     assert estimate.score == pytest.approx(np.nanmax(heatmap), abs=1e-6)
 
 
 def test_the_calibration_decides_the_estimator(files):
-    assert open_estimator(fingertip(calibration=files["right"]), "right").calibration.estimator.name == NAME
+    assert open_session(fingertip(calibration=files["right"]), "right").calibration.estimator.name == NAME
     tips = {"right": fingertip(), "left": fingertip()}
     combined = open_combined(CombinedConfig(calibration=files["combined"]), tips)
     assert combined.calibration.sides == ("right", "left")
-    assert combined.grids is None
+    assert combined.search is None
 
 
 def test_check_shows_the_assumptions(calibration, files, tmp_path):
@@ -129,20 +131,20 @@ def test_check_shows_the_assumptions(calibration, files, tmp_path):
     replace(calibration, assumptions=("load timing",)).save(path)
     ends = ", assuming that the load cell's delay is as given (--load-cell-delay-s)"
     for file, said in ((path, f"with torque{ends}"), (files["combined"], "with torque")):
-        assert _torque(open_combined(CombinedConfig(calibration=file), tips)) == said
+        assert _torque(open_combined(CombinedConfig(calibration=file), tips).calibration) == said
 
 
 @pytest.mark.parametrize(
     ("open_it", "sentence"),
     [
-        (lambda f: open_estimator(fingertip(calibration=f["right"]), "left"), "fingertip, not of left"),
-        (lambda f: open_estimator(fingertip(calibration=f["combined"]), "right"), "of both under `combined`"),
-        (lambda f: open_estimator(fingertip(calibration=f["right"], estimator="bank"), "right"), f"estimator {NAME}"),
-        (lambda _: open_estimator(fingertip(estimator=NAME), "right"), "none is configured"),
-        (lambda _: open_estimator(fingertip(estimator=NAME, calibration="no.cal"), "right"), "no.cal does not"),
-        (lambda _: open_estimator(fingertip(estimator=NAME, calibration="c" * 300), "right"), "ccc does not exist"),
-        (lambda _: open_estimator(fingertip(calibration=__file__), "right"), "calibrate again"),
-        (lambda _: open_estimator(fingertip(), "right"), "needs a bank; add `bank:`"),
+        (lambda f: open_session(fingertip(calibration=f["right"]), "left"), "fingertip, not of left"),
+        (lambda f: open_session(fingertip(calibration=f["combined"]), "right"), "of both under `combined`"),
+        (lambda f: open_session(fingertip(calibration=f["right"], estimator="bank"), "right"), f"estimator {NAME}"),
+        (lambda _: open_session(fingertip(estimator=NAME), "right"), "none is configured"),
+        (lambda _: open_session(fingertip(estimator=NAME, calibration="no.cal"), "right"), "no.cal does not"),
+        (lambda _: open_session(fingertip(estimator=NAME, calibration="c" * 300), "right"), "ccc does not exist"),
+        (lambda _: open_session(fingertip(calibration=__file__), "right"), "calibrate again"),
+        (lambda _: open_session(fingertip(), "right"), "needs a bank; add `bank:`"),
         (lambda f: open_combined(CombinedConfig(calibration=f["combined"]), {"right": fingertip()}), "of both, and"),
     ],
 )  # fmt: skip

@@ -1,0 +1,171 @@
+"""Fingertip tasks that read boards: one board each, and the pairs of several boards' frames."""
+
+import asyncio
+import contextlib
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import structlog
+
+from shearloop.bank.arrays import BoolArray
+from shearloop.bank.channels import ChannelTable
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import EitHeatmap
+from shearloop.daemon.sensing.fingertip_messages import frame_message
+from shearloop.daemon.sensing.fingertip_task import FingertipTask
+from shearloop.daemon.sensing.frame_pairing import FramePairing
+from shearloop.daemon.supervisor import TaskFacts
+from shearloop.drivers.eit_kit import EitKit, Frame
+
+
+@dataclass(slots=True, kw_only=True)
+class CombinedTask(FingertipTask):
+    """Pairs the frames of several fingertips, which their boards' tasks add, and estimates from each pair."""
+
+    period_s: float
+    pairing: FramePairing
+    _pairs: deque[tuple[Frame, ...]] = field(default_factory=deque)
+    _in_order: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    def add(self, side: str, frames: Sequence[Frame]) -> None:
+        """Take the frames of one read; call this at once, because the order of arrival decides the pairs."""
+        for frame in frames:
+            if (pair := self.pairing.add(side, frame)) is not None:
+                self._pairs.append(pair)
+
+    async def process_pairs(self) -> None:
+        """Estimate from the pairs that wait, in order."""
+        async with self._in_order:
+            while self._pairs:
+                await self.process(*self._pairs.popleft())
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether no pair waits for its estimate."""
+        return not self._pairs
+
+    def diagnostics(self) -> TaskFacts:
+        """Return the values for the health message."""
+        return {"expected_hz": 1.0 / self.period_s, "estimates": self.count}
+
+
+class DeadElectrodes:
+    """What the dead channels of the latest frame have in common; each electrode is logged once."""
+
+    def __init__(self) -> None:
+        # Of the latest frame; empty without a dead electrode.
+        self.sentence = ""
+        self._logged: set[str] = set()
+
+    def update(self, source: str, table: ChannelTable, dead: BoolArray) -> None:
+        """Take the (c,) dead channels of a frame."""
+        names = table.name_dead(dead) if dead.any() else []
+        self.sentence = f"dead channels: {', '.join(names)}; press its connector on, and wet the gel" if names else ""
+        if not self._logged.issuperset(names):
+            self._logged.update(names)
+            structlog.get_logger().bind(device=source).warning(self.sentence)
+
+
+@dataclass(slots=True, kw_only=True)
+class BoardTask(FingertipTask):
+    """Reads one board, estimates from each frame, and publishes both; `combined` also needs the frames.
+
+    `states` keeps what a recording that begins later needs.
+    """
+
+    board: EitKit
+    states: "FingertipStates"
+    combined: CombinedTask | None = None
+    always_heatmap: bool = False
+    dead_electrodes: DeadElectrodes = field(default_factory=DeadElectrodes)
+
+    async def run(self) -> None:
+        """Process every frame until cancelled."""
+        async with contextlib.aclosing(self.board.batches()) as batches:
+            async for frames in batches:
+                with self.states.processing():
+                    if self.combined is not None:
+                        self.combined.add(self.name, frames)
+                    for frame in frames:
+                        await self.process_frame(frame)
+
+    async def process_frame(self, frame: Frame) -> None:
+        """Estimate from a frame and from the pairs that wait; publish the estimates, then the frame."""
+        await self.process(frame)
+        if self.combined is not None:
+            await self.combined.process_pairs()
+        self.publisher.publish(frame_message(self.name, frame))
+        self.dead_electrodes.update(self.name, self.session.calibration.table, frame.dead)
+        if self.always_heatmap or self.publisher.has_subscriber(EitHeatmap.topic):
+            await self._publish_heatmap(frame)
+
+    def diagnostics(self) -> TaskFacts:
+        """Return the values for the health message."""
+        board = self.board.diagnostics()
+        errors = (self.dead_electrodes.sentence, str(board["last_refusal"]))
+        return {
+            **board,
+            "rate_hz": board["measured_hz"],
+            "error": "; ".join(filter(None, errors)) if board["connected"] else board["last_loss"],
+            "estimates": self.count,
+        }
+
+    async def _publish_heatmap(self, frame: Frame) -> None:
+        scores = await asyncio.to_thread(self.session.heatmap)
+        search = self.session.search
+        if scores is None or search is None:
+            return
+        self.publisher.publish(
+            EitHeatmap(
+                source=self.name,
+                t_mono_ns=frame.t_mid_ns,
+                scores=scores,
+                k_low=float(search.k_grid[0]),
+                k_high=float(search.k_grid[-1]),
+                sigma_low=float(search.sigma_grid[0]),
+                sigma_high=float(search.sigma_grid[-1]),
+                model=search.model,
+                frame=frame.seq,
+            )
+        )
+
+
+class FingertipStates:
+    """Keeps the states of all fingertips for a recording that begins in the middle of a run.
+
+    They belong together, because a pair has frames of several boards. So they are taken between frames of all boards.
+    """
+
+    def __init__(self, clock: Clock, combined: CombinedTask | None = None) -> None:
+        """Begin without a board; the fingertips of a pair are in `combined`."""
+        self._clock = clock
+        self._combined = combined
+        self._boards: list[BoardTask] = []
+        self._busy = 0
+
+    def add(self, board: BoardTask) -> None:
+        """Take the task of a board."""
+        self._boards.append(board)
+
+    @contextlib.contextmanager
+    def processing(self) -> Iterator[None]:
+        """Hold the states back while the block processes a board's frames."""
+        self._busy += 1
+        try:
+            yield
+        finally:
+            self._busy -= 1
+        if not self._busy:
+            self._record()
+
+    def _record(self) -> None:
+        if not any(one.wants_state for one in self._boards):
+            return
+        if self._combined is not None and not self._combined.is_waiting:
+            return
+        now_ns = self._clock.now_ns()
+        for one in self._boards:
+            one.record_state({"parser": one.board.parser}, now_ns)
+        if self._combined is not None:
+            self._combined.record_state({"pairing": self._combined.pairing}, now_ns)

@@ -1,0 +1,76 @@
+"""Messages and recorded inputs of the EIT fingertips."""
+
+from dataclasses import asdict
+from operator import attrgetter
+
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame
+from shearloop.drivers.eit_kit import Frame
+from shearloop.estimation import Adaptation, Estimate
+
+
+def frame_message(name: str, frame: Frame) -> EitFrame:
+    """Return the message of a frame."""
+    return EitFrame(
+        source=name,
+        t_mono_ns=frame.t_mid_ns,
+        channels=frame.channels,
+        line=frame.raw,
+        frame=frame.seq,
+        age_s=(frame.t_arrival_ns - frame.t_mid_ns) / 1e9,
+        saturated=int(np.count_nonzero(frame.saturated)),
+        dead=int(np.count_nonzero(frame.dead)),
+        repeated=frame.repeated,
+    )
+
+
+def torques_as_bytes(frame: int, reference: str, torque_nm: FloatArray) -> bytes:
+    """Return the raw event's data: the known torques (n,) of the grip that correct the gain from a frame on."""
+    return " ".join([str(frame), reference, *map(repr, torque_nm.tolist())]).encode()
+
+
+def torques_from_bytes(data: bytes) -> tuple[int, str, FloatArray]:
+    """Return the frame, the source and the torques (n,) of a raw event; raises ValueError for other data."""
+    frame, reference, *torques = data.decode().split()
+    return int(frame), reference, np.array(torques, dtype=np.float64)
+
+
+def adapted_message(name: str, frames: tuple[Frame, ...], reference: str, adaptation: Adaptation) -> EitAdapted:
+    """Return the message of a correction that begins with the frames of one time."""
+    correction, before, after = adaptation.correction, adaptation.before, adaptation.after
+    return EitAdapted(
+        source=name,
+        t_mono_ns=_mean_ns(frames),
+        reference=reference,
+        twists=correction.twists,
+        factor=tuple(correction.factors.tolist()),
+        factor_std=tuple(correction.errors.tolist()),
+        offset_nm=correction.offset_nm,
+        gain_before=before.gain,
+        gain_after=after.gain,
+        rmse_before_nm=before.rmse_nm,
+        rmse_after_nm=after.rmse_nm,
+        spread_before=before.spread,
+        spread_after=after.spread,
+        frame=frames[0].seq,
+    )
+
+
+def _mean_ns(frames: tuple[Frame, ...]) -> int:
+    return sum(frame.t_mid_ns for frame in frames) // len(frames)
+
+
+def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, now_ns: int) -> EitEstimate:
+    """Return the message of an estimate from frames of one time, as published at now_ns."""
+    values = asdict(estimate)
+    del values["reasons"], values["lag_s"]
+    return EitEstimate(
+        source=name,
+        t_mono_ns=_mean_ns(frames),
+        **values,
+        reason="; ".join(estimate.reasons),
+        frame=frames[0].seq,
+        latency_s=(now_ns - max(map(attrgetter("t_arrival_ns"), frames))) / 1e9,
+    )

@@ -1,0 +1,179 @@
+"""Sessions of the configured fingertips: files are opened, and what the control loop knows of their torques."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from weakref import WeakValueDictionary
+
+from shearloop.bank.bank_file import Bank
+from shearloop.bank.channels import PAPER_TABLE, ChannelTable
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
+from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
+from shearloop.daemon.control.samples import TorqueSource
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.daemon.sensing.skin_task import skin_torque_source
+from shearloop.errors import UserError
+from shearloop.estimation import Calibration, Session
+from shearloop.estimation.bank_match import PaperMatcher
+from shearloop.estimation.defaults import MAX_GAP_S
+from shearloop.estimation.estimator import PaperEstimator
+from shearloop.estimation.paper_session import PaperSession
+from shearloop.estimation.session import BankSearch
+
+# Source of the estimate from several fingertips together.
+COMBINED = "combined"
+_SEARCHES: Mapping[str, type[PrunedMatcher | PrunedZeroLagMatcher]] = {
+    "all_lags": PrunedMatcher,
+    "zero_lag": PrunedZeroLagMatcher,
+}
+# A search has no state, so fingertips with the same bank share one.
+_in_use: WeakValueDictionary[tuple[str, str], BankSearch] = WeakValueDictionary()
+# After a grip some frames are disturbed or missing.
+_WARM_UP_SHARE = 2.0
+
+
+def channel_table(config: DaemonConfig) -> ChannelTable:
+    """Return the channels of the fingertips, by their banks and calibrations.
+
+    Raises UserError where these differ, and BankError as `open_session` does.
+    """
+    tables = {name: fingertip_table(fingertip) for name, fingertip in config.fingertips.items()}
+    if len({*tables.values()}) > 1:
+        kinds = ", ".join(f"{name} has {each.n_channels} channels" for name, each in tables.items())
+        raise UserError(f"the fingertips are of different kinds ({kinds}); run a daemon for each kind")
+    return next(iter(tables.values()), PAPER_TABLE)
+
+
+def fingertip_table(config: FingertipConfig) -> ChannelTable:
+    """Return a fingertip's channels, by its bank or its calibration, else the paper's."""
+    if config.bank is not None:
+        return Bank.open(config.bank).table
+    if config.calibration is not None and os.path.exists(config.calibration):
+        return Calibration.load(config.calibration).table
+    return PAPER_TABLE
+
+
+def open_session(config: FingertipConfig, name: str) -> Session:
+    """Return the session of one fingertip.
+
+    Raises BankError for a file that is missing, damaged or does not fit, and UserError for a calibration of another
+    estimator or side.
+    """
+    if config.calibration is not None and os.path.exists(config.calibration):
+        calibration = _load(config.calibration, config.estimator)
+        if calibration.sides and calibration.sides != (name,):
+            raise UserError(
+                f"{config.calibration} is of the {' and '.join(calibration.sides)} fingertip, not of {name}; "
+                f"calibrate with `--sides {name}`, or name a calibration of both under `combined`"
+            )
+        if calibration.estimator.needs == "bank" and config.bank is None:
+            raise _without_bank(calibration.estimator.name, name)
+        return _open(config.calibration, calibration, config)
+    if config.estimator not in (None, PaperEstimator.name):
+        found = "none is configured" if config.calibration is None else f"{config.calibration} does not exist"
+        options = f"--sides {name} --estimator {config.estimator} --out {config.calibration or 'CAL'}"
+        raise UserError(
+            f"the estimator {config.estimator} of {name} needs a calibration on recordings, and {found}; make one with "
+            f"`shearloop calibrate REC… {options}`"
+        )
+    if config.bank is None:
+        raise _without_bank(PaperEstimator.name, name)
+    if config.calibration is not None:
+        # The file is missing, and the error says how to make it.
+        return _open(config.calibration, Calibration.load(config.calibration), config)
+    bank = Bank.open(config.bank)
+    return _session(Calibration.uncalibrated(bank.identity, bank.table), config)
+
+
+def _without_bank(estimator: str, name: str) -> UserError:
+    return UserError(f"the estimator `{estimator}` needs a bank; add `bank:` to the fingertip {name}")
+
+
+def open_combined(config: CombinedConfig, fingertips: Mapping[str, FingertipConfig]) -> Session:
+    """Return the session of several fingertips together; raises as `open_session` does."""
+    calibration = _load(config.calibration, config.estimator)
+    missing = [side for side in calibration.sides if side not in fingertips]
+    if missing or len(calibration.sides) < 2:
+        raise UserError(
+            f"{config.calibration} is of {' and '.join(calibration.sides)}, and the fingertips are "
+            f"{', '.join(fingertips)}; calibrate on a recording of both, and name the fingertips as its sides"
+        )
+    return _open(config.calibration, calibration, fingertips[calibration.sides[0]])
+
+
+def torque_sources(
+    config: DaemonConfig, sessions: Mapping[str, Session], combined: Session | None
+) -> dict[str, TorqueSource]:
+    """Return what the control loop knows of each sensor's torque."""
+    periods_s = {name: own.frame_period_s for name, own in config.fingertips.items()}
+    sources = {name: _torque_source(session, name, periods_s[name]) for name, session in sessions.items()}
+    if combined is not None:
+        sources[COMBINED] = _torque_source(combined, COMBINED, max(periods_s.values()))
+    if config.skin is not None and (skin := skin_torque_source(config.skin)) is not None:
+        sources[skin.name] = skin
+    if config.load_cell is not None:
+        sources[LOAD_CELL] = TorqueSource(name=LOAD_CELL, period_s=1.0 / config.load_cell.rate_hz)
+    return sources
+
+
+def _torque_source(session: Session, name: str, period_s: float) -> TorqueSource:
+    calibration = session.calibration
+    return TorqueSource(
+        name=name,
+        period_s=period_s,
+        window_s=period_s * session.averaged_frames,
+        measures_torque=calibration.measures_torque,
+        # The first torque after a grip needs the lagged frames too.
+        warm_up_s=_WARM_UP_SHARE * calibration.estimator.motion.n_needed * period_s,
+        has_gain=calibration.measures_torque,
+    )
+
+
+def _open(path: Path, calibration: Calibration, config: FingertipConfig) -> Session:
+    try:
+        return _session(calibration, config)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from error
+
+
+def _session(calibration: Calibration, config: FingertipConfig) -> Session:
+    """Return a session; raises CalibrationError for a bank that is missing or another one."""
+    bank = Bank.open(config.bank) if config.bank is not None else None
+    search = _shared_search(bank, config.matching) if bank is not None else None
+    period_s, baseline_frames = config.frame_period_s, config.baseline_frames
+    if calibration.sides:
+        return Session(calibration, bank, search=search, period_s=period_s, baseline_frames=baseline_frames)
+    # Only the paper's estimator is of no side.
+    calibration.check_bank(bank)
+    if search is None:
+        raise ValueError("the paper's estimator needs a bank")
+    return PaperSession(
+        calibration,
+        PaperMatcher(search),
+        search=search,
+        baseline_frames=baseline_frames,
+        average_frames=config.average_frames,
+        max_gap_s=max(MAX_GAP_S, STALE_AFTER_PERIODS * period_s),
+    )
+
+
+def _shared_search(bank: Bank, matching: str) -> BankSearch:
+    key = (f"{bank.identity} {bank.signals_sha256}", matching)
+    shared = _in_use.get(key)
+    if shared is None:
+        shared = _in_use[key] = _SEARCHES[matching].from_bank(bank)
+    return shared
+
+
+def _load(path: Path, wanted: str | None) -> Calibration:
+    calibration = Calibration.load(path)
+    if calibration.kind != "raw":
+        raise UserError(f"{path} was made from slices; the daemon has raw frames: calibrate on a recording of them")
+    if wanted not in (None, calibration.estimator.name):
+        raise UserError(
+            f"{path} is a calibration of the estimator {calibration.estimator.name}, and {wanted} is configured; "
+            f"name the other, or calibrate with `--estimator {wanted}`"
+        )
+    return calibration

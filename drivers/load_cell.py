@@ -27,6 +27,22 @@ STUCK_AFTER = 20
 CAPACITY_NM = 1.75
 # More than twice the fastest change in the paper's recordings (0.76 N·m/s, a 10 mm cylinder slipping free).
 SLEW_NM_PER_S = 2.0
+# A calibration with more raw units in the capacity than this is of converter counts: it has millions of them, and grams
+# would be five thousand.
+_MOST_UNITS = 10_000
+# Why a line's unit is not that of the calibration, and the cure.
+COUNTS_REASON = (
+    "the board sends counts and has no calibration; run `shearloop calibrate load` and name its file as "
+    "`load_cell.calibration`"
+)
+COUNTS_FOR_TORQUES = (
+    "the board sends counts, and `load_cell.calibration` is of a board that sends torques or weights; run `shearloop "
+    "calibrate load` with this board"
+)
+TORQUES_FOR_COUNTS = (
+    "the board sends N·m, and `load_cell.calibration` is of a board that sends counts; take the key `calibration` out "
+    "of the configuration, or run `shearloop calibrate load` with this board"
+)
 
 _DECIMAL = re.compile(rb"[+-]?[0-9]{1,15}(\.[0-9]{1,15})?")
 
@@ -58,6 +74,11 @@ class LoadCalibration(CalibrationModel):
         return abs(self.nm_per_count) == 1.0
 
     @property
+    def takes_counts(self) -> bool:
+        """Whether a line's decimal is a number of the converter's counts."""
+        return abs(self.nm_per_count) * _MOST_UNITS < CAPACITY_NM
+
+    @property
     def nm_per_count(self) -> float:
         """The torque of one count, N·m."""
         return self.sign * self.lever_arm_m * self.scale_n_per_count
@@ -78,8 +99,8 @@ class LoadSample:
     raw: the decimal as sent; torque_nm: calibrated; t_mid_ns: the middle of the conversion, t_arrival_ns: the line's
     arrival (both monotonic). `saturated`: at an end of the converter's range. `spike`: beyond
     the cell's capacity, or further from the last good value than the rig can move. `stuck`: the same value for two
-    seconds. `partial`: the first line after opening, which may lack its beginning. `counts`: beyond the capacity on a
-    board that sends whole numbers, without a calibration; also a spike.
+    seconds. `partial`: the first line after opening, which may lack its beginning. `other_unit`: why the line is not in
+    the calibration's unit, with the cure; empty where it is.
     """
 
     raw: float
@@ -90,12 +111,12 @@ class LoadSample:
     spike: bool = False
     stuck: bool = False
     partial: bool = False
-    counts: bool = False
+    other_unit: str = ""
 
     @property
     def trusted(self) -> bool:
         """Whether no flag is set."""
-        return not (self.saturated or self.spike or self.stuck or self.partial)
+        return not (self.saturated or self.spike or self.stuck or self.partial or self.other_unit)
 
 
 class LoadParser(serial_sensor.LineParser[LoadSample]):
@@ -122,8 +143,8 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
         super().restart()
         self._last_raw: float | None = None
         self._repeats = 0
-        # Whether no line since then had a decimal point.
-        self._whole_numbers = True
+        # Whether no line since then had a decimal point, and whether one was within the capacity.
+        self._whole_numbers, self._fits = True, False
         self._levels = serial_sensor.StepFilter[tuple[float, int]]()
 
     def _value(self, line: serial_sensor.TimedLine) -> LoadSample:
@@ -133,6 +154,7 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
         self._repeats = self._repeats + 1 if raw == self._last_raw else 1
         self._last_raw = raw
         saturated, spike = raw in (COUNTS_MAX, COUNTS_MIN), abs(torque_nm) > CAPACITY_NM
+        self._fits = self._fits or not (spike or line.partial)
         # An unreliable value is not a level to judge the next one by.
         if not (saturated or line.partial):
             if spike:
@@ -148,10 +170,18 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
             spike=spike,
             stuck=self._repeats >= self._stuck_after,
             partial=line.partial,
-            counts=spike and self._whole_numbers and self.calibration.takes_torque,
+            other_unit="" if saturated or line.partial else self._other_unit(raw, line.text, spike=spike),
         )
         self.flagged += not sample.trusted
         return sample
+
+    def _other_unit(self, raw: float, text: bytes, *, spike: bool) -> str:
+        if self.calibration.takes_counts:
+            return TORQUES_FOR_COUNTS if b"." in text and abs(raw) <= CAPACITY_NM else ""
+        # A board of torques has a line within its capacity before one that is corrupted.
+        if spike and (self._whole_numbers or not self._fits):
+            return COUNTS_REASON if self.calibration.takes_torque else COUNTS_FOR_TORQUES
+        return ""
 
     def _is_reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
         # Arrival stamps bunch on a busy host: no interval counts as shorter than a period.

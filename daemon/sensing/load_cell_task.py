@@ -19,11 +19,6 @@ LOAD_CELL = "load_cell"
 ZERO_SAMPLES = 22
 # An HX711 settles within four conversions (data sheet, "Output settling time": 400 ms at 10 a second, 50 ms at 80).
 SETTLING_PERIODS = 4
-# Why counts are no torque, and the cure.
-COUNTS_REASON = (
-    "the board sends counts and has no calibration; run `shearloop calibrate load` and name its file as "
-    "`load_cell.calibration`"
-)
 # A zero takes two seconds; with a slower board twice the time of its readings.
 ZERO_TIMEOUT_S = 15.0
 
@@ -91,8 +86,8 @@ class LoadCellTask:
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the board's values for `health`."""
         found = self._board.diagnostics()
-        counts = COUNTS_REASON if self._latest is not None and self._latest.counts else ""
-        own = self._zero_error or counts or found["last_refusal"]
+        other_unit = self._latest.other_unit if self._latest is not None else ""
+        own = self._zero_error or other_unit or found["last_refusal"]
         error = own if found["connected"] else found["last_loss"]
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
@@ -133,11 +128,11 @@ def _reason(sample: LoadSample) -> str:
     """Return why a reading is not trusted, or an empty text."""
     if sample.trusted:
         return ""
-    if sample.counts and not sample.saturated:
-        return COUNTS_REASON
+    if sample.other_unit:
+        return sample.other_unit
     flags = {
         "at the end of its range": sample.saturated,
-        "further from the last one than the rig can move": sample.spike and not sample.counts,
+        "further from the last one than the rig can move": sample.spike,
         "the same for two seconds": sample.stuck,
         "perhaps the end of a longer line": sample.partial,
     }

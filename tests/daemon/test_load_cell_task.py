@@ -10,7 +10,7 @@ from shearloop.cli.terminal import message_line
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
 from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, ZERO_TIMEOUT_S, LoadCellTask
-from shearloop.drivers.load_cell import LoadSample
+from shearloop.drivers.load_cell import COUNTS_FOR_TORQUES, COUNTS_REASON, TORQUES_FOR_COUNTS, LoadSample
 from tests.running import running
 
 
@@ -40,7 +40,7 @@ class Board:
         return {"connected": True, "last_loss": "", "last_refusal": self.refusal}
 
     async def send(
-        self, raw: float, count: int = ZERO_SAMPLES, *, from_ns: int = 0, every_ns: int = 1, **flags: bool
+        self, raw: float, count: int = ZERO_SAMPLES, *, from_ns: int = 0, every_ns: int = 1, **flags: bool | str
     ) -> None:
         """Send samples that are taken from a moment on, or from where the earlier ones ended."""
         self._seq = from_ns or self._seq
@@ -143,17 +143,17 @@ async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(f
     assert (good.valid, good.reason) == (True, "")
 
 
-async def test_a_board_that_sends_counts_without_a_calibration_says_so():
+@pytest.mark.parametrize("why", [COUNTS_REASON, COUNTS_FOR_TORQUES, TORQUES_FOR_COUNTS])
+async def test_a_board_of_another_unit_than_its_calibration_says_so(why):
     async with reading() as (task, board):
-        await board.send(165_390.0, 1, spike=True, counts=True)
+        await board.send(165_390.0, 1, spike=True, other_unit=why)
         (sample,) = board.published
         assert not sample.valid
         assert sample.reason == task.diagnostics()["error"]
-        assert "sends counts" in sample.reason
-        assert "`shearloop calibrate load`" in sample.reason
+        assert sample.reason == why
         assert "can move" not in sample.reason
         line = message_line("load.torque", {**asdict(sample), "timestamp": 0.0})
-        assert "N·m" not in line
+        assert line.count("N·m") == why.count("N·m"), "no torque is shown"
         assert sample.reason in line
 
 

@@ -12,7 +12,17 @@ from shearloop.drivers import load_cell
 from shearloop.drivers.calibration_files import load_device_calibration, save_calibration
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN, PERIOD_NS, STUCK_AFTER, LoadCalibration, LoadParser
+from shearloop.drivers.load_cell import (
+    COUNTS_FOR_TORQUES,
+    COUNTS_MAX,
+    COUNTS_MIN,
+    COUNTS_REASON,
+    PERIOD_NS,
+    STUCK_AFTER,
+    TORQUES_FOR_COUNTS,
+    LoadCalibration,
+    LoadParser,
+)
 from shearloop.drivers.refused_lines import refusal_sentence
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.slices import slices
@@ -201,16 +211,38 @@ def test_a_missing_calibration_file_says_how_to_make_one(tmp_path):
         save_calibration(tmp_path / "no/such/folder.yaml", TORQUE_LINES)
 
 
-def test_counts_without_a_calibration_are_told_from_a_spike():
-    lines = ["81250", "81310", "81190", "81250"]
-    first, *others = feed_lines(LoadParser(TORQUE_LINES), lines)
-    assert first.counts
-    assert all(one.counts and one.spike and not one.trusted for one in others)
-    calibrated = LoadParser(LoadCalibration(tare_counts=81_250, scale_n_per_count=2.3e-5))
-    assert not any(one.counts for one in feed_lines(calibrated, lines))
+OF_COUNTS = LoadCalibration(tare_counts=81_250, scale_n_per_count=2.3e-5)
+# As `calibrate load` finds it with a board that sends N·m, and one that sends grams.
+OF_TORQUES = LoadCalibration(tare_counts=0.003, scale_n_per_count=1.02 / 0.035)
+OF_GRAMS = LoadCalibration(tare_counts=12.0, scale_n_per_count=9.80665e-3)
+
+
+@pytest.mark.parametrize(
+    ("calibration", "lines", "why"),
+    [
+        (TORQUE_LINES, ["81250", "81310", "81190"], COUNTS_REASON),
+        (TORQUE_LINES, ["81250.25", "81310.50", "81190.00"], COUNTS_REASON),
+        (OF_TORQUES, ["81250", "81310", "81190"], COUNTS_FOR_TORQUES),
+        (OF_GRAMS, ["-812500", "-812480", "-812475"], COUNTS_FOR_TORQUES),
+        (OF_COUNTS, ["0.0123", "-0.0401", "0.0000"], TORQUES_FOR_COUNTS),
+        (OF_COUNTS, ["0.00", "0.01", "0.00"], TORQUES_FOR_COUNTS),
+        (OF_COUNTS, ["81250", "81310", "81190"], ""),
+        (OF_COUNTS, ["81250.00", "81310.12", "81190.50"], ""),
+        (OF_TORQUES, ["0.0123", "-0.0401", "0"], ""),
+        (OF_GRAMS, ["12.5", "13.25", "0.00"], ""),
+    ],
+)
+def test_a_line_of_another_unit_than_the_calibrations_is_no_torque(calibration, lines, why):
+    # The first line after opening may lack its beginning.
+    _, *samples = feed_lines(LoadParser(calibration), ["0", *lines])
+    assert [one.other_unit for one in samples] == [why] * 3
+    assert [one.trusted for one in samples] == [not why] * 3
+
+
+def test_a_corrupted_torque_is_not_called_counts():
     # The paper's corrupted values have no decimal point.
     torques = feed_lines(LoadParser(TORQUE_LINES), ["0.0100", "0.0101", "38399996", "0.0102"])
-    assert [one.counts for one in torques] == [False] * 4
+    assert [one.other_unit for one in torques] == [""] * 4
     assert [one.spike for one in torques] == [False, False, True, False]
 
 

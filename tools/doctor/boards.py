@@ -12,7 +12,6 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.channels import ChannelTable
 from shearloop.daemon.config import AdcConfig, FingertipConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.rig import load_cell_calibration
-from shearloop.daemon.sensing.load_cell_task import COUNTS_REASON
 from shearloop.daemon.sensing.sessions import fingertip_table
 from shearloop.drivers.connection import SerialPort, find_port
 from shearloop.drivers.eit_kit import START, Frame, FrameParser
@@ -212,8 +211,8 @@ def check_samples(samples: Sequence[LoadSample]) -> Finding:
         found = f"all {n} readings are exactly {last.raw:.10g}"
         cure = "check that the HX711 has power and that its DT and SCK wires are on the pins named in the sketch"
         return trouble(subject, found, "a live converter is never that still", cure)
-    if last.counts:
-        what, cure = split_cure(COUNTS_REASON)
+    if last.other_unit:
+        what, cure = split_cure(last.other_unit)
         return trouble(subject, f"the last reading is {last.raw:.10g}", f"{what}, so there is no torque", cure)
     if (spikes := sum(sample.spike for sample in samples)) > 0.5 * n:
         found = f"{spikes} of {counted(n, 'reading')} are beyond the cell's capacity, the last {last.torque_nm:.4g} N·m"

@@ -234,6 +234,16 @@ async def test_what_is_wrong_with_the_load_cells_signal_is_told(rig, tmp_path, l
     assert cure in found.next_step
 
 
+async def test_a_board_of_torques_with_a_calibration_of_counts_has_its_cure(rig, tmp_path):
+    save_calibration(tmp_path / "load.yaml", CALIBRATION)
+    found = (await rig(load=texts(b"0.0123\r\n", b"0.0119\r\n"), calibration=str(tmp_path / "load.yaml")))[
+        "signal of load_cell"
+    ]
+    assert found.state == "trouble"
+    assert "sends N·m" in found.means
+    assert "take the key `calibration` out" in found.next_step
+
+
 async def test_counts_are_cured_by_the_calibration(rig, tmp_path):
     save_calibration(tmp_path / "load.yaml", CALIBRATION)
     found = (await rig(load=counts()))["signal of load_cell"]

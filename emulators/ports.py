@@ -13,7 +13,7 @@ from typing import Protocol, Self, TypeAlias
 from shearloop.emulators import number_between
 
 READ_BYTES = 4096
-OUTAGES = "silence [SECONDS], unplug [SECONDS], normal"
+OUTAGES = "silence [SECONDS], unplug [SECONDS], slow MILLISECONDS, normal"
 
 
 class PtyPort:
@@ -119,7 +119,7 @@ class Server(ABC):
     appearances: asyncio.Queue[str]
 
     def __init__(self, answer_s: float) -> None:
-        self._answer_s = answer_s
+        self._answer_s = self._usual_answer_s = answer_s
         # normal, silence or unplug.
         self._state = "normal"
         self._changed = asyncio.Event()
@@ -153,7 +153,10 @@ class Server(ABC):
                 self._begin(kind)
                 for time_s in times_s:
                     self._recovery = asyncio.get_running_loop().call_later(time_s, self._begin, "normal")
+            case ["slow", answer_ms]:
+                self._answer_s = number_between(answer_ms, 0.0, 10_000.0, "no time in ms of at most 10000") / 1000
             case ["normal"]:
+                self._answer_s = self._usual_answer_s
                 self._begin("normal")
             case _:
                 raise ValueError(f"{text!r} is no command; there are {OUTAGES}")

@@ -1,6 +1,7 @@
 """The gripper over either connection: widths, activation, motion, state, reconnection."""
 
 import asyncio
+import contextlib
 import math
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
@@ -33,6 +34,8 @@ _NOMINAL_STD_MM = 3.0
 # This many diameters over this fraction of the stroke show whether the width bows.
 _BOW_GAUGES, _BOW_SPREAD = 4, 0.5
 POLL_S = 0.1
+# Without a readout of `states` for this number of poll periods, a command reads by itself.
+_POLLS_WAITED = 3
 # The pause between reset and activation that Robotiq's own clients keep.
 PAUSE_NS = 500_000_000
 RESET_DEADLINE_NS = 3_000_000_000
@@ -197,6 +200,9 @@ class RobotiqGripper:
     _seq: int = field(default=0, init=False)
     _last_move: messages.GripperMove | None = field(default=None, init=False)
     _loss: DriverError | None = field(default=None, init=False)
+    # The latest readout since the last request, and its beginning.
+    _latest: tuple[messages.Readout, int] | None = field(default=None, init=False)
+    _news: asyncio.Event = field(default_factory=asyncio.Event, init=False)
 
     @property
     def model(self) -> GripperModel:
@@ -218,13 +224,12 @@ class RobotiqGripper:
     async def close(self) -> None:
         """Close the connection; the gripper keeps its grip."""
         async with self._lock:
-            self.connected, self.latest = False, None
+            self.connected, self.latest, self._latest = False, None, None
             await self.client.close()
 
     async def read(self) -> messages.GripperState:
-        """Return the gripper's present state."""
-        readout, t_ns = await self._read()
-        self.latest = self._state(readout, t_ns)
+        """Return the gripper's present state; each value is of now."""
+        self.latest = self._state(*await self._read(whole=True))
         return self.latest
 
     async def activate(self, *, operator_confirmed: bool = False) -> messages.GripperState:
@@ -233,7 +238,7 @@ class RobotiqGripper:
         After a major fault the operator has to confirm that the fingers are clear. `operator_confirmed` activates in
         any state. Raises GripperFaultError when the activation is refused or fails.
         """
-        readout, t_ns = await self._read()
+        readout, t_ns = await self._recent()
         fault = messages.fault_of(readout.flt)
         if not operator_confirmed:
             if fault.needs_activation:
@@ -264,7 +269,7 @@ class RobotiqGripper:
         Raises GripperRefusedError for a command that is not finite, GripperFaultError when the gripper would not move.
         """
         sent = self.request_of(command)
-        readout, _ = await self._read()
+        readout, _ = await self._recent()
         if blocking := blocking_fault(readout):
             raise messages.GripperFaultError(blocking)
         self._last_move = sent
@@ -293,20 +298,20 @@ class RobotiqGripper:
         self, done: Callable[[messages.Readout], bool], deadline_ns: int, failure: str
     ) -> messages.GripperState:
         """Return the first state that is `done`; GripperFaultError after the deadline."""
-        since_ns = time.monotonic_ns()
+        since_ns = next_ns = time.monotonic_ns()
         while True:
-            readout, t_ns = await self._read()
+            readout, t_ns = await self._readout_after(next_ns)
             if done(readout):
                 return self._state(readout, t_ns)
             if t_ns - since_ns > deadline_ns:
                 raise messages.GripperFaultError(failure)
-            await asyncio.sleep(self.poll_s)
+            next_ns = t_ns + 1
 
     async def halt(self) -> None:
         """Stop the fingers where they are; they keep their grip. An activation is ended by a reset."""
         self._last_move = None
         await self._write(messages.GripperAction.HALT)
-        readout, _ = await self._read()
+        readout, _ = await self._read(whole=True)
         # The status may not show an activation yet that has just been requested. A major fault stops the fingers, and
         # a reset would clear it without the operator.
         active = readout.sta is messages.ActivationStatus.ACTIVE
@@ -338,7 +343,8 @@ class RobotiqGripper:
 
     async def _next_state(self) -> messages.GripperState:
         if self.connected:
-            return await self.read()
+            self.latest = self._state(*await self._read())
+            return self.latest
         if self._loss is not None:
             raise self._loss
         state = await self.connect()
@@ -357,11 +363,31 @@ class RobotiqGripper:
             round(float(np.interp(command.force_n, self.model.force_n, (0, COUNTS_MAX)))),
         )
 
-    async def _read(self) -> tuple[messages.Readout, int]:
-        return await self._exchange(self.client.read)
+    async def _read(self, *, whole: bool = False) -> tuple[messages.Readout, int]:
+        self._latest = await self._exchange(partial(self.client.read, whole=whole))
+        self._news.set()
+        self._news.clear()
+        return self._latest
+
+    async def _recent(self) -> tuple[messages.Readout, int]:
+        """Return the latest readout where `states` keeps it fresh, else a new one: each delays the next state."""
+        if self._latest is not None and time.monotonic_ns() - self._latest[1] < 2 * self.poll_s * 1e9:
+            return self._latest
+        return await self._read(whole=True)
+
+    async def _readout_after(self, since_ns: int) -> tuple[messages.Readout, int]:
+        """Return a readout of `states` that began at `since_ns` or later; one of its own where none comes."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_POLLS_WAITED * self.poll_s):
+                while self._latest is None or self._latest[1] < since_ns:
+                    await self._news.wait()
+                return self._latest
+        return await self._read()
 
     async def _write(self, request: messages.Request) -> None:
+        self._latest = None
         await self._exchange(partial(self.client.write, request))
+        self._latest = None
 
     async def _exchange(self, exchange: Callable[[], Awaitable[T]]) -> tuple[T, int]:
         """Return an exchange's result and its beginning. It goes on when its caller is cancelled.
@@ -382,7 +408,7 @@ class RobotiqGripper:
             except DriverError as error:
                 if self.connected:
                     self._loss = error
-                self.connected, self.latest = False, None
+                self.connected, self.latest, self._latest = False, None, None
                 raise
 
     def _state(self, readout: messages.Readout, t_ns: int) -> messages.GripperState:

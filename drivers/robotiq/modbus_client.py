@@ -102,7 +102,7 @@ class ModbusClient:
             self._client.close()
         self._client = None
 
-    async def read(self) -> messages.Readout:
+    async def read(self, *, whole: bool = True) -> messages.Readout:  # noqa: ARG002 - one answer holds them all
         """Return the status registers; DeviceLostError or ProtocolError."""
         response = await self._exchange(None)
         return readout_of(response.registers)

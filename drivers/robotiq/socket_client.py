@@ -16,8 +16,12 @@ from shearloop.drivers.robotiq import messages
 REPLY_DEADLINE_S = 0.5
 MAX_REPLY_BYTES = 32
 _ACK = b"ack"
-# PRE before OBJ, and OBJ before POS: then OBJ is never older than the target, nor the position than the stop.
-READ_ORDER = ("ACT", "STA", "GTO", "PRE", "OBJ", "POS", "FLT", "COU")
+# In each readout, after the others: then OBJ is never older than the target, nor the position than the stop.
+ALWAYS = ("OBJ", "POS")
+# Controllers were reported that take 32 ms a variable: eight of them would be older than the loop accepts.
+IN_TURN = ("PRE", "GTO", "ACT", "STA", "FLT", "COU")
+# Those in turn are asked for within this time, and at least one.
+IN_TURN_S = 0.02
 # Older URCaps have no motor current.
 _OPTIONAL = ("COU",)
 
@@ -62,16 +66,27 @@ def value_of(variable: str, text: str) -> int | None:
         if variable in _OPTIONAL:
             return None
         raise DeviceLostError(
-            "The robot's controller answers but has no data of the gripper; check its power and cable, and that it is "
-            "selected in the URCap's installation page."
+            "The robot's controller answers but has no data of the gripper: check its power and cable, and select it "
+            "in the URCap's installation page; on an e-Series set Tool I/O, Controlled by, to the Robotiq URCap, and "
+            "uninstall an RS-485 URCap."
         )
     if not (text.isascii() and text.isdigit() and int(text) <= 255):
         raise ProtocolError(f"The gripper's socket gave {variable} as {text!r}, which is no number from 0 to 255.")
     return int(text)
 
 
+def changed_by(request: messages.Request) -> tuple[str, ...]:
+    """Return the variables that a request changes."""
+    match request:
+        case messages.GripperAction.HALT:
+            return ("GTO",)
+        case messages.GripperMove():
+            return ("PRE",)
+    return ("ACT", "STA", "GTO", "FLT")
+
+
 def readout_of(values: dict[str, int | None]) -> messages.Readout:
-    """Return the readout of the values of READ_ORDER; ProtocolError for a status that is not in the manual."""
+    """Return the readout of the values of all variables; ProtocolError for a status that is not in the manual."""
     known = {name: value for name, value in values.items() if value is not None}
     try:
         return messages.Readout(
@@ -98,6 +113,9 @@ class SocketClient:
         self._deadline_s = reply_deadline_s
         self._connection: TcpPort | None = None
         self._received = b""
+        # The latest value of each variable, and the order in which those in turn come next.
+        self._values: dict[str, int | None] = {}
+        self._turn = list(IN_TURN)
 
     @property
     def name(self) -> str:
@@ -108,6 +126,7 @@ class SocketClient:
         """Open the connection; DeviceNotFoundError when nothing listens there."""
         await self.close()
         self._received = b""
+        self._values.clear()
         try:
             self._connection = await TcpPort.connect(self._host, self._port)
         except OSError as error:  # a timeout is one
@@ -122,14 +141,38 @@ class SocketClient:
         if connection is not None:
             connection.close()
 
-    async def read(self) -> messages.Readout:
-        """Return the status registers, requested one by one; DeviceLostError or ProtocolError."""
-        return readout_of({name: value_of(name, await self._ask(f"GET {name}")) for name in READ_ORDER})
+    async def read(self, *, whole: bool = False) -> messages.Readout:
+        """Return the status registers, requested one by one; DeviceLostError or ProtocolError.
+
+        Object and position are of now. On a slow connection the others are up to six readouts old, unless the last
+        request has changed them or `whole` asks for all of them.
+        """
+        if whole:
+            self._values.clear()
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + IN_TURN_S
+        # What is unknown comes first.
+        for number, name in enumerate(sorted(self._turn, key=self._values.__contains__)):
+            if number and name in self._values and loop.time() > until_s:
+                break
+            self._turn.remove(name)
+            self._turn.append(name)
+            await self._get(name)
+        for name in ALWAYS:
+            await self._get(name)
+        return readout_of(self._values)
 
     async def write(self, request: messages.Request) -> None:
         """Send a request and wait for its acknowledgement; DeviceLostError or ProtocolError."""
+        for name in changed_by(request):
+            self._values.pop(name, None)
+        if isinstance(request, messages.GripperMove) and self._values.get("GTO") != 1:
+            self._values.pop("GTO", None)
         for line in set_lines(request):
             await self._ask(line)
+
+    async def _get(self, name: str) -> None:
+        self._values[name] = value_of(name, await self._ask(f"GET {name}"))
 
     def _came_instead(self) -> str:
         return f", only {shown(self._received)}" if self._received else ""

@@ -37,7 +37,7 @@ class Client:
 
     async def close(self) -> None: ...
 
-    async def read(self) -> messages.Readout:
+    async def read(self, **_: bool) -> messages.Readout:
         return self.readouts.pop(0) if len(self.readouts) > 1 else self.readouts[0]
 
     async def write(self, request: messages.Request) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.cli.free_ports import free_port, is_free
-from shearloop.drivers.defaults import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, URCAP_PORT
+from shearloop.drivers.defaults import DASHBOARD_PORT, PRIMARY_PORT, RTDE_PORT, SCRIPT_PORT, URCAP_PORT
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:
@@ -235,6 +235,6 @@ def _bank(name: str, fingertip: "FingertipConfig", path: Path) -> str:
 def _free_loopback() -> str:
     """Return an address of this computer with free ports for robot and gripper."""
     for host in LOOPBACKS:
-        if all(is_free(host, port) for port in (RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT, URCAP_PORT)):
+        if all(is_free(host, port) for port in (RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT, PRIMARY_PORT, URCAP_PORT)):
             return host
     raise UserError("every loopback address plays a robot already: end one of the other rigs")

@@ -276,6 +276,7 @@ def build_rig(
     gripper = make_gripper(config.gripper, loop, publisher, patience_of(config)) if config.gripper is not None else None
     sensors = build_sensors(config, publisher, clock, recorder, loop, sessions, combined, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), warns=not config.emulated)
+    robot.holds = loop.may_hold
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, settings.limits, gripper_model(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}

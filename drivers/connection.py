@@ -294,6 +294,11 @@ class LinkMonitor:
         self._notify(LinkEvent(up=False, sentence=self._last_error, repeated=repeated))
         return pause_s
 
+    def noted(self, sentence: str) -> None:
+        """Report what a device says by itself."""
+        if self._observer is not None:
+            self._observer.on_refusal(sentence)
+
     def refused(self, sentence: str) -> None:
         """Note refused data, and report the first of each connection; later ones are counted by the driver."""
         if self._observer is not None and not self._told_refusal:

@@ -6,6 +6,8 @@ FRAME_PERIOD_S = 0.5408
 LOAD_CELL_RATE_HZ = 10.9
 # A UR controller's services: RTDE, the Real-Time Client, which takes programs, and the Dashboard Server.
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
+# Its Primary Client Interface, which reports error codes.
+PRIMARY_PORT = 30001
 # The gripper behind the URCap.
 URCAP_PORT = 63352
 # The shear skin's current source. Twice two gauges of 25 Ω and their leads need 1 V; harmless for people and gauges.

@@ -25,6 +25,8 @@ HOME_RAD = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
 # Data sheet of the UR5e: 180 degrees per second. A linear move that needs more, near a singularity, ends in a
 # protective stop.
 JOINT_SPEED_LIMIT_RAD_PER_S = math.pi
+# UR's forum: a CB3 estimates forces to ± 10 N and ± 5 N·m; the components, so that their norm is within that.
+CURRENTS_ERROR = np.array([10.0, 10.0, 10.0, 5.0, 5.0, 5.0]) / math.sqrt(3)
 
 
 def link_frames(q_rad: Vector) -> list[Matrix]:
@@ -185,6 +187,7 @@ class Arm:
         self._plant = plant
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)
+        self._noise, self._random = np.zeros(6), np.random.default_rng(0)
 
     @property
     def _frame(self) -> Matrix:
@@ -211,7 +214,7 @@ class Arm:
     @property
     def wrench(self) -> Vector:
         """Force and torque at the tool, relative to the zero."""
-        return self._wrench - self._wrench_zero
+        return self._wrench + self._noise - self._wrench_zero
 
     def turn(self, target_rad_per_s: Vector, acceleration: float) -> None:
         """Turn towards these joint speeds from now on."""
@@ -239,8 +242,12 @@ class Arm:
             self.q_rad, self.qd_rad_per_s, finished = self.motion.advance(self.q_rad, self.qd_rad_per_s, dt_s)
             self.motion = None if finished else self.motion
 
-    def feel(self, dt_s: float) -> None:
-        """Let the wrist turn its plant for one cycle, and feel its torque about the tool's axis."""
+    def feel(self, dt_s: float, *, noisy: bool = False) -> None:
+        """Let the wrist turn its plant for one cycle, and feel its torque about the tool's axis.
+
+        `noisy`: with the errors of forces that are estimated from the joints' currents.
+        """
+        self._noise = self._random.uniform(-1.0, 1.0, 6) * CURRENTS_ERROR if noisy else np.zeros(6)
         if self._plant is not None:
             torque_nm = self._plant.step(dt_s, float(self.q_rad[5]))
             flange_axis = self._frame[:3, :3] @ self._tool[2, :3]

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Collection
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import replace
 
-from shearloop.drivers.defaults import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
+from shearloop.drivers.defaults import DASHBOARD_PORT, PRIMARY_PORT, RTDE_PORT, SCRIPT_PORT
 from shearloop.emulators import number_between
 from shearloop.emulators.ports import Connections, connected
 from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
@@ -24,19 +24,31 @@ MOST_CATCH_UP_S = 0.02
 BANNER = "Connected: Universal Robots Dashboard Server"
 _ROBOT_MODES = {MODE_POWER_OFF: "POWER_OFF", MODE_IDLE: "IDLE", MODE_RUNNING: "RUNNING"}
 # What changes the robot needs remote control; UR's words differ from version to version.
+# Universal_Robots_ROS_Driver, issues 125 and 262.
+_LOCAL = (
+    "Command is not allowed due to safety reasons, please switch robot to Remote Control mode and reconnect to port "
+    "29999"
+)
 _CONTROLS = ("power on", "brake release", "unlock protective stop", "stop", "close popup", "close safety popup")
-# By major version: the size of a state on the script port, and how many come a second (UR's page "Overview of client
-# interfaces").
+# By major version: the size of a state on the script port, and how many of them, and of control cycles, a second has
+# (UR's page "Overview of client interfaces").
 _STATE_BYTES, _STATES_HZ = {3: 1108, 5: 1220}, {3: 125.0, 5: 500.0}
+# Of the Primary Client Interface: kinds of packages, of a message, and the code, argument and level of an event.
+_ROBOT_STATE, _ROBOT_MESSAGE, _CODE_MESSAGE = 16, 20, 6
+_ERROR_CODES = {"protective-stop": (204, 3, 3)}
 # What the kernel keeps of the states for a client that does not read.
 _UNREAD_BYTES = 4096
 _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
 FAULTS = (
     *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "protect-abrupt-ends"),
-    *("registers-in-use", "local-control", "refuse-protocol", "mute-dashboard", "drop-scripts"),
-    *("version", "payload", "slider", "normal"),
+    *("registers-in-use", "upper-registers-in-use", "local-control", "refuse-protocol"),
+    *("mute-dashboard", "drop-scripts", "version", "payload", "slider", "error-code", "normal"),
 )
+
+
+def _package(kind: int, content: bytes) -> bytes:
+    return struct.pack(">iB", 5 + len(content), kind) + content
 
 
 class Controller:
@@ -56,6 +68,8 @@ class Controller:
         self._silent_until_s = 0.0
         self._rtde: dict[asyncio.StreamWriter, RtdeSession] = {}
         self._connections: Connections = {}
+        # Those of the Primary Client Interface.
+        self._told: set[asyncio.StreamWriter] = set()
 
     @asynccontextmanager
     async def open(self) -> AsyncIterator[None]:
@@ -65,6 +79,7 @@ class Controller:
                 (RTDE_PORT, self._serve_rtde),
                 (SCRIPT_PORT, self._serve_scripts),
                 (DASHBOARD_PORT, self._serve_dashboard),
+                (PRIMARY_PORT, self._serve_primary),
             ):
                 if port in self._closed_ports:
                     continue
@@ -78,9 +93,9 @@ class Controller:
 
     async def run(self) -> AsyncIterator[RobotEvent]:
         """Let time pass, and yield the robot's events, until cancelled."""
-        dt_s = 1.0 / self._rate_hz
         last_s = time.monotonic()
         while True:
+            dt_s = 1.0 / min(self._rate_hz, _STATES_HZ[5 if self.robot.is_e_series else 3])
             await asyncio.sleep(max(0.0, last_s + dt_s - time.monotonic()))
             now_s = time.monotonic()
             missed_s = max(0.0, now_s - MOST_CATCH_UP_S - last_s)
@@ -92,6 +107,8 @@ class Controller:
                 for writer, session in self._rtde.items():
                     self._send(writer, session.data())
             for event in self.robot.take_events():
+                if event.name in _ERROR_CODES:
+                    self._report(*_ERROR_CODES[event.name])
                 yield event
 
     def command(self, line: str) -> None:
@@ -112,20 +129,16 @@ class Controller:
             case ["silence", seconds]:
                 self.silence(number_between(seconds, 0.0, 86400.0, "not a time in seconds from 0 to 86400"))
             case [
-                "registers-in-use" | "local-control" | "refuse-protocol" | "mute-dashboard" | "drop-scripts" as fault
+                "registers-in-use"
+                | "upper-registers-in-use"
+                | "local-control"
+                | "refuse-protocol"
+                | "mute-dashboard"
+                | "drop-scripts" as fault
             ]:
                 self.faults.add(fault)
-            case ["version", numbers]:
-                if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", numbers) is None:
-                    raise ValueError(f"{numbers!r} is not a version such as 5.4.0.0")
-                major, minor, bugfix, build = map(int, numbers.split("."))
-                self.robot.change(replace(self.robot.spec, version=(major, minor, bugfix, build)))
-            case ["payload", mass_kg]:
-                payload_kg = number_between(mass_kg, 0.0, 100.0, "not a mass in kg from 0 to 100")
-                self.robot.change(replace(self.robot.spec, payload_kg=payload_kg))
-            case ["slider", fraction]:
-                slider = number_between(fraction, 0.01, 1.0, "not a fraction from 0.01 to 1")
-                self.robot.arm.speed_slider = slider
+            case ["version" | "payload" | "slider" | "error-code" as setting, value]:
+                self._set(setting, value)
             case ["normal"]:
                 self.robot.clear_faults()
                 self.robot.change(self._first_spec)
@@ -135,6 +148,23 @@ class Controller:
                 raise ValueError(f"{name} does not take {' '.join(arguments) or 'nothing'}")
             case _:
                 raise ValueError(f"there is no fault {line!r}; there are {', '.join(FAULTS)}")
+
+    def _set(self, setting: str, value: str) -> None:
+        """Change what has a value; ValueError where it cannot have this one."""
+        robot = self.robot
+        match setting:
+            case "version":
+                if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", value) is None:
+                    raise ValueError(f"{value!r} is not a version such as 5.4.0.0")
+                major, minor, bugfix, build = map(int, value.split("."))
+                robot.change(replace(robot.spec, version=(major, minor, bugfix, build)))
+            case "payload":
+                payload_kg = number_between(value, 0.0, 100.0, "not a mass in kg from 0 to 100")
+                robot.change(replace(robot.spec, payload_kg=payload_kg))
+            case "slider":
+                robot.arm.speed_slider = number_between(value, 0.01, 1.0, "not a fraction from 0.01 to 1")
+            case _:
+                self._report(int(number_between(value, 1, 9999, "not a code from 1 to 9999")), 0, 2)
 
     def silence(self, duration_s: float) -> None:
         """Send nothing on any port for a while; the connections stay open, and the data is lost."""
@@ -183,7 +213,7 @@ class Controller:
         """
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNREAD_BYTES)
         writer.transport.set_write_buffer_limits(0)
-        major = 3 if self.robot.spec.version[0] == 3 else 5
+        major = 5 if self.robot.is_e_series else 3
         # Its size, then values that no client of ours reads.
         state = struct.pack(">I", _STATE_BYTES[major]).ljust(_STATE_BYTES[major], b"\x00")
         while True:
@@ -197,6 +227,25 @@ class Controller:
             if not data:
                 return
             yield data
+
+    async def _serve_primary(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with connected(writer, self._connections):
+            self._told.add(writer)
+            try:
+                # The version comes first, and states ten times a second, which no client of ours reads.
+                self._send(writer, _package(_ROBOT_STATE, bytes(8)))
+                while await reader.read(4096):
+                    pass
+            finally:
+                self._told.discard(writer)
+
+    def _report(self, code: int, argument: int, level: int) -> None:
+        """Send an error code to the clients of the Primary Client Interface."""
+        content = struct.pack(
+            ">QbBiiiII", round(self.robot.clock_s * 1e6), -2, _CODE_MESSAGE, code, argument, level, 0, 0
+        )
+        for writer in self._told:
+            self._send(writer, _package(_ROBOT_MESSAGE, content))
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with connected(writer, self._connections):
@@ -212,13 +261,13 @@ class Controller:
         """Carry out a request as UR's page "Dashboard Server e-Series" describes it, and return the reply."""
         robot = self.robot
         if "local-control" in self.faults and request in _CONTROLS:
-            return f"Command is not allowed: the robot is in local control ({request})"
+            return _LOCAL
         match request:
             case "PolyscopeVersion":
                 return f"URSoftware {'.'.join(map(str, robot.spec.version))} (Jun 01 2024)"
             case "get serial number":
                 return "20235500001"
-            case "is in remote control":
+            case "is in remote control" if robot.is_e_series:
                 return "false" if "local-control" in self.faults else "true"
             case "robotmode":
                 return f"Robotmode: {_ROBOT_MODES[robot.robot_mode]}"

@@ -13,6 +13,7 @@ from shearloop.emulators.urscript import Program, ProgramEndedError, Registers
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 MODE_POWER_OFF, MODE_IDLE, MODE_RUNNING = 3, 5, 7
 SAFETY_NORMAL, SAFETY_PROTECTIVE_STOP, SAFETY_EMERGENCY_STOP = 1, 3, 7
+E_SERIES_MAJOR = 5
 LOG_LINES = 100
 PROGRAM_END_DECELERATION, SAFETY_DECELERATION = 10.0, 20.0
 
@@ -79,7 +80,7 @@ class Robot:
                 if self.protects_abrupt_ends and self.arm.moving:
                     self.protective_stop(f"the program ended while the arm moved: {ended}")
         self._move(dt_s)
-        self.arm.feel(dt_s)
+        self.arm.feel(dt_s, noisy=not self.is_e_series)
 
     def stand_still(self, seconds: float) -> None:
         """Let only the clock go on."""
@@ -100,6 +101,11 @@ class Robot:
             self._note("motion-stopped" if moving else "motion-started")
 
     @property
+    def is_e_series(self) -> bool:
+        """Whether it has a force sensor, which it zeroes as a program starts; a CB3 estimates forces from currents."""
+        return self.spec.version[0] >= E_SERIES_MAJOR
+
+    @property
     def program_running(self) -> bool:
         """Whether a program is loaded and has not ended; a paused one counts."""
         return self._program is not None
@@ -112,11 +118,13 @@ class Robot:
             return
         self.end_program("a new script arrived")
         try:
-            self._program = Program(text, self.registers, self.arm, self.log.append)
+            self._program = Program(text, self.registers, self.arm, self.log.append, e_series=self.is_e_series)
         except SyntaxError as error:
             self._note("script-refused", str(error))
             return
         self.runtime_state = PLAYING
+        if self.is_e_series:
+            self.arm.zero_wrench()
         self._note("program-started")
 
     def end_program(self, cause: str) -> None:

@@ -13,7 +13,7 @@ from shearloop.emulators.ur_robot import (
     SAFETY_PROTECTIVE_STOP,
     Robot,
 )
-from shearloop.emulators.urscript import COMMAND
+from shearloop.emulators.urscript import COMMANDS
 
 Value = int | float | Sequence[float] | Vector
 
@@ -88,7 +88,7 @@ class RtdeSession:
 
     robot: Robot
     rate_hz: float
-    # Names of faults; `refuse-protocol` and `registers-in-use` concern this connection.
+    # Names of faults; `refuse-protocol`, `registers-in-use` and `upper-registers-in-use` concern this connection.
     faults: set[str]
     _buffer: bytearray = field(default_factory=bytearray)
     _inputs: list[list[str]] = field(default_factory=list)
@@ -148,12 +148,19 @@ class RtdeSession:
     def _set_inputs(self, payload: bytes) -> bytes:
         names = _names(payload)
         kinds = [type_of(name) for name in names]
-        if "registers-in-use" in self.faults:
-            kinds = ["IN_USE" if "_register_" in name else kind for name, kind in zip(names, kinds, strict=True)]
+        kinds = ["IN_USE" if self._is_taken(name) else kind for name, kind in zip(names, kinds, strict=True)]
         if {"IN_USE", "NOT_FOUND"} & set(kinds):
             return package(INPUTS, b"\x00" + ",".join(kinds).encode())
         self._inputs.append(names)
         return package(INPUTS, bytes([len(self._inputs)]) + ",".join(kinds).encode())
+
+    def _is_taken(self, name: str) -> bool:
+        """Return whether another client writes this input."""
+        register = _REGISTER.fullmatch(name)
+        upper = register is not None and int(register[3]) >= _REGISTERS // 2
+        return register is not None and (
+            "registers-in-use" in self.faults or (upper and "upper-registers-in-use" in self.faults)
+        )
 
     def _write(self, payload: bytes) -> None:
         names = self._inputs[payload[0] - 1]
@@ -161,9 +168,9 @@ class RtdeSession:
         if values is None:
             # The client sends a vector of a wrong length as a short package; a controller drops it.
             return
-        # Register 0 last: its command needs the arguments.
+        # The command's register last: it needs the arguments.
         pairs = list(zip(names, values, strict=False))
-        for name, value in sorted(pairs, key=lambda pair: pair[0] == COMMAND):
+        for name, value in sorted(pairs, key=lambda pair: pair[0] in COMMANDS):
             self.robot.registers.write(name, value, self.robot.time_s)
 
 

@@ -24,9 +24,12 @@ from shearloop.emulators.ur_arm import Arm
 Event = tuple[str, str]
 Thread = Iterator[None]
 
-COMMAND = "input_int_register_0"
+# The first integer register of each half.
+COMMANDS = ("input_int_register_0", "input_int_register_24")
 # More loops than this within one cycle never end.
 MOST_LOOPS = 10_000
+# Functions from PolyScope 5 on.
+_E_SERIES = ("zero_ftsensor", "get_steptime")
 # Functions that use up cycles.
 _LASTING = ("sync", "speedj", "movel", "stopj", "stopl")
 _SAME_KEYWORDS = {"and", "or", "not", "if", "elif", "else", "while", "def", "return", "break", "continue", "global"}
@@ -123,14 +126,22 @@ def _opening(line: str, declared: set[str]) -> list[str]:
 class Program:
     """One run of a program, from its upload to its end."""
 
-    def __init__(self, text: str, registers: Registers, arm: Arm, log: Callable[[str], None]) -> None:
-        """Begin; SyntaxError where the text is no program. `log` gets the messages for the pendant's log."""
+    def __init__(
+        self, text: str, registers: Registers, arm: Arm, log: Callable[[str], None], *, e_series: bool = True
+    ) -> None:
+        """Begin; SyntaxError where the text is no program. `log` gets the messages for the pendant's log.
+
+        Without `e_series` it lacks the functions that came with that generation.
+        """
         self._registers, self._arm, self._log = registers, arm, log
         self._step_s = 0.0
         self._events: list[Event] = []
         self._watchdogs: dict[str, float] = {}
         code, main = translate(text)
         names = self._functions()
+        if not e_series:
+            for name in _E_SERIES:
+                del names[name]
         exec(code, names)  # noqa: S102
         # By number; the main one is number 1, and the program ends with it.
         self._threads: dict[int, Thread] = {1: names[main]()}

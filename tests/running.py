@@ -76,6 +76,12 @@ class LinkEvents(Changes):
 
     def on_refusal(self, sentence: str) -> None:
         self.refusals.append(sentence)
+        self.note()
+
+    async def refusal(self) -> str:
+        """Wait for what a device says, and return the first of it."""
+        await self.until(lambda: bool(self.refusals))
+        return self.refusals[0]
 
     def on_link_event(self, event: LinkEvent) -> None:
         self.events.append(event)

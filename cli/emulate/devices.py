@@ -33,12 +33,14 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   drop-rtde               close the RTDE connections, but not the dashboard's
   silence SECONDS         send nothing on any port
   registers-in-use        refuse input registers as if a fieldbus had them
+  upper-registers-in-use  refuse those from 24 on as if another RTDE client had them
   local-control           leave remote control
   refuse-protocol         refuse the RTDE protocol version
   mute-dashboard          accept connections to the dashboard, and send nothing on them
   drop-scripts            take programs, and play none
   protect-abrupt-ends     end in a protective stop when a program ends while the arm moves
   slider FRACTION         move the pendant's speed slider, 1 at its right end
+  error-code CODE         report an error code, as the pendant's log has it
   version A.B.C.D         report this version of PolyScope to later connections
   payload KG              have another payload set at the pendant
   normal                  end all of them
@@ -222,8 +224,8 @@ def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
     parser.epilog = (
         f"Prints {printed}, again each time it comes back. On standard input: `object MM` puts something of that width "
         "between the fingers, `object none` takes it away; `fault CODE` makes the gripper report a fault; `unplug "
-        "[SECONDS]` breaks the connection, `silence [SECONDS]` answers nothing; `normal` ends them, and a fault below "
-        "10."
+        "[SECONDS]` breaks the connection, `silence [SECONDS]` answers nothing, `slow MILLISECONDS` answers late; "
+        "`normal` ends them, and a fault below 10."
     )
     add_option(parser, "--speed", positive(), "N", "times the gripper's own pace", default=1.0)
     text = f"{', '.join(MODELS)} (default: %(default)s)"

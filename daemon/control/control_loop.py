@@ -210,6 +210,15 @@ class ControlLoop:
         force = f"with at most {force_n:g} N" if force_n is not None else "with an unknown force"
         return f"its fingers hold something {gripper.width_mm:.1f} mm wide, {force}"
 
+    def may_hold(self) -> bool:
+        """Return whether the gripper holds something, or does not know; a grip of an earlier process counts."""
+        if "gripper" not in self._watched.required:
+            return False
+        gripper = self.inputs.gripper
+        if gripper is None:
+            return self._gripped.force_n is not None
+        return gripper.holding or gripper.moving or gripper.uncertain
+
     def release_refusal(self) -> str | None:
         """Return why the operator cannot open the gripper now, or None; the arm is not asked."""
         if (running := self.running) is not None:

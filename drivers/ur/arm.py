@@ -15,10 +15,26 @@ import rtde_control
 import script_client
 
 from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge, ScriptReadiness, command_dashboard
-from shearloop.drivers.ur.messages import RUNTIME_PLAYING, MoveLinear, RobotLostError, RtdeSample, WristSpeed
-from shearloop.drivers.ur.script import KNOWN_SCRIPTS, NO_MOTION_TICKS, guard_script, hash_of
+from shearloop.drivers.ur.messages import (
+    RUNTIME_PLAYING,
+    ControllerError,
+    MoveLinear,
+    RobotLostError,
+    RtdeSample,
+    WristSpeed,
+)
+from shearloop.drivers.ur.primary_port import PrimaryPort
+from shearloop.drivers.ur.script import (
+    KNOWN_SCRIPTS,
+    NO_MOTION_TICKS,
+    UPPER,
+    ScriptRegisters,
+    carry_wrench,
+    guard_script,
+    hash_of,
+)
 from shearloop.drivers.ur.script_port import ScriptPort
-from shearloop.drivers.ur.settings import UrSettings
+from shearloop.drivers.ur.settings import Six, UrSettings
 
 # A thread of ur-rtde polls its socket every 0.1 ms, which takes 5 % of a core. With this timer slack it wakes once per
 # two samples. One-time commands wait for that thread, so that the slack is at most a sixth of the watchdog's time.
@@ -31,7 +47,9 @@ _UPLOAD_S = 1.0
 class UrArm:
     """A connection for samples, one for control, and the dashboard when needed."""
 
-    def __init__(self, settings: UrSettings, version: str) -> None:
+    def __init__(
+        self, settings: UrSettings, version: str, registers: ScriptRegisters = UPPER, primary: PrimaryPort | None = None
+    ) -> None:
         """Connect without starting a program, so that this works in a protective stop. `version` is like 5.17.3.0.
 
         Raises:
@@ -39,29 +57,33 @@ class UrArm:
             RobotLostError: the controller does not send its state, or ur-rtde's script is unknown.
         """
         self._settings = settings
+        self._primary = primary
         major, minor = map(int, version.split(".")[:2])
         own = script_client.ScriptClient("", major, minor).getScript()
         known = hash_of(own) in KNOWN_SCRIPTS
-        self._script = guard_script(own, settings) if known else ""
+        self._script = guard_script(own, settings, registers) if known else ""
         if not self._script:
             raise RobotLostError(
                 "version",
                 f"The installed ur-rtde has a control script for PolyScope {version} that is unknown, so that its "
                 f"limits cannot be added (SHA-256 {hash_of(own)}): install ur-rtde 1.6.5.",
             )
-        self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
+        self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3, registers)
         kind = rtde_control.RTDEControlInterface
         watchdog_ns = 1e9 / settings.watchdog_hz
         # The thread that ur-rtde starts here inherits the slack; 0 gives this one its default again.
         _set_timer_slack(min(_LONGEST_POLL_SLACK_NS, int(watchdog_ns / _SLACKS_PER_WATCHDOG)))
-        self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
+        flags = int(kind.FLAG_NO_WAIT) | (int(kind.FLAG_UPPER_RANGE_REGISTERS) if registers.first else 0)
+        self._control = kind(settings.host, settings.rate_hz, flags)
         _set_timer_slack(0)
         self._script_port = ScriptPort(settings.host, _UPLOAD_S)
         # A linear move was begun, and the wrist has not turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
-        # In the base's frame, while the controller cannot zero its wrench.
-        self._wrench_zero = (0.0,) * 6
+        # In the base's frame: of a controller that cannot zero its wrench, or that has zeroed it with a load.
+        self.wrench_zero: Six = (0.0,) * 6
+        # The wrench before the last upload, where something was held.
+        self._held: Six | None = None
         self._script_readiness = ScriptReadiness(self._receiver, settings.command_timeout_s)
 
     def read(self) -> RtdeSample:
@@ -73,13 +95,17 @@ class UrArm:
         if sample.runtime_state == RUNTIME_PLAYING:
             self._script_port.close()
         return RtdeSample(
-            **vars(sample) | {"wrench": tuple(map(sub, sample.wrench, self._wrench_zero))},
+            **vars(sample) | {"wrench": _difference(sample.wrench, self.wrench_zero)},
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._receiver.connected and self._control.isConnected(),
             moving_linearly=self._may_move_linearly
             and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
+
+    def take_errors(self) -> list[ControllerError]:
+        """Return the controller's error codes since the last call."""
+        return self._primary.read() if self._primary is not None else []
 
     def wrist(self, command: WristSpeed, left_s: float) -> bool:
         """Turn wrist 3 for `left_s` at most, and hold the other joints; not during a linear move."""
@@ -96,6 +122,8 @@ class UrArm:
 
     def move(self, command: MoveLinear) -> bool:
         """Begin a linear move; `RtdeSample.moving_linearly` shows its end."""
+        if not self._script_readiness.wait():
+            return False
         self._may_move_linearly = True
         self._write_deadline(self._settings.silence_timeout_s)
         speed, acceleration = command.speed_m_per_s, command.acceleration_m_per_s2
@@ -126,24 +154,37 @@ class UrArm:
 
     def zero_wrench(self) -> bool:
         """Make the present wrench zero: in the controller, or in this process where the controller cannot."""
-        if self._settings.facts.zeroes_wrench:
-            return self._send_once(self._control.zeroFtSensor)
-        self._wrench_zero = self._receiver.latest().wrench
+        if not self._settings.facts.zeroes_wrench:
+            self.wrench_zero = self._receiver.latest().wrench
+            return True
+        if not self._send_once(self._control.zeroFtSensor):
+            return False
+        self.wrench_zero = (0.0,) * 6
         return True
 
-    def upload(self) -> None:
+    def upload(self, *, held: bool = False) -> None:
         """Send the control script; the program starts by itself, and ends when it receives nothing.
+
+        An e-Series zeroes its wrench as a program starts. Where something is `held`, the zero from before is kept.
 
         Raises:
             RobotLostError: the controller does not take the script.
         """
         # ur-rtde's own script connection is never read, so that the controller soon stops listening to it.
-        self._script_port.send(self._script)
+        script, self._held = self._script, None
+        if held and self._settings.facts.zeroes_at_start:
+            self._held = self._wrench()
+            script = carry_wrench(script, self._held)
+        self._script_port.send(script)
         self._script_readiness.command_sent()
 
     def arm_watchdog(self) -> bool:
         """Arm the robot's watchdog after an upload; accepted only by a program that answers."""
-        return self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)
+        armed = self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)
+        if armed and self._settings.facts.zeroes_at_start:
+            now: Six = self._receiver.latest().wrench
+            self.wrench_zero = _difference(now, self._held) if self._held is not None else (0.0,) * 6
+        return armed
 
     def end_program(self) -> None:
         """End the control script; one that is not ready is left to its watchdog."""
@@ -153,6 +194,9 @@ class UrArm:
     def withdraw_deadline(self) -> None:
         """Let no motion go on, also not when a program that is paused now is resumed."""
         self._receiver.write_deadline(NO_MOTION_TICKS)
+
+    def _wrench(self) -> Six:
+        return _difference(self._receiver.latest().wrench, self.wrench_zero)
 
     def _write_deadline(self, left_s: float) -> None:
         # The latest sample is older than now, so that the deadline is never late.
@@ -174,6 +218,10 @@ class UrArm:
     def ask_dashboard(self, *requests: str) -> str:
         """Have the dashboard carry out requests; return and raise as `command_dashboard` does."""
         return command_dashboard(self._settings.host, 2.5, requests)
+
+
+def _difference(one: Six, other: Six) -> Six:
+    return tuple(map(sub, one, other))
 
 
 def _set_timer_slack(slack_ns: int) -> None:

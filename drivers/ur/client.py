@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, cast
@@ -21,7 +21,7 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.control_box import silent_sentence
 from shearloop.drivers.ur.messages import RobotLostError
-from shearloop.drivers.ur.settings import UrSettings
+from shearloop.drivers.ur.settings import Six, UrSettings
 
 # A disconnecting worker stops the arm (1 s) and ends the program; after this time it is killed.
 EXIT_S = 3.0
@@ -64,6 +64,9 @@ class UrRobot:
         self.losses: Counter[str] = Counter()
         # How many states have come.
         self.states = 0
+        # Whether the gripper holds something, or may: then a new program keeps the zero of the wrench.
+        self.holds: Callable[[], bool] = lambda: False
+        self._wrench_zero: Six = (0.0,) * 6
         self._connection: WorkerConnection | None = None
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
@@ -92,10 +95,15 @@ class UrRobot:
         if self._connection is None or self.state is None:
             replied.set_result(messages.CommandReply(f"The robot is not connected. {self.monitor.latest.sentence}"))
         else:
+            if isinstance(command, messages.Unlock):
+                self._send_held(self._connection)
             self._number += 1
             self._replies[self._number] = replied
             self._connection.send(command, self._number)
         return replied
+
+    def _send_held(self, connection: "WorkerConnection") -> None:
+        connection.send(messages.Held(self.holds(), self._wrench_zero))
 
     def keep_moving(self) -> None:
         """Let a straight move that is under way go on for `silence_timeout_s`; each decision calls this."""
@@ -119,6 +127,7 @@ class UrRobot:
             lambda: connection, sys.executable, "-m", "shearloop.drivers.ur.worker"
         )
         connection.send(self.settings)
+        self._send_held(connection)
         self._connection = connection
         try:
             await connection.listen()
@@ -138,6 +147,7 @@ class UrRobot:
         match message:
             case messages.RobotState():
                 before, self.state = self.state, message
+                self._wrench_zero = message.wrench_zero
                 self.states += 1
                 if before is None:
                     connected = f"The robot at {self.settings.host} is connected."
@@ -153,6 +163,9 @@ class UrRobot:
                     replied.set_result(message)
             case messages.WorkerPhase():
                 self._warning = message.warning
+            case messages.ControllerError():
+                code = f"The controller reports {message} ({message.level})"
+                self.monitor.noted(f"{code}: look it up in Universal Robots' list of error codes.")
             case messages.Failed():
                 raise RobotLostError(message.kind, message.sentence)
 

@@ -19,6 +19,7 @@ from shearloop.drivers.ur.messages import (
     Disconnect,
     Enable,
     Heartbeat,
+    Held,
     MoveLinear,
     RobotLostError,
     RobotState,
@@ -72,6 +73,8 @@ class Recovery:
         # Whether the attempt has succeeded, or why it has ended otherwise.
         self.ready = False
         self.refusal: str | None = None
+        # Whether the gripper holds something.
+        self.held = False
 
     @property
     def operator_asked(self) -> bool:
@@ -131,7 +134,7 @@ class Recovery:
                 self._arm.clear_command()
             # The controller may be busy and drop an upload.
             if self._is_due("upload", now_ns):
-                self._arm.upload()
+                self._arm.upload(held=self.held)
 
     def _make_safe(self, sample: RtdeSample, now_ns: int, safe: bool) -> None:
         if not self.operator_asked:
@@ -180,6 +183,8 @@ class CommandHandler:
         self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s)
         self._held_reason = NOT_ENABLED
         self._daemon_alive_ns = now_ns
+        # Whether the gripper holds something, as the daemon says.
+        self._held_tool = False
         # Whether the daemon disconnects: only stops are accepted from then on.
         self.leaving = False
 
@@ -227,6 +232,7 @@ class CommandHandler:
                 if not self._executor.disabled_reason:
                     self._executor.disable(unfit)
                 self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, number)
+                self._recovery.held = self._held_tool
                 return None
             case _ if self._recovery is not None:
                 refusal = BEING_MADE_READY
@@ -240,6 +246,12 @@ class CommandHandler:
         if refusal:
             return CommandReply(refusal=refusal)
         return CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
+
+    def take_held(self, message: Held) -> None:
+        """Note whether something is held, for the next start of the program, and the zero of another worker."""
+        self._held_tool, self._arm.wrench_zero = message.held, message.wrench_zero
+        if self._recovery is not None:
+            self._recovery.held = message.held
 
     def _stop(self, number: int, command: Stop, sample: RtdeSample, now_ns: int) -> str:
         """Stop on command; return why not, or an empty string."""
@@ -307,6 +319,7 @@ class CommandHandler:
             sent=executor.sent,
             clipped=executor.clipped,
             cycle=cycle,
+            wrench_zero=self._arm.wrench_zero,
         )
 
     def _why_unfit(self, sample: RtdeSample) -> str:

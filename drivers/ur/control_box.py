@@ -18,7 +18,7 @@ from typing import Final
 from shearloop.drivers.defaults import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs
-from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, STEP_REGISTER
+from shearloop.drivers.ur.script import LOWER, UPPER, ScriptRegisters
 from shearloop.drivers.ur.settings import GENERATIONS, UrSettings
 
 # The services behind the ports, as PolyScope's menu names them.
@@ -51,9 +51,7 @@ _OTHER_PACKAGES = 20
 # A peer that acknowledges nothing for this time is gone.
 _PEER_GONE_S = 3
 _LONGEST_LINE = 1024
-# The command registers of ur-rtde's control script, and ours.
-_REGISTERS = ("input_int_register_0", "input_double_register_0", DEADLINE_REGISTER)
-# The outputs and their types, in the order of a sample's fields.
+# The outputs and their types, in the order of a sample's fields; the script's registers come last.
 _TYPES: Final = {
     "timestamp": "DOUBLE",
     "actual_q": "VECTOR6D",
@@ -66,9 +64,6 @@ _TYPES: Final = {
     "runtime_state": "UINT32",
     "target_speed_fraction": "DOUBLE",
     "speed_scaling": "DOUBLE",
-    "output_int_register_0": "INT32",
-    CLOCK_REGISTER: "INT32",
-    STEP_REGISTER: "DOUBLE",
 }
 # Outputs that controllers have from PolyScope 3.12 and 5.5.1 on.
 _TOOL_TYPES: Final = {"payload": "DOUBLE", "payload_cog": "VECTOR3D", "tcp_offset": "VECTOR6D"}
@@ -95,7 +90,8 @@ class ControllerInfo:
     robot_mode: str
     safety_mode: str
     remote: bool | None
-    registers_free: bool
+    # Those that the daemon would use; None where other clients write both halves.
+    registers: ScriptRegisters | None
 
 
 def probe_controller(host: str, timeout_s: float) -> str:
@@ -152,17 +148,24 @@ def query_controller(host: str, timeout_s: float) -> ControllerInfo:
     version = probe_controller(host, timeout_s)
     requests = ("robotmode", "safetymode", "is in remote control")
     robot_mode, safety_mode, remote = ask_dashboard(host, timeout_s, requests)
-    # A register belongs to a connection: closing it gives the register back.
-    with _connected(host, RTDE_PORT, timeout_s, "asking for its registers") as connection:
-        _agree_on_protocol(connection)
-        free = b"IN_USE" not in _request(connection, _INPUTS, ",".join(_REGISTERS).encode())
     return ControllerInfo(
         version,
         robot_mode.removeprefix("Robotmode: "),
         safety_mode.removeprefix("Safetymode: "),
         {"true": True, "false": False}.get(remote.lower()),
-        free,
+        free_registers(host, timeout_s),
     )
+
+
+def free_registers(host: str, timeout_s: float) -> ScriptRegisters | None:
+    """Return the half of the input registers that no other client writes, the upper one first; None for neither."""
+    for registers in (UPPER, LOWER):
+        # A register belongs to a connection: closing it gives the register back.
+        with _connected(host, RTDE_PORT, timeout_s, "asking for its registers") as connection:
+            _agree_on_protocol(connection)
+            if b"IN_USE" not in _request(connection, _INPUTS, ",".join(registers.inputs).encode()):
+                return registers
+    return None
 
 
 def ask_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> list[str]:
@@ -391,13 +394,14 @@ class RtdeReceiver:
     takes a third of the worker's processor time at rest.
     """
 
-    def __init__(self, host: str, rate_hz: float, timeout_s: float) -> None:
+    def __init__(self, host: str, rate_hz: float, timeout_s: float, registers: ScriptRegisters = UPPER) -> None:
         """Connect and wait for the first sample.
 
         Raises:
             RobotLostError: the controller is absent or silent, does not send the outputs, or our register is in use.
         """
         self._host = host
+        self._registers = registers
         self._parser = SampleParser()
         self.connected = True
         with explain_failure(host, timeout_s, "asking for its state"):
@@ -417,14 +421,16 @@ class RtdeReceiver:
 
     def _first_sample(self, rate_hz: float) -> RtdeOutputs:
         _agree_on_protocol(self._connection)
-        for outputs in (_TYPES | _TOOL_TYPES, _TYPES):
+        registers = self._registers
+        known = _TYPES | {registers.state: "INT32", registers.clock: "INT32", registers.step: "DOUBLE"}
+        for outputs in (known | _TOOL_TYPES, known):
             answer = _request(self._connection, _OUTPUTS, struct.pack(">d", rate_hz) + ",".join(outputs).encode())
             types = answer[1:].decode(errors="replace")
             if types == ",".join(outputs.values()):
                 break
         else:
             raise OSError(f"its outputs are of the types {types}")
-        answer = _request(self._connection, _INPUTS, DEADLINE_REGISTER.encode())
+        answer = _request(self._connection, _INPUTS, self._registers.deadline.encode())
         if b"IN_USE" in answer:
             raise registers_in_use(self._host)
         self._recipe = answer[0]

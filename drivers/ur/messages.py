@@ -131,6 +131,18 @@ class Unlock:
 
 
 @dataclass(frozen=True, slots=True)
+class Held:
+    """Whether the gripper holds something, or may; and the zero of the wrench that another worker had.
+
+    Sent to each new worker, and before an `Unlock`.
+    """
+
+    __pydantic_config__: ClassVar = {"ser_json_inf_nan": "constants"}
+    held: bool
+    wrench_zero: Six
+
+
+@dataclass(frozen=True, slots=True)
 class Disconnect:
     """Stop the arm, end the control program, exit."""
 
@@ -293,6 +305,8 @@ class RobotState(RtdeSample):
     clipped: tuple[str, ...]
     # Number of the worker's cycle.
     cycle: int
+    # What `wrench` is measured from, where the controller's own zero is another one.
+    wrench_zero: Six
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,6 +326,19 @@ class WorkerPhase:
 
 
 @dataclass(frozen=True, slots=True)
+class ControllerError:
+    """An error code of the controller, and how serious it calls it."""
+
+    code: int
+    argument: int
+    level: str
+
+    def __str__(self) -> str:
+        """Return it as UR's list of error codes has it."""
+        return f"C{self.code}A{self.argument}"
+
+
+@dataclass(frozen=True, slots=True)
 class Failed:
     """Why the worker exits."""
 
@@ -320,7 +347,7 @@ class Failed:
 
 
 # The settings are the first message to the worker.
-Message = Command | CommandReply | RobotState | UrSettings | Heartbeat | WorkerPhase | Failed
+Message = Command | Held | CommandReply | RobotState | UrSettings | Heartbeat | WorkerPhase | ControllerError | Failed
 
 # The largest message, a state with every reason for clipping, has about 2 kB.
 LARGEST_MESSAGE: Final = 1 << 16

@@ -40,8 +40,6 @@ ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
 ACCELERATION_S = 0.04
 # The pendant shows grams, tenths of a millimetre and thousandths of a radian.
 PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
-# A straight move continues for this fraction of `silence_timeout_s` after a cycle of the worker.
-LEASE_SHARE = 0.3
 # A motion has ended after this number of successive samples at rest.
 REST_SAMPLES = 3
 # The time allowed for a motion to end: nominal time × factor + constant.
@@ -272,8 +270,8 @@ class MotionExecutor:
             return
         # Each cycle lets the script go on for a short time: when this process dies with the daemon, the script ends the
         # move before its watchdog would.
-        silence_s = self._settings.silence_timeout_s
-        self._arm.send_heartbeat(min(LEASE_SHARE * silence_s, silence_s - (now_ns - daemon_alive_ns) / 1e9))
+        left_s = self._settings.silence_timeout_s - (now_ns - daemon_alive_ns) / 1e9
+        self._arm.send_heartbeat(min(self._settings.lease_s, left_s))
 
     def _keep_stopping(self, braking: _Braking, sample: RtdeSample, now_ns: int) -> None:
         if now_ns > braking.deadline_ns:

@@ -8,20 +8,65 @@ arm moves may end in a protective stop.
 
 import hashlib
 import re
+from dataclasses import dataclass
 
-from shearloop.drivers.ur.settings import UrSettings
+from shearloop.drivers.ur.settings import MOVE_GRACE_S, Six, UrSettings
 
-# RTDE guide: the registers from 24 on are for RTDE clients; ur-rtde uses the first ones of either half.
-_REGISTER = 47
-DEADLINE_REGISTER, CLOCK_REGISTER = f"input_int_register_{_REGISTER}", f"output_int_register_{_REGISTER}"
-# The time of one tick of the clock, in s.
-STEP_REGISTER = f"output_double_register_{_REGISTER}"
+
+@dataclass(frozen=True, slots=True)
+class ScriptRegisters:
+    """One half of the controller's registers: the script takes commands in the first ones, and deadlines in the last.
+
+    RTDE guide: those from 24 on are for RTDE clients; fieldbuses and their URCaps use the lower half.
+    """
+
+    first: int
+
+    @property
+    def last(self) -> int:
+        """The number of our registers; ur-rtde 1.6.5 uses the first fifteen or so."""
+        return self.first + 23
+
+    @property
+    def command(self) -> str:
+        """The input with the number of ur-rtde's command."""
+        return f"input_int_register_{self.first}"
+
+    @property
+    def state(self) -> str:
+        """The output with the state of the script."""
+        return f"output_int_register_{self.first}"
+
+    @property
+    def deadline(self) -> str:
+        """The input with the deadline of a motion, in ticks."""
+        return f"input_int_register_{self.last}"
+
+    @property
+    def clock(self) -> str:
+        """The output with the script's ticks."""
+        return f"output_int_register_{self.last}"
+
+    @property
+    def step(self) -> str:
+        """The output with the time of one tick, in s."""
+        return f"output_double_register_{self.last}"
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """All inputs that ur-rtde and we write."""
+        return (
+            *(f"input_int_register_{self.first + number}" for number in range(8)),
+            *(f"input_double_register_{self.first + number}" for number in range(14)),
+            self.deadline,
+        )
+
+
+UPPER, LOWER = ScriptRegisters(24), ScriptRegisters(0)
 # The clock starts at 0: with this deadline no motion begins or goes on.
 NO_MOTION_TICKS = -1
 # A deadline lies this much further ahead at most: a cycle of the slowest controller, for rounding.
 _SLACK_S = 0.008
-# The client has this time to stop a linear move after its deadline; then the script does.
-_GRACE_S = 0.05
 
 # ur-rtde 1.6.5: the line before the main loop, and the thread that carries out speeds.
 _BEFORE_LOOP = "        keep_running = True\n"
@@ -47,9 +92,12 @@ KNOWN_SCRIPTS = {
 
 # speedj returns after a cycle, so that each cycle checks. The clock starts at 0 in each program, and a deadline too far
 # ahead is an older program's. It counts cycles: a sum of times would drift, for URScript's numbers may have 32 bits. An
-# overload stops the wrist until the client asks for rest.
+# overload stops the wrist until the client asks for rest. The deadline of a straight move comes over another connection
+# than the move, perhaps after it, so that a move that has just begun is not judged.
 _GUARD = """\
     global guard_ticks = 0
+    global guard_rested = 0
+    global guard_bias = [0, 0, 0, 0, 0, 0]
 
     def guard_left_s():
         return (read_input_integer_register({register}) - guard_ticks) * {step}
@@ -75,7 +123,9 @@ _GUARD = """\
         while (True):
             guard_ticks = guard_ticks + 1
             write_output_integer_register({register}, guard_ticks)
-            if move_thrd != 0 and guard_left_s() < -{grace}:
+            if move_thrd == 0:
+                guard_rested = guard_ticks
+            elif guard_left_s() < -{grace} and (guard_ticks - guard_rested) * {step} > {grace}:
                 guard_end_move()
             end
             sync()
@@ -84,8 +134,8 @@ _GUARD = """\
 
     def guard_is_overloaded():
         load = get_tcp_force()
-        force_n = norm([load[0], load[1], load[2]])
-        torque_nm = norm([load[3], load[4], load[5]])
+        force_n = norm([load[0] + guard_bias[0], load[1] + guard_bias[1], load[2] + guard_bias[2]])
+        torque_nm = norm([load[3] + guard_bias[3], load[4] + guard_bias[4], load[5] + guard_bias[5]])
         return force_n > {force} or torque_nm > {torque}
     end
 
@@ -140,8 +190,15 @@ _GUARD = """\
     end
 """
 _START = """\
-        rtde_set_watchdog("input_int_register_0", {watchdog_hz:g}, "stop")
+        rtde_set_watchdog("{command}", {watchdog_hz:g}, "stop")
         clock_thrd = run guard_clock()
+"""
+_ZEROES = "            zero_ftsensor()\n"
+_NO_BIAS = "            guard_bias = [0, 0, 0, 0, 0, 0]\n"
+# The arm stands as the program starts, so that what it held before is the load.
+_CARRY = """\
+        started_with = get_tcp_force()
+        guard_bias = [{differences}]
 """
 
 
@@ -150,7 +207,7 @@ def hash_of(script: str) -> str:
     return hashlib.sha256(script.encode()).hexdigest()
 
 
-def guard_script(script: str, settings: UrSettings) -> str:
+def guard_script(script: str, settings: UrSettings, registers: ScriptRegisters = UPPER) -> str:
     """Return ur-rtde's script as a program with its watchdog and its limits, or "" where it is of an unknown form.
 
     ur-rtde arms the watchdog by a command once the script runs. Until then a script would outlive its client. URScript
@@ -161,10 +218,11 @@ def guard_script(script: str, settings: UrSettings) -> str:
     limits = settings.limits
     margin = limits.joints.margin_rad
     values = {
-        "register": _REGISTER,
+        "register": registers.last,
+        "command": registers.command,
         "step": settings.facts.step,
         "watchdog_hz": settings.watchdog_hz,
-        "grace": _GRACE_S,
+        "grace": MOVE_GRACE_S,
         "longest": settings.command_timeout_s + _SLACK_S,
         "lower": limits.joints.lower_rad[5] + margin,
         "upper": limits.joints.upper_rad[5] - margin,
@@ -174,6 +232,16 @@ def guard_script(script: str, settings: UrSettings) -> str:
         "force": limits.force_n.hard,
         "torque": limits.torque_nm.hard,
     }
-    script = _REGISTER_OFFSET.sub(r"\1 0", script)
+    script = _REGISTER_OFFSET.sub(rf"\g<1> {registers.first}", script)
+    script = script.replace(_ZEROES, _ZEROES + _NO_BIAS)
     script = _SPEED_THREAD.sub(lambda _: _GUARD.format(**values), script)
     return f"def rtde_control():\n{script.replace(_BEFORE_LOOP, _START.format(**values) + _BEFORE_LOOP)}end\n"
+
+
+def carry_wrench(script: str, wrench: Six) -> str:
+    """Return a guarded script that judges forces by the zero from before its start, with which `wrench` was measured.
+
+    It is in N and N·m in the base's frame; turns about the tool's axis do not change what lies along that axis.
+    """
+    differences = ", ".join(f"{value:.6f} - started_with[{index}]" for index, value in enumerate(wrench))
+    return script.replace(_BEFORE_LOOP, _CARRY.format(differences=differences) + _BEFORE_LOOP)

@@ -21,6 +21,12 @@ Three = tuple[float, float, float]
 _Deadline = Annotated[float, Field(gt=0, le=1)]
 # The wrist stands this long after the last decision (docs/safety.md).
 _PROMISED_S = 0.2
+# A client has this time to stop a straight move after its deadline; then the script does.
+MOVE_GRACE_S = 0.05
+# Two cycles of a controller, and some rounding.
+_CYCLES_S = 0.02
+# A straight move goes on for this fraction of the silence at least.
+_SHORTEST_LEASE = 0.3
 # The watchdog is slower than a stop by this factor.
 _WATCHDOG_FACTOR = 1.5
 
@@ -39,14 +45,18 @@ class GenerationFacts:
     step: str
     # Whether the controller can zero its wrench: `zero_ftsensor` ends a CB3's program.
     zeroes_wrench: bool
+    # Whether it zeroes its wrench by itself as a program starts.
+    zeroes_at_start: bool
     # The noise of the wrench: a CB3 estimates it from the joints' currents.
     noise_n: float
     noise_nm: float
 
 
 GENERATIONS: Final[dict[Generation, GenerationFacts]] = {
-    "e-series": GenerationFacts("an e-Series", 5, "get_steptime()", zeroes_wrench=True, noise_n=3.5, noise_nm=0.2),
-    "cb3": GenerationFacts("a CB3", 3, "0.008", zeroes_wrench=False, noise_n=10.0, noise_nm=5.0),
+    "e-series": GenerationFacts(
+        "an e-Series", 5, "get_steptime()", zeroes_wrench=True, zeroes_at_start=True, noise_n=3.5, noise_nm=0.2
+    ),
+    "cb3": GenerationFacts("a CB3", 3, "0.008", zeroes_wrench=False, zeroes_at_start=False, noise_n=10.0, noise_nm=5.0),
 }
 
 
@@ -265,6 +275,14 @@ class UrSettings(_Checked):
         wrist = self.limits
         braking_s = wrist.wrist_speed_rad_per_s.inner / wrist.wrist_acceleration_rad_per_s2.hard
         return max(self.command_timeout_s, self.silence_timeout_s) + 2 / self.rate_hz + braking_s
+
+    @property
+    def lease_s(self) -> float:
+        """How long a straight move goes on after a cycle of the worker, if none follows.
+
+        With the script's grace this is the longest silence: a worker that is late for less costs no program.
+        """
+        return max(_SHORTEST_LEASE * self.silence_timeout_s, self.silence_timeout_s - MOVE_GRACE_S - _CYCLES_S)
 
     @property
     def watchdog_hz(self) -> float:

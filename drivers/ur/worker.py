@@ -22,12 +22,14 @@ from shearloop.drivers.ur.control_box import (
     ask_dashboard,
     check_generation,
     check_ports,
+    free_registers,
     probe_controller,
     registers_in_use,
     untested_sentence,
 )
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.motion import why_unfit
+from shearloop.drivers.ur.primary_port import PrimaryPort
 from shearloop.drivers.ur.settings import UrSettings
 
 if TYPE_CHECKING:
@@ -133,8 +135,13 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
         check_generation(settings, version)
         # To a silent dashboard, ur-rtde says "Operation canceled".
         ask_dashboard(host, settings.connect_timeout_s / 4, ("PolyscopeVersion",))
-        pipe.send(messages.WorkerPhase("connecting", untested_sentence(version)))
-        return UrArm(settings, version)
+        primary = PrimaryPort(host, settings.connect_timeout_s / 8)
+        registers = free_registers(host, settings.connect_timeout_s / 8)
+        if registers is None:
+            raise registers_in_use(host)
+        warning = " ".join(filter(None, (untested_sentence(version), primary.warning)))
+        pipe.send(messages.WorkerPhase("connecting", warning))
+        return UrArm(settings, version, registers, primary)
     except RuntimeError as error:
         text = str(error)
         if "already in use" in text:
@@ -153,6 +160,8 @@ def _control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
     while True:
         _set_alarm(settings.hang_timeout_s)
         sample = arm.read()
+        for error in arm.take_errors():
+            pipe.send(error)
         if not sample.connected or sample.age_ns > 3 * settings.state_timeout_s * 1e9:
             raise RobotLostError("lost", why_unfit(sample, settings))
         _handle_commands(pipe, handler, sample)
@@ -186,7 +195,9 @@ def _control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
 def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> None:
     """Carry out the daemon's commands."""
     for number, message in pipe.receive():
-        if isinstance(message, messages.Command | messages.Heartbeat):
+        if isinstance(message, messages.Held):
+            handler.take_held(message)
+        elif isinstance(message, messages.Command | messages.Heartbeat):
             reply = handler.request(number, message, sample, time.monotonic_ns())
             if reply is not None:
                 pipe.send(reply, number)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from shearloop.emulators.ur_controller import Controller
 from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, ControllerSpec, Robot
 from tests.drivers.ur import robots
-from tests.drivers.ur.robots import control_script, do, send
+from tests.drivers.ur.robots import control_script, do, moving_asynchronously, send
 
 
 def wait(robot: Robot, seconds: float) -> None:
@@ -44,10 +44,6 @@ def turning(seconds: float) -> Robot:
 
 def happened(robot: Robot, name: str) -> list[float]:
     return [event.time_s for event in robot._events if event.name == name]
-
-
-def moving_asynchronously(robot: Robot) -> bool:
-    return bool(int(robot.registers["output_int_register_2"]) & 1 << 15)
 
 
 def test_watchdog_ends_with_its_program():

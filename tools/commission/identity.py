@@ -7,6 +7,7 @@ from importlib import metadata
 from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.drivers.ur.control_box import RtdeReceiver, query_controller, untested_sentence
 from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.tools.commission.report import Line, Verdict
 
@@ -31,7 +32,8 @@ class Identity:
 def read_identity(settings: UrSettings, safety_checksum: str) -> Identity:
     """Ask the controller; raises RobotLostError if it does not answer."""
     seen = query_controller(settings.host, settings.connect_timeout_s)
-    receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s)
+    registers = seen.registers or UPPER
+    receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s, registers)
     try:
         outputs = receiver.latest()
     finally:

@@ -19,6 +19,8 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.ur.control_box import REMOTE_CURE, check_ports, query_controller, untested_sentence
 from shearloop.drivers.ur.messages import RobotLostError
+from shearloop.drivers.ur.primary_port import PrimaryPort
+from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 from shearloop.tools.doctor.boards import (
@@ -90,6 +92,10 @@ def _check_robot(settings: Path) -> Iterator[Finding]:
         cure = "look at the teach pendant, and check the cable and `host` in the robot's settings"
         yield from_error("robot", error, "the robot cannot be driven", cure)
         return
+    with contextlib.closing(PrimaryPort(host, ROBOT_TIMEOUT_S)) as primary:
+        what, _, cure = primary.warning.rpartition("; ")
+    if what:
+        yield note("robot's error codes", what, "the log does not have the controller's codes", cure.rstrip("."))
     answers = f"{host} answers, PolyScope {seen.version}"
     if untested := untested_sentence(seen.version):
         what, _, cure = untested.rpartition(": ")
@@ -107,8 +113,9 @@ def _check_robot(settings: Path) -> Iterator[Finding]:
     else:
         cure = "make the cell safe, start the daemon, then `shearloop command unlock`"
         yield note("robot's mode", mode, "the arm does not move in this mode", cure)
-    if seen.registers_free:
-        yield good("robot's registers", "free")
+    if seen.registers is not None:
+        halves = "free" if seen.registers is UPPER else "those from 24 on are in use, and the lower ones free"
+        yield good("robot's registers", halves)
     else:
         means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
         cure = "close the other program, or disable the adapter under Installation → Fieldbus"

@@ -75,6 +75,7 @@ class FakeArm:
         self.reading = dataclasses.replace(AT_REST, runtime_state=1)
         self.target, self.acceleration = 0.0, 4.0
         self.accepts = True
+        self.wrench_zero = (0.0,) * 6
         self.stops_moves = True
         self.unlockable = self.stoppable = True
         # The controller's words against a request: of an error, and of an answer that may be ignored.
@@ -107,6 +108,9 @@ class FakeArm:
 
     def read(self) -> messages.RtdeSample:
         return self.reading
+
+    def take_errors(self) -> list[messages.ControllerError]:
+        return []
 
     def end_program(self) -> None:
         self.target = self._resumed_target = 0.0
@@ -186,8 +190,8 @@ class FakeArm:
                 self.end_program()
         return ""
 
-    def upload(self) -> None:
-        self.calls.append("upload")
+    def upload(self, *, held: bool = False) -> None:
+        self.calls.append("upload, held" if held else "upload")
         if self.stale_command:
             self.target = 0.8
         self._watched = False

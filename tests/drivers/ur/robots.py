@@ -12,7 +12,7 @@ import pytest
 from shearloop.drivers.connection import LinkMonitor, LinkObserver
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
-from shearloop.drivers.ur.script import guard_script
+from shearloop.drivers.ur.script import LOWER, UPPER, guard_script
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.emulators.ur_robot import Robot
 
@@ -37,11 +37,18 @@ def control_script(settings: UrSettings | None = None, version: tuple[int, int] 
 
 
 def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> None:
-    """Write a command's registers as ur-rtde does."""
-    for index, number in enumerate(numbers):
-        robot.registers.write(f"input_double_register_{index}", number, robot.time_s)
-    robot.registers.write("input_int_register_1", int(asynchronous), robot.time_s)
-    robot.registers.write("input_int_register_0", command, robot.time_s)
+    """Write a command's registers as ur-rtde does, in both halves: a script reads one of them."""
+    for first in (LOWER.first, UPPER.first):
+        for index, number in enumerate(numbers):
+            robot.registers.write(f"input_double_register_{first + index}", number, robot.time_s)
+        robot.registers.write(f"input_int_register_{first + 1}", int(asynchronous), robot.time_s)
+        robot.registers.write(f"input_int_register_{first}", command, robot.time_s)
+
+
+def moving_asynchronously(robot: Robot) -> bool:
+    """Return whether ur-rtde's script reports a linear move under way."""
+    states = (int(robot.registers[f"output_int_register_{half.first + 2}"]) for half in (LOWER, UPPER))
+    return any(state & 1 << 15 for state in states)
 
 
 def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> float:
@@ -49,7 +56,7 @@ def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) 
     begun_s, took_s = robot.time_s, 0.0
     for written, state in ((command, 2), (0, 1)):
         send(robot, written, *numbers, asynchronous=asynchronous)
-        while robot.registers["output_int_register_0"] != state:
+        while state not in (robot.registers[LOWER.state], robot.registers[UPPER.state]):
             robot.step(STEP_S)
             assert robot.program_running, robot._events[-1]
             assert robot.time_s < begun_s + 20

@@ -12,7 +12,7 @@ import pytest
 
 from shearloop.drivers.ur import settings as ur
 from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeOutputs, WristSpeed
-from shearloop.drivers.ur.script import NO_MOTION_TICKS
+from shearloop.drivers.ur.script import LOWER, NO_MOTION_TICKS, UPPER
 from tests.drivers.ur.flight import SETTINGS, received
 
 SIX = (0.0,) * 6
@@ -23,10 +23,11 @@ SCRIPT = "    thread speed_thread():\n    end\n        keep_running = True\n"
 class Client:
     """Connects to nothing, takes every call of ur-rtde's and answers True or from `answers`; `calls` names them."""
 
-    FLAG_NO_WAIT = 0
+    FLAG_NO_WAIT, FLAG_UPPER_RANGE_REGISTERS = 16, 8
     answers: ClassVar[dict[str, object]] = {}
 
-    def __init__(self, *_: object) -> None:
+    def __init__(self, *arguments: object) -> None:
+        self.arguments = arguments
         self.calls: list[str] = []
 
     def __getattr__(self, name: str) -> Callable[..., object]:
@@ -142,9 +143,12 @@ def test_register_is_cleared_once_the_client_knows_that_no_program_runs(arm):
 def test_sent_script_arms_its_watchdog(arm, monkeypatch):
     sent: list[str] = []
     monkeypatch.setattr(arm.ScriptPort, "send", lambda _, program: sent.append(program))
-    arm.UrArm(SETTINGS, VERSION).upload()
-    armed = f'rtde_set_watchdog("input_int_register_0", {SETTINGS.watchdog_hz:g}, "stop")'
-    assert armed in sent[0]
+    for registers, number, flags in ((UPPER, 24, 24), (LOWER, 0, 16)):
+        one = arm.UrArm(SETTINGS, VERSION, registers)
+        one.upload()
+        armed = f'rtde_set_watchdog("input_int_register_{number}", {SETTINGS.watchdog_hz:g}, "stop")'
+        assert armed in sent.pop()
+        assert one._control.arguments[2] == flags
 
 
 def test_unknown_script_is_refused(arm):
@@ -172,6 +176,29 @@ def test_wrench_of_a_cb3_is_zeroed_without_its_controller(arm):
     one._receiver.sample = dataclasses.replace(received(1.1), wrench=(1.0, 2.5, 3.0, 0.0, 0.0, 3.0))
     assert one.read().wrench == (0.0, 0.5, 0.0, 0.0, 0.0, 2.0)
     assert "zeroFtSensor" not in one._control.calls
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_wrench_of_what_is_held_outlives_the_zero_of_a_new_program(arm, monkeypatch, held):
+    """An e-Series zeroes its wrench as a program starts."""
+    sent: list[str] = []
+    monkeypatch.setattr(arm.ScriptPort, "send", lambda _, program: sent.append(program))
+    one = arm.UrArm(SETTINGS, VERSION)
+    load = (1.0, 0.0, 3.0, 0.0, 0.0, 1.5)
+    one._receiver.sample = dataclasses.replace(received(1.0), wrench=load)
+    one.upload(held=held)
+    assert ("1.500000 - started_with[5]" in sent[0]) == held
+    one._receiver.sample = dataclasses.replace(received(2.0), wrench=SIX)
+    assert one.arm_watchdog()
+    assert one.read().wrench == (load if held else SIX)
+    # The next worker goes on with this zero, and a new one ends it.
+    another = arm.UrArm(SETTINGS, VERSION)
+    another.wrench_zero = one.wrench_zero
+    another._receiver.sample = dataclasses.replace(received(3.0), wrench=SIX)
+    assert another.read().wrench == (load if held else SIX)
+    another._script_readiness._waiting = False
+    assert another.zero_wrench()
+    assert another.read().wrench == SIX
 
 
 def test_deadline_counts_from_the_latest_sample(arm):

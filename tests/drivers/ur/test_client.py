@@ -13,8 +13,9 @@ import pytest
 
 from shearloop.drivers.connection import LinkObserver
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.control_box import probe_controller
+from shearloop.drivers.ur.control_box import probe_controller, query_controller
 from shearloop.drivers.ur.messages import Enable, MoveLinear, RobotLostError, Stop, Unlock, WristSpeed, ZeroForceTorque
+from shearloop.drivers.ur.script import LOWER, UPPER
 from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.robots import ROOT, enable, pid_of, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
@@ -240,6 +241,23 @@ async def test_connection_that_is_refused_is_explained(controller, link, fault, 
         assert robot.losses[kind] == 1
         assert said in loss.sentence
         assert said in (await robot.send(Enable())).refusal
+
+
+async def test_registers_of_the_upper_half_that_another_client_writes_are_left_to_it(controller):
+    host = controller.host
+    assert query_controller(host, 5.0).registers == UPPER
+    await controller.fault("upper-registers-in-use")
+    assert query_controller(host, 5.0).registers == LOWER
+    async with running(settings_for(host)) as robot:
+        await enable(robot)
+        await turn(robot, controller, 0.1)
+
+
+async def test_error_codes_of_the_controller_are_reported(controller, link):
+    async with running(settings_for(controller.host), link) as robot:
+        await enable(robot)
+        await controller.fault("protective-stop")
+        assert "C204A3 (violation)" in await link.refusal()
 
 
 async def test_unsupported_controller_does_not_restart_the_worker(controller, link):

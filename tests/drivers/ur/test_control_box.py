@@ -110,7 +110,8 @@ async def test_local_control_is_told_at_once_in_the_controllers_own_words(reques
             await asyncio.to_thread(command_dashboard, HOST, TIMEOUT_S, (request_,))
     assert "in local control: switch it to remote control" in str(refused.value)
     assert "Settings → System → Remote Control" in str(refused.value)
-    assert f"Command is not allowed: the robot is in local control ({request_})" in str(refused.value)
+    assert "please switch robot to Remote Control mode" in str(refused.value)
+    assert f"`{request_}`" in str(refused.value)
 
 
 async def test_what_is_carried_out_says_nothing_and_a_refused_necessity_says_why():

@@ -310,7 +310,7 @@ def test_worker_whose_uploads_start_nothing_is_replaced():
     flight = flying()
     flight.arm.end_program()
     flight.arm.calls.clear()
-    flight.arm.upload = lambda: flight.arm.calls.append("upload")
+    flight.arm.upload = lambda **_: flight.arm.calls.append("upload")
     begun_ns = flight.now_ns
     with pytest.raises(RobotLostError, match="does not play it") as lost:
         flight.ask(Unlock())
@@ -323,7 +323,7 @@ def test_slowly_starting_program_gets_heartbeats(monkeypatch):
     """The program arms its watchdog when it starts."""
     flight = Flight()
     upload = flight.arm.upload
-    monkeypatch.setattr(flight.arm, "upload", lambda: flight.arm.calls.append("upload"))
+    monkeypatch.setattr(flight.arm, "upload", lambda **_: flight.arm.calls.append("upload"))
     flight.fly(50)
     assert flight.arm.calls == ["clear_command", "upload", *["clear_command"] * 48]
     monkeypatch.setattr(flight.arm, "upload", upload)

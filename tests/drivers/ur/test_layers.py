@@ -6,7 +6,8 @@ import itertools
 import pytest
 
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
-from shearloop.drivers.ur.script import CLOCK_REGISTER, DEADLINE_REGISTER, NO_MOTION_TICKS, STEP_REGISTER
+from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, carry_wrench
+from shearloop.drivers.ur.settings import UrSettings
 from shearloop.emulators.ur_robot import PLAYING, Robot
 from tests.drivers.ur import robots
 from tests.drivers.ur.flight import AT_REST, CYCLE_NS, FakeArm, Flight, flying
@@ -22,9 +23,9 @@ STEPS = 4
 class ScriptedArm(FakeArm):
     """An arm whose controller runs a control script; writes the registers that `UrArm` and ur-rtde write."""
 
-    def __init__(self, script: str) -> None:
+    def __init__(self, script: str, settings: UrSettings = DELIVERED) -> None:
         super().__init__()
-        self.robot, self._script = Robot(), script
+        self.robot, self._script, self._settings = Robot(), script, settings
 
     def cycle(self) -> None:
         for _ in range(STEPS):
@@ -38,7 +39,7 @@ class ScriptedArm(FakeArm):
             qd_rad_per_s=tuple(arm.qd_rad_per_s),
             wrench=tuple(arm.wrench),
             runtime_state=self.robot.runtime_state,
-            moving_linearly=bool(int(self.robot.registers["output_int_register_2"]) & 1 << 15),
+            moving_linearly=robots.moving_asynchronously(self.robot),
         )
 
     def _write(self, command: int, *values: float) -> bool:
@@ -46,11 +47,11 @@ class ScriptedArm(FakeArm):
         return True
 
     def _write_deadline(self, left_s: float) -> None:
-        until = self.robot.registers[CLOCK_REGISTER] + int(left_s / robots.STEP_S)
-        self.robot.registers.write(DEADLINE_REGISTER, until, self.robot.time_s)
+        until = self.robot.registers[UPPER.clock] + int(left_s / robots.STEP_S)
+        self.robot.registers.write(UPPER.deadline, until, self.robot.time_s)
 
     def withdraw_deadline(self) -> None:
-        self.robot.registers.write(DEADLINE_REGISTER, NO_MOTION_TICKS, self.robot.time_s)
+        self.robot.registers.write(UPPER.deadline, NO_MOTION_TICKS, self.robot.time_s)
 
     def wrist(self, command: WristSpeed, left_s: float) -> bool:
         self._write_deadline(left_s)
@@ -68,7 +69,7 @@ class ScriptedArm(FakeArm):
         return True
 
     def move(self, command: MoveLinear) -> bool:
-        self._write_deadline(DELIVERED.silence_timeout_s)
+        self._write_deadline(self._settings.silence_timeout_s)
         return self._run_once(robots.MOVE_L, *command.pose, command.speed_m_per_s, command.acceleration_m_per_s2)
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
@@ -82,11 +83,11 @@ class ScriptedArm(FakeArm):
     def clear_command(self) -> bool:
         return self._write(0)
 
-    def upload(self) -> None:
-        self.robot.upload(self._script)
+    def upload(self, *, held: bool = False) -> None:
+        self.robot.upload(carry_wrench(self._script, tuple(self.robot.arm.wrench)) if held else self._script)
 
     def arm_watchdog(self) -> bool:
-        return self._write(robots.SET_WATCHDOG, DELIVERED.watchdog_hz)
+        return self._write(robots.SET_WATCHDOG, self._settings.watchdog_hz)
 
 
 def guarded_arm() -> ScriptedArm:
@@ -149,9 +150,9 @@ def test_script_alone_stops_the_wrist_in_time(guarded):
         assert arm.reading.qd_rad_per_s[5] == pytest.approx(FASTEST)
 
 
-def moving_at_full_speed(script: str) -> Flight:
+def moving_at_full_speed(script: str, settings: UrSettings = DELIVERED) -> Flight:
     """Return a flight in a linear move at its largest speed, at the moment of the daemon's last message."""
-    flight = flying(DELIVERED, ScriptedArm(script))
+    flight = flying(settings, ScriptedArm(script, settings))
     flight.fly(1)
     x, y, z, *turn = flight.arm.robot.arm.pose
     inner = LIMITS.linear_speed_m_per_s.inner
@@ -262,11 +263,11 @@ def test_gentle_stop_of_the_worker_stays_gentle():
 def test_decision_that_comes_late_does_not_turn_the_wrist(delay_s):
     """The deadline counts from the sample before the decision, so that a slow network does not prolong it."""
     arm = guarded_arm()
-    until = arm.robot.registers[CLOCK_REGISTER] + int(TIMEOUT_S / robots.STEP_S)
+    until = arm.robot.registers[UPPER.clock] + int(TIMEOUT_S / robots.STEP_S)
     for _ in range(round(delay_s / robots.STEP_S / STEPS)):
         arm.send_heartbeat()
         arm.cycle()
-    arm.robot.registers.write(DEADLINE_REGISTER, until, arm.robot.time_s)
+    arm.robot.registers.write(UPPER.deadline, until, arm.robot.time_s)
     arm.repeat(WristSpeed(FASTEST, HARDEST))
     arm.cycle()
     assert arm.reading.rests == (delay_s > TIMEOUT_S)
@@ -274,7 +275,7 @@ def test_decision_that_comes_late_does_not_turn_the_wrist(delay_s):
 
 def test_deadline_of_an_earlier_program_does_not_count():
     arm = guarded_arm()
-    arm.robot.registers.write(DEADLINE_REGISTER, 1_800_000, arm.robot.time_s)
+    arm.robot.registers.write(UPPER.deadline, 1_800_000, arm.robot.time_s)
     arm.repeat(WristSpeed(FASTEST, HARDEST))
     arm.cycle()
     assert arm.reading.rests
@@ -319,17 +320,70 @@ def test_script_stops_beyond_the_hard_force_and_torque_until_rest_is_asked_for(p
     assert not turn(arm, command, 0.1)[-1].rests
 
 
+@pytest.mark.parametrize("comes", [True, False])
+def test_a_straight_move_may_begin_before_its_deadline_arrives(comes):
+    """Move and deadline come over two connections; the register holds the deadline of an earlier motion."""
+    arm = guarded_arm()
+    arm.withdraw_deadline()
+    for _ in range(50):
+        arm.send_heartbeat()
+        arm.cycle()
+    x, y, z, *turned = arm.robot.arm.pose
+    arm._run_once(robots.MOVE_L, x, y, z - 0.2, *turned, 0.05, 0.5)
+    for _ in range(2):
+        arm.cycle()
+    for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
+        arm.send_heartbeat(DELIVERED.silence_timeout_s if comes else None)
+        arm.cycle()
+    assert arm.reading.program_running == comes
+    assert arm.reading.rests != comes
+
+
+@pytest.mark.parametrize(("silence_s", "late_s", "goes_on"), [(0.1, 0.06, True), (1.0, 0.9, True), (1.0, 1.1, False)])
+def test_a_worker_that_is_late_for_less_than_the_silence_costs_no_straight_move(silence_s, late_s, goes_on):
+    """1 s is what an emulated rig allows a busy computer."""
+    settings = dataclasses.replace(DELIVERED, command_timeout_s=silence_s, silence_timeout_s=silence_s)
+    flight = moving_at_full_speed(control_script(settings), settings)
+    for _ in range(round(late_s * 1e9) // CYCLE_NS):
+        flight.be_alone()
+    assert flight.arm.reading.program_running == goes_on
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_program_that_starts_while_something_is_held_keeps_its_limits(held):
+    """An e-Series zeroes its wrench then: with 0.7 of the largest torque held, and with 0.4 that come later."""
+    arm, command = guarded_arm(), WristSpeed(FASTEST, 4.0)
+    load = arm.robot.arm._wrench
+    load[5] = 0.7 * LIMITS.torque_nm.hard
+    assert not turn(arm, command, 0.3)[-1].rests
+    turn(arm, WristSpeed(0.0, 8.0), 0.3)
+    arm.send_heartbeat()
+    arm.upload(held=held)
+    arm.cycle()
+    assert arm.robot.arm.wrench == pytest.approx([0.0] * 6)
+    assert not turn(arm, command, 0.3)[-1].rests
+    load[5] = 1.1 * LIMITS.torque_nm.hard
+    assert turn(arm, command, 0.3)[-1].rests == held
+    # A new zero counts for the program too.
+    load[5] = 1.5 * LIMITS.torque_nm.hard
+    turn(arm, WristSpeed(0.0, 8.0), 0.3)
+    arm.end_speed(4.0)
+    do(arm.robot, robots.ZERO_FT)
+    arm.send_heartbeat()
+    assert not turn(arm, command, 0.3)[-1].rests
+
+
 @pytest.mark.parametrize("version", VERSIONS)
 def test_each_version_of_the_script_can_be_guarded(version):
     robot = Robot()
-    robot.registers.write("input_int_register_0", 0, 0.0)
+    robot.registers.write(UPPER.command, 0, 0.0)
     robot.upload(control_script(DELIVERED, version))
     for _ in range(10):
         robot.step(0.008)
     assert robot.program_running
     # A thread starts in the cycle after the one that starts it.
-    assert robot.registers[CLOCK_REGISTER] == 9
-    assert robot.registers[STEP_REGISTER] == 0.008
+    assert robot.registers[UPPER.clock] == 9
+    assert robot.registers[UPPER.step] == 0.008
 
 
 def test_deadline_counts_during_a_gentle_ramp():

@@ -22,21 +22,27 @@ os._exit(0)
 """
 
 
-def test_script_differs_in_its_speed_thread_and_before_its_loop():
+def test_script_differs_in_its_speed_thread_and_in_named_lines():
     own, guarded = control_script().splitlines(), control_script(DELIVERED).splitlines()
-    *speeds, start = [
-        change
-        for change in difflib.SequenceMatcher(None, own, guarded, autojunk=False).get_opcodes()
-        if change[0] != "equal"
-    ]
     first, after = own.index("    thread speed_thread():"), own.index("    thread servo_thread():")
-    assert all(first <= begin <= end < after for _, begin, end, *_ in speeds)
-    _, begin, end, here, _ = start
-    assert begin == end < own.index("        while keep_running:")
-    armed = f'rtde_set_watchdog("input_int_register_0", {DELIVERED.watchdog_hz:g}, "stop")'
-    assert guarded[here].strip() == armed
-    # What comes before it in the program itself, beside functions, reads nothing.
-    assert not any("read_input" in line for line in own[own.index("# HEADER_END") : begin])
+    changes = [
+        ([one.strip() for one in own[begin:end]], [one.strip() for one in guarded[here:there]])
+        for tag, begin, end, here, there in difflib.SequenceMatcher(None, own, guarded, autojunk=False).get_opcodes()
+        if tag != "equal" and not first <= begin <= end < after
+    ]
+    offsets = [f"global reg_offset_{kind} = " for kind in ("float", "int")]
+    armed = f'rtde_set_watchdog("input_int_register_24", {DELIVERED.watchdog_hz:g}, "stop")'
+    assert changes == [
+        ([f"{one}0" for one in offsets], [f"{one}24" for one in offsets]),
+        # A new zero of the wrench is the script's too.
+        ([], ["guard_bias = [0, 0, 0, 0, 0, 0]"]),
+        ([], [armed, "clock_thrd = run guard_clock()"]),
+    ]
+    # Nothing that it reads comes before the watchdog in the program itself, beside functions.
+    started = next(number for number, one in enumerate(guarded) if one.strip() == armed)
+    assert started < guarded.index("        while keep_running:")
+    main = guarded[guarded.index("# HEADER_END") : started]
+    assert not any("read_input" in line for line in main if not line.startswith("        "))
 
 
 @pytest.mark.parametrize("version", [version for version in VERSIONS if version[0] != 10])

@@ -24,7 +24,7 @@ LOAD_PERIOD_S = 1 / 10.9
 CORRUPTED = 38399996
 # The ends of the HX711's 24 bits.
 COUNTS_MIN, COUNTS_MAX = -(1 << 23), (1 << 23) - 1
-TIMED_FAULTS = ("silence", "saturation", "stuck", "unplug")
+TIMED_FAULTS = ("silence", "saturation", "stuck", "unplug", "zero-channel")
 
 
 # A fault of the next line, or one that lasts for some seconds, without an end if infinite.
@@ -153,8 +153,17 @@ class EitKitBoard(EmulatedBoard):
     A `y` ends a silence without a duration.
     """
 
-    faults = ("cut-line", "wrong-count", "nan", "garbage", "silence", "unplug")
+    faults = ("cut-line", "wrong-count", "nan", "garbage", "silence", "unplug", "zero-channel")
     _started = False
+
+    def _next_line(self, now_s: float) -> bytes:
+        line = super()._next_line(now_s)
+        if self._lasting != "zero-channel" or not line:
+            return line
+        # An open electrode.
+        values = line.split(b", ")
+        first = next(number for number, value in enumerate(values) if value.strip() and float(value))
+        return b", ".join([*values[:first], b"0.0000", *values[first + 1 :]])
 
     async def _wait_for_start(self) -> bool:
         """Wait for the first `y`; without power, when it was unplugged, the board has forgotten it."""

@@ -26,7 +26,7 @@ JOINTS = {joint.value: joint for joint in Joint}
 # The pads face each other: a shear on the right has the opposite sign on the left.
 SIDES = {"right": 1.0, "left": -1.0}
 COMMANDS = (
-    f"kick NM, slip [NM], joint {'|'.join(JOINTS)}, object MM|none, silence DEVICE [SECONDS], "
+    f"kick NM, slip [NM], weigh NM, flip load, joint {'|'.join(JOINTS)}, object MM|none, silence DEVICE [SECONDS], "
     "unplug DEVICE [SECONDS], replug DEVICE, right|left|load FAULT, "
     "gripper drop|fault CODE|…, a fault of the robot, or normal"
 )
@@ -119,11 +119,16 @@ class EmulatedRig:
                 self.scene.kick(_torque(jump_nm))
             case ["slip", *left_nm] if len(left_nm) < 2:
                 self.scene.slip(*map(_torque, left_nm))
+            case ["weigh", torque_nm]:
+                self.scene.load_nm = _torque(torque_nm)
+            case ["flip", "load"]:
+                self.scene.load_sign = -1.0
             case ["joint", name] if name in JOINTS:
                 self.scene.put_on(JOINTS[name])
             case ["object", *_]:
                 self._device("gripper").command(text)
             case ["normal"]:
+                self.scene.load_nm, self.scene.load_sign = 0.0, 1.0
                 for commanded in self._commanded.values():
                     commanded.command("normal")
             case ["replug", device]:

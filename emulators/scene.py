@@ -177,6 +177,8 @@ class Scene:
         self._speed = speed
         self._wrist_rad = 0.0
         self._slips_to_nm: float | None = None
+        # On the load cell alone: a torque beside the tool's, and the sign of a cell that is mounted the other way.
+        self.load_nm, self.load_sign = 0.0, 1.0
         self._states = deque([(0.0, TwinState())])
 
     def step(self, dt_s: float, wrist_rad: float) -> float:
@@ -200,7 +202,7 @@ class Scene:
 
     def conversion_nm(self, duration_s: float) -> float:
         """Return the mean torque on the lever, in N·m, over the last `duration_s` of the scene's time."""
-        return float(self._history("torque_nm", duration_s, N_MOMENTS).mean())
+        return self.load_sign * (self.load_nm + float(self._history("torque_nm", duration_s, N_MOMENTS).mean()))
 
     def frame(self, duration_s: float) -> tuple[FloatArray, FloatArray, float]:
         """Return grip (0…1) and shear (N·m) at each injection of a frame, (32,) each, and the fingers' width in mm.

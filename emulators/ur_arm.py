@@ -11,6 +11,7 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import constants
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -102,10 +103,14 @@ class Speed:
     target_rad_per_s: Vector
     acceleration_rad_per_s2: float
     halts: bool = False
+    # No joint gets slower than at this rate; finite with worn brakes.
+    braking_rad_per_s2: float = math.inf
 
     def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:
         """Return the arm one cycle later."""
-        step = self.acceleration_rad_per_s2 * dt_s
+        slower = np.abs(self.target_rad_per_s) < np.abs(qd_rad_per_s)
+        largest = np.minimum(self.acceleration_rad_per_s2, np.where(slower, self.braking_rad_per_s2, math.inf))
+        step = largest * dt_s
         qd = qd_rad_per_s + np.clip(self.target_rad_per_s - qd_rad_per_s, -step, step)
         return q_rad + 0.5 * (qd + qd_rad_per_s) * dt_s, qd, self.halts and not qd.any()
 
@@ -183,6 +188,12 @@ class Arm:
         self.motion: Speed | LinearMove | None = None
         # The pendant's speed slider, a factor on commanded speeds.
         self.speed_slider = 1.0
+        # Faults: how fast it brakes, the noise of its measured speeds, and a force (3,) that nothing exerts.
+        self.braking_rad_per_s2 = math.inf
+        self.noise_rad_per_s = 0.0
+        self.bias_n = np.zeros(3)
+        # Of what hangs on the tool.
+        self.hung_kg = 0.0
         self._framed_q_rad, self._last_frame = self.q_rad, tool_frames(self.q_rad, self._tool)[-1]
         self._plant = plant
         self._wrench = np.zeros(6)
@@ -214,11 +225,27 @@ class Arm:
     @property
     def wrench(self) -> Vector:
         """Force and torque at the tool, relative to the zero."""
-        return self._wrench + self._noise - self._wrench_zero
+        hung_n = np.array([0.0, 0.0, -constants.g * self.hung_kg])
+        apart = np.concatenate([self.bias_n + hung_n, np.zeros(3)])
+        return np.asarray(self._wrench + self._noise - self._wrench_zero + apart)
+
+    @property
+    def measured_rad_per_s(self) -> Vector:
+        """The joints' speeds as the controller reports them."""
+        if not self.noise_rad_per_s:
+            return self.qd_rad_per_s
+        return np.asarray(self.qd_rad_per_s + self._random.normal(0.0, self.noise_rad_per_s, 6))
+
+    def mend(self) -> None:
+        """End every fault."""
+        self.speed_slider, self.braking_rad_per_s2, self.noise_rad_per_s = 1.0, math.inf, 0.0
+        self.bias_n, self.hung_kg = np.zeros(3), 0.0
 
     def turn(self, target_rad_per_s: Vector, acceleration: float) -> None:
         """Turn towards these joint speeds from now on."""
-        self.motion = Speed(self.speed_slider * target_rad_per_s, acceleration)
+        self.motion = Speed(
+            self.speed_slider * target_rad_per_s, acceleration, braking_rad_per_s2=self.braking_rad_per_s2
+        )
 
     def move_to(self, pose: Vector, speed: float, acceleration: float) -> None:
         """Begin a linear move."""
@@ -227,7 +254,7 @@ class Arm:
 
     def halt(self, deceleration: float) -> None:
         """Slow every joint down to rest."""
-        self.motion = Speed(np.zeros(6), deceleration, halts=True) if self.moving else None
+        self.motion = Speed(np.zeros(6), deceleration, True, self.braking_rad_per_s2) if self.moving else None
 
     def halt_on_line(self, deceleration: float) -> None:
         """Slow a linear move down to rest on its line; anything else as `halt` does."""

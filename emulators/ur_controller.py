@@ -5,7 +5,7 @@ import re
 import socket
 import struct
 import time
-from collections.abc import AsyncIterator, Collection
+from collections.abc import AsyncIterator, Callable, Collection
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import replace
 
@@ -40,10 +40,10 @@ _ERROR_CODES = {"protective-stop": (204, 3, 3)}
 _UNREAD_BYTES = 4096
 _SAFETY_MODES = {1: "NORMAL", 3: "PROTECTIVE_STOP", 7: "ROBOT_EMERGENCY_STOP"}
 
-FAULTS = (
-    *("protective-stop", "emergency-stop", "release", "drop-rtde", "silence", "protect-abrupt-ends"),
+# Faults that last until `normal`.
+_LASTING = (
     *("registers-in-use", "upper-registers-in-use", "local-control", "refuse-protocol"),
-    *("mute-dashboard", "drop-scripts", "version", "payload", "slider", "error-code", "normal"),
+    *("mute-dashboard", "drop-scripts", "block-scripts"),
 )
 
 
@@ -114,6 +114,11 @@ class Controller:
     def command(self, line: str) -> None:
         """Carry out a fault, as `protective-stop` or `silence 2`; ValueError for another line."""
         match line.split():
+            case [name] if name in _LASTING:
+                self.faults.add(name)
+            case [name, text] if name in _WITH_NUMBER:
+                low, high, otherwise, begin = _WITH_NUMBER[name]
+                begin(self, number_between(text, low, high, otherwise))
             case ["protective-stop"]:
                 self.robot.protective_stop("requested by hand")
             case ["emergency-stop"]:
@@ -122,23 +127,19 @@ class Controller:
                 self.robot.release()
             case ["protect-abrupt-ends"]:
                 self.robot.protects_abrupt_ends = True
+            case ["protect-ends"]:
+                self.robot.protects_ends = True
+            case ["float-clock"]:
+                self.robot.registers.counts_as_float = True
             case ["drop-rtde"]:
                 # The other ports live on.
                 for writer in list(self._rtde):
                     writer.close()
-            case ["silence", seconds]:
-                self.silence(number_between(seconds, 0.0, 86400.0, "not a time in seconds from 0 to 86400"))
-            case [
-                "registers-in-use"
-                | "upper-registers-in-use"
-                | "local-control"
-                | "refuse-protocol"
-                | "mute-dashboard"
-                | "drop-scripts" as fault
-            ]:
-                self.faults.add(fault)
-            case ["version" | "payload" | "slider" | "error-code" as setting, value]:
-                self._set(setting, value)
+            case ["version", numbers]:
+                if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", numbers) is None:
+                    raise ValueError(f"{numbers!r} is not a version such as 5.4.0.0")
+                major, minor, bugfix, build = map(int, numbers.split("."))
+                self.robot.change(replace(self.robot.spec, version=(major, minor, bugfix, build)))
             case ["normal"]:
                 self.robot.clear_faults()
                 self.robot.change(self._first_spec)
@@ -149,22 +150,9 @@ class Controller:
             case _:
                 raise ValueError(f"there is no fault {line!r}; there are {', '.join(FAULTS)}")
 
-    def _set(self, setting: str, value: str) -> None:
-        """Change what has a value; ValueError where it cannot have this one."""
-        robot = self.robot
-        match setting:
-            case "version":
-                if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", value) is None:
-                    raise ValueError(f"{value!r} is not a version such as 5.4.0.0")
-                major, minor, bugfix, build = map(int, value.split("."))
-                robot.change(replace(robot.spec, version=(major, minor, bugfix, build)))
-            case "payload":
-                payload_kg = number_between(value, 0.0, 100.0, "not a mass in kg from 0 to 100")
-                robot.change(replace(robot.spec, payload_kg=payload_kg))
-            case "slider":
-                robot.arm.speed_slider = number_between(value, 0.01, 1.0, "not a fraction from 0.01 to 1")
-            case _:
-                self._report(int(number_between(value, 1, 9999, "not a code from 1 to 9999")), 0, 2)
+    def weigh(self, payload_kg: float) -> None:
+        """Have this payload set at the pendant."""
+        self.robot.change(replace(self.robot.spec, payload_kg=payload_kg))
 
     def silence(self, duration_s: float) -> None:
         """Send nothing on any port for a while; the connections stay open, and the data is lost."""
@@ -219,6 +207,10 @@ class Controller:
         while True:
             self._send(writer, state)
             await writer.drain()
+            if "block-scripts" in self.faults:
+                # It neither reads nor sends.
+                await asyncio.sleep(1.0 / _STATES_HZ[major])
+                continue
             try:
                 async with asyncio.timeout(1.0 / _STATES_HZ[major]):
                     data = await reader.read(65536)
@@ -289,3 +281,29 @@ class Controller:
             case "close popup" | "close safety popup":
                 return request.replace("close", "closing")
         return f"could not understand: '{request}'"
+
+
+def _set_bias(controller: Controller, force_n: float) -> None:
+    controller.robot.arm.bias_n[0] = force_n
+
+
+# The range of each fault's number, what another number is, and how it begins.
+_WITH_NUMBER: dict[str, tuple[float, float, str, Callable[[Controller, float], None]]] = {
+    "silence": (0.0, 86400.0, "not a time in seconds from 0 to 86400", Controller.silence),
+    "payload": (0.0, 100.0, "not a mass in kg from 0 to 100", Controller.weigh),
+    "slider": (0.01, 1.0, "not a fraction from 0.01 to 1", lambda one, x: setattr(one.robot.arm, "speed_slider", x)),
+    "velocity-noise": (
+        *(0.0, 1.0, "not a speed in rad/s from 0 to 1"),
+        lambda one, x: setattr(one.robot.arm, "noise_rad_per_s", x),
+    ),
+    "slow-braking": (
+        *(0.01, 100.0, "not a deceleration in rad/s² from 0.01 to 100"),
+        lambda one, x: setattr(one.robot.arm, "braking_rad_per_s2", x),
+    ),
+    "bias": (-100.0, 100.0, "not a force in N from -100 to 100", _set_bias),
+    "hang": (0.0, 20.0, "not a mass in kg from 0 to 20", lambda one, x: setattr(one.robot.arm, "hung_kg", x)),
+}
+FAULTS = (
+    *("protective-stop", "emergency-stop", "release", "drop-rtde", "protect-abrupt-ends", "protect-ends"),
+    *("float-clock", "version", *_WITH_NUMBER, *_LASTING, "normal"),
+)

@@ -63,6 +63,8 @@ class Robot:
         self.log: deque[str] = deque(maxlen=LOG_LINES)
         # Whether a program that ends by itself while the arm moves ends in a protective stop: reports differ.
         self.protects_abrupt_ends = False
+        # Whether any program that ends by itself does.
+        self.protects_ends = False
 
     def step(self, dt_s: float) -> None:
         """Run one control cycle."""
@@ -77,8 +79,8 @@ class Robot:
                     self._note(*event)
             except ProgramEndedError as ended:
                 self.end_program(str(ended))
-                if self.protects_abrupt_ends and self.arm.moving:
-                    self.protective_stop(f"the program ended while the arm moved: {ended}")
+                if self.protects_ends or (self.protects_abrupt_ends and self.arm.moving):
+                    self.protective_stop(f"the program ended: {ended}")
         self._move(dt_s)
         self.arm.feel(dt_s, noisy=not self.is_e_series)
 
@@ -178,7 +180,8 @@ class Robot:
 
     def clear_faults(self) -> None:
         """Be safe and powered, without a program."""
-        self.protects_abrupt_ends, self.arm.speed_slider = False, 1.0
+        self.protects_abrupt_ends = self.protects_ends = self.registers.counts_as_float = False
+        self.arm.mend()
         self.end_program("the faults are cleared")
         self.robot_mode, self.safety_mode, self._power_step_s = MODE_RUNNING, SAFETY_NORMAL, math.inf
         self._note("faults-cleared")

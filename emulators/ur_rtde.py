@@ -32,7 +32,7 @@ _SAFETY_BITS = {
 _VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
     "timestamp": ("DOUBLE", lambda robot: robot.clock_s),
     "actual_q": ("VECTOR6D", lambda robot: robot.arm.q_rad),
-    "actual_qd": ("VECTOR6D", lambda robot: robot.arm.qd_rad_per_s),
+    "actual_qd": ("VECTOR6D", lambda robot: robot.arm.measured_rad_per_s),
     "actual_TCP_pose": ("VECTOR6D", lambda robot: robot.arm.pose),
     "actual_TCP_speed": ("VECTOR6D", lambda robot: robot.arm.speed),
     "actual_TCP_force": ("VECTOR6D", lambda robot: robot.arm.wrench),

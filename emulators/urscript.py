@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from shearloop.drivers.ur.script import LOWER, UPPER
 from shearloop.emulators.ur_arm import Arm
 
 # An event's name and detail.
@@ -26,6 +27,10 @@ Thread = Iterator[None]
 
 # The first integer register of each half.
 COMMANDS = ("input_int_register_0", "input_int_register_24")
+# The registers with the script's clock.
+CLOCKS = (LOWER.clock, UPPER.clock)
+# What remains of 0.002 s that is added to 1024 s in 32 bits.
+FLOAT_LOSS = float(np.float32(1024.0) + np.float32(0.002) - np.float32(1024.0)) / 0.002
 # More loops than this within one cycle never end.
 MOST_LOOPS = 10_000
 # Functions from PolyScope 5 on.
@@ -50,6 +55,8 @@ class Registers(defaultdict[str, float]):
         super().__init__(int)
         # When each input register was last written.
         self.written_s: defaultdict[str, float] = defaultdict(float)
+        # A fault: the script's clock loses what a sum of cycles in 32-bit floats loses after 17 minutes.
+        self.counts_as_float = False
 
     def write(self, name: str, value: float, now_s: float) -> None:
         """Set an input register, as a client does over RTDE."""
@@ -257,7 +264,9 @@ class Program:
         self._mover = 0
 
     def _write_output(self, kind: str, number: int, value: float) -> None:
-        self._registers[f"output_{kind}_register_{number}"] = value
+        name = f"output_{kind}_register_{number}"
+        loses = self._registers.counts_as_float and name in CLOCKS
+        self._registers[name] = FLOAT_LOSS * value if loses else value
 
     def _claim_arm(self) -> None:
         if self._mover not in (0, self._running):

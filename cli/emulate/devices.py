@@ -38,7 +38,14 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   refuse-protocol         refuse the RTDE protocol version
   mute-dashboard          accept connections to the dashboard, and send nothing on them
   drop-scripts            take programs, and play none
+  block-scripts           take connections to the script port, and neither read nor send on them
   protect-abrupt-ends     end in a protective stop when a program ends while the arm moves
+  protect-ends            end in a protective stop when a program ends by itself
+  float-clock             let the script's clock lose 2.3 %, as a sum of cycles in 32-bit floats does after 17 min
+  velocity-noise RAD/S    report joint speeds with this noise
+  slow-braking RAD/S²     brake no joint faster than this
+  bias N                  report a force that nothing exerts
+  hang KG                 hang a mass on the tool
   slider FRACTION         move the pendant's speed slider, 1 at its right end
   error-code CODE         report an error code, as the pendant's log has it
   version A.B.C.D         report this version of PolyScope to later connections
@@ -50,7 +57,8 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
 def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
-        "next frame: cut-line, wrong-count, nan, garbage; or to what follows: silence [SECONDS], unplug [SECONDS]. "
+        "next frame: cut-line, wrong-count, nan, garbage; or to what follows: silence [SECONDS], unplug [SECONDS], "
+        "zero-channel [SECONDS]. "
         "Starting the board ends a silence without a number; `normal` ends every fault."
     )
     frames = parser.add_argument_group("frames")

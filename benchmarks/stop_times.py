@@ -122,7 +122,13 @@ class RunningRig:
         right = {"device": {"path": "eit-right"}, "bank": "rig.bank", "frame_period_s": FRAME_PERIOD_S / speed}
         load_cell = {"device": {"path": "load-cell"}, "rate_hz": LOAD_CELL_RATE_HZ * speed}
         self._config = write_rig_config(
-            folder, "config/demo_ur.yaml", fingertips={"right": right}, load_cell=load_cell, **content
+            folder,
+            "config/demo_ur.yaml",
+            emulated=True,
+            emulated_deadlines="real",
+            fingertips={"right": right},
+            load_cell=load_cell,
+            **content,
         )
         self._folder = folder
         # The height of the middle of the straight moves.

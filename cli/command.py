@@ -119,7 +119,8 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
 
         rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
         loop = [loop_line(reply["loop"]), ""] if "loop" in reply else []
-        return [*loop, *table(("task", "state", "rate", "notes"), rows)]
+        cap = [f"{reply['cap'][0].upper()}{reply['cap'][1:]}.", ""] if reply.get("cap") else []
+        return [*loop, *cap, *table(("task", "state", "rate", "notes"), rows)]
     if name == "experiments":
         from shearloop.cli.terminal import table
 

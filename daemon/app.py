@@ -82,6 +82,8 @@ class Daemon:
             self.health = HealthReporter(self.publisher, self.supervisor, clock, config.emulated, config.name)
             self.sensors, self._rig = build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
             if self._rig is not None:
+                if self._rig.commissioning is not None:
+                    self.health.cap = partial(getattr, self._rig.commissioning, "sentence")
                 self.health.refusals |= {
                     "tare": self._rig.control_loop.tare_refusal,
                     "start": self._rig.runner.start_refusal,

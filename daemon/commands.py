@@ -104,7 +104,8 @@ class Commands:
                 _refuse_if(rig.runner.start_refusal())
                 file = (await rig.experiments.read(Path(path))).file
                 motion = first_motion(file)
-                plan = plan_of(file, rig.experiments.robot, rig.experiments.gripper)
+                robot = rig.experiments.robot
+                plan = plan_of(file, robot.settings.limits if robot is not None else None, rig.experiments.gripper)
                 question = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}."
                 return {"question": question, "plan": list(plan.sentences())}
             _refuse_if(await rig.start(Path(path)))
@@ -157,7 +158,8 @@ class Commands:
         if self.rig is None:
             return {"tasks": tasks, "daemon": daemon}
         state = loop_state(self.rig.control_loop, 0.0, 0)
-        return {"tasks": tasks, "daemon": daemon, "loop": {key: getattr(state, key) for key in LOOP_KEYS}}
+        loop = {key: getattr(state, key) for key in LOOP_KEYS}
+        return {"tasks": tasks, "daemon": daemon, "loop": loop, "cap": self.health.cap()}
 
     async def _stop(self, request: Request) -> Reply:
         spare_daemon = bool(request.get("spare_daemon"))

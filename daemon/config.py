@@ -267,8 +267,14 @@ class DaemonConfig(ConfigModel):
     load_cell: LoadCellConfig | None = Field(None, description="the load cell")
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
     gripper: GripperConfig | None = Field(None, description="the gripper; needs `robot`")
+    commissioned: Path | None = Field(
+        None, description="report of `shearloop commission`; a real robot without one is slow and weak"
+    )
     loop: LoopConfig = Field(LoopConfig(), description="settings of the closed loop")
     emulated: bool = Field(False, description="every device is emulated on this computer; a real address is refused")
+    emulated_deadlines: Literal["patient", "real"] = Field(
+        "patient", description="of an emulated robot: for a busy computer, or as in the robot's settings"
+    )
     experiment: Path | None = Field(None, description="what `shearloop command start` runs if it names no other")
     autostart: bool = Field(False, description="start `experiment` once all devices are connected; needs `emulated`")
     experiments: tuple[Path, ...] = Field(
@@ -309,8 +315,6 @@ class DaemonConfig(ConfigModel):
         for port, keys in self._ports().items():
             if len(keys) > 1:
                 raise ValueError(f"`{keys[0]}` and `{keys[1]}` are both {port}; each device needs its own")
-        if self.experiment is not None and self.robot is None:
-            raise ValueError("an experiment needs a robot: add `robot: ur.yaml`, or take `experiment` out")
         if self.autostart and not self.emulated:
             raise ValueError(
                 "`autostart` moves the robot without a command: it needs `emulated: true`; "
@@ -323,8 +327,18 @@ class DaemonConfig(ConfigModel):
             if real is not None:
                 key, device = real
                 raise ValueError(f"`emulated: true` and `{key}: {device}`, a real device: take one of the two out")
-        if self.gripper is not None and self.robot is None:
-            raise ValueError("a gripper without a robot cannot be driven: add `robot: ur.yaml`, or take `gripper` out")
+        return self
+
+    @model_validator(mode="after")
+    def _has_its_robot(self) -> "DaemonConfig":
+        needs = {
+            "experiment": "an experiment needs a robot",
+            "commissioned": "`commissioned` is of a robot",
+            "gripper": "a gripper without a robot cannot be driven",
+        }
+        for key, why in needs.items():
+            if getattr(self, key) is not None and self.robot is None:
+                raise ValueError(f"{why}: add `robot: ur.yaml`, or take `{key}` out")
         return self
 
     def _real_devices(self) -> Iterator[tuple[str, str]]:

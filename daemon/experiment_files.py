@@ -15,10 +15,10 @@ from typing import TypeVar
 
 import structlog
 
+from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.control.experiment_check import check_devices, check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
 from shearloop.drivers.robotiq.models import GripperModel
-from shearloop.drivers.ur.settings import UrLimits
 from shearloop.errors import UserError
 from shearloop.files import read_file
 from shearloop.yaml_files import MOST_BYTES, Document, shown
@@ -41,10 +41,11 @@ def read_experiment(path: Path) -> ExperimentFile:
     return _checked(read_document(path), None, None)
 
 
-def _checked(document: Document, robot: UrLimits | None, gripper: GripperModel | None) -> ExperimentFile:
+def _checked(document: Document, robot: Commissioning | None, gripper: GripperModel | None) -> ExperimentFile:
     """Return the experiment of a document; raises UserError for one that is invalid, or that these do not allow."""
     file = outline(document.content)
-    return without_mistakes(document, [*check_steps(file), *check_devices(file, robot, gripper)])
+    limits, cap = (robot.settings.limits, robot.cap) if robot is not None else (None, None)
+    return without_mistakes(document, [*check_steps(file), *check_devices(file, limits, gripper, cap)])
 
 
 def read_document(path: Path) -> Document:
@@ -82,7 +83,7 @@ class ExperimentFiles:
     """
 
     folders: tuple[Path, ...]
-    robot: UrLimits | None = None
+    robot: Commissioning | None = None
     gripper: GripperModel | None = None
     _reading: threading.Thread | None = field(default=None, init=False)
 

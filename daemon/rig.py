@@ -6,6 +6,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, commissioning_of, measured_widths
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.control import experiment_check, experiment_schema
 from shearloop.daemon.control.action_executor import Tareable
@@ -56,7 +57,7 @@ def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
 
 def patience_of(config: DaemonConfig) -> float:
     """Return the factor on the deadlines of a rig's devices: above 1 for an emulated rig alone."""
-    return EMULATED_PATIENCE if config.emulated else 1.0
+    return EMULATED_PATIENCE if is_patient(config) else 1.0
 
 
 def make_gripper_client(config: GripperConfig, patience: float = 1.0) -> RobotiqClient:
@@ -111,7 +112,12 @@ def open_settings(config: DaemonConfig) -> UrSettings | None:
             f"{config.robot}: `host: {settings.host}` is not this computer, and the configuration says "
             "`emulated: true`: take that out for a real robot, or give 127.0.0.1 for an emulated one"
         )
-    return with_emulated_deadlines(settings) if config.emulated else settings
+    return with_emulated_deadlines(settings) if is_patient(config) else settings
+
+
+def is_patient(config: DaemonConfig) -> bool:
+    """Return whether deadlines fit a busy computer: nothing that is emulated can hurt."""
+    return config.emulated and config.emulated_deadlines == "patient"
 
 
 def with_emulated_deadlines(settings: UrSettings) -> UrSettings:
@@ -126,11 +132,16 @@ def with_emulated_deadlines(settings: UrSettings) -> UrSettings:
 
 
 def make_loop(
-    config: DaemonConfig, robot: UrSettings, sources: Mapping[str, TorqueSource], dead_tasks: Mapping[str, str]
+    config: DaemonConfig,
+    robot: UrSettings,
+    sources: Mapping[str, TorqueSource],
+    dead_tasks: Mapping[str, str],
+    supplied: Supplied = NOTHING_SUPPLIED,
 ) -> ControlLoop:
     """Return the control loop of a robot with these settings.
 
-    `sources` are all torques but the robot's; `dead_tasks` has the error of each task that is dead at present.
+    `sources` are all torques but the robot's; `dead_tasks` has the error of each task that is dead at present;
+    `supplied` is of the rig's report.
     """
     sources = {**sources, WRENCH: wrench_source(robot.rate_hz)}
     # Controller, identification and commands plan with what the robot's process lets through.
@@ -138,8 +149,10 @@ def make_loop(
         name: min(getattr(config.loop, name), getattr(robot.limits, name).inner)
         for name in ("wrist_speed_rad_per_s", "wrist_acceleration_rad_per_s2")
     }
-    if config.emulated:
+    if is_patient(config):
         limited["stale_after_s"] = max(config.loop.stale_after_s, EMULATED_STALE_S)
+    if supplied.actuation_s is not None and "actuation_s" not in config.loop.model_fields_set:
+        limited["actuation_s"] = supplied.actuation_s
     loop = config.loop.model_copy(update=limited)
     required = ("robot", "gripper") if config.gripper is not None else ("robot",)
     gels = {
@@ -150,11 +163,22 @@ def make_loop(
     return ControlLoop(loop, sources, required, gels, dead_tasks, patience_of(config))
 
 
-def make_gripper(config: GripperConfig, loop: ControlLoop, publisher: Publisher, patience: float) -> GripperTask:
-    """Return the gripper's task; it is not connected yet. `patience` is the factor on the deadline of its replies."""
+def make_gripper(
+    config: GripperConfig,
+    loop: ControlLoop,
+    publisher: Publisher,
+    patience: float,
+    supplied: Supplied = NOTHING_SUPPLIED,
+) -> GripperTask:
+    """Return the gripper's task; it is not connected yet.
+
+    `patience` is the factor on the deadline of its replies; `supplied` is of the rig's report.
+    """
     client, calibration = make_gripper_client(config, patience), gripper_calibration(config)
+    measured = measured_widths(supplied, config.model) if config.calibration is None else None
+    calibration = measured or calibration
     hand = RobotiqGripper(client, calibration, monitor=LinkMonitor(LinkReporter("gripper", loop)))
-    measures = config.calibration is not None
+    measures = config.calibration is not None or measured is not None
     return GripperTask(hand, publisher, loop, FingertipDiameters(COMBINED), measures_diameters=measures)
 
 
@@ -172,6 +196,7 @@ class Rig:
     recorder: Recorder | None
     # None for a rig that starts by itself: its emulated devices end with the daemon.
     memory: RigMemory | None = None
+    commissioning: Commissioning | None = None
 
     async def start(self, path: Path) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
@@ -269,22 +294,31 @@ def build_rig(
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     sources = torque_sources(config, sessions, combined)
     settings = open_settings(config)
-    check_experiment(config, sources, settings)
-    if settings is None:
+    commissioning = commissioning_of(config, settings) if settings is not None else None
+    check_experiment(config, sources, commissioning)
+    if commissioning is None:
         return build_sensors(config, publisher, clock, recorder, None, sessions, combined, None), None
-    loop = make_loop(config, settings, sources, supervisor.dead)
-    gripper = make_gripper(config.gripper, loop, publisher, patience_of(config)) if config.gripper is not None else None
+    settings, supplied = commissioning.settings, commissioning.supplied
+    loop = make_loop(config, settings, sources, supervisor.dead, supplied)
+    gripper = None
+    if config.gripper is not None:
+        gripper = make_gripper(config.gripper, loop, publisher, patience_of(config), supplied)
     sensors = build_sensors(config, publisher, clock, recorder, loop, sessions, combined, gripper)
-    robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), warns=not config.emulated)
+    robot = UrRobot(
+        settings,
+        LinkMonitor(LinkReporter("robot", loop)),
+        warns=not config.emulated,
+        settings_for=commissioning.on_controller,
+    )
     robot.holds = loop.may_hold
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
-    experiments = ExperimentFiles(config.experiment_folders, settings.limits, gripper_model(config))
+    experiments = ExperimentFiles(config.experiment_folders, commissioning, gripper_model(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
     memory = RigMemory(memory_path(settings.host), loop) if not config.autostart else None
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
     if memory is not None:
         tasks["memory"] = memory
-    return sensors, Rig(loop, runner, tasks, experiments, recorder, memory)
+    return sensors, Rig(loop, runner, tasks, experiments, recorder, memory, commissioning)
 
 
 def gripper_model(config: DaemonConfig) -> GripperModel | None:
@@ -293,11 +327,11 @@ def gripper_model(config: DaemonConfig) -> GripperModel | None:
 
 
 def check_experiment(
-    config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
+    config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None = None
 ) -> experiment_schema.ExperimentFile | None:
     """Return the configured experiment, if any; raises UserError if the configured devices cannot run it.
 
-    `sources` are all torques but the robot's; `robot` has its limits, where they are known.
+    `sources` are all torques but the robot's; `robot` has its limits and its cap, where they are known.
     """
     path = config.experiment
     if path is None:
@@ -307,14 +341,14 @@ def check_experiment(
 
 
 def experiment_mistakes(
-    content: object, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: UrSettings | None = None
+    content: object, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None = None
 ) -> list[experiment_schema.Mistake]:
     """Return each step and key of an experiment's content that its own limits or the devices do not allow."""
     driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
     file = experiment_schema.outline(content)
-    limits = robot.limits if robot is not None else None
     mistakes = experiment_check.check_steps(file)
-    mistakes += experiment_check.check_devices(file, limits, gripper_model(config))
+    limits, cap = (robot.settings.limits, robot.cap) if robot is not None else (None, None)
+    mistakes += experiment_check.check_devices(file, limits, gripper_model(config), cap)
     if file.torque_source and file.steps:
         mistakes += _undriven(file.torque_source, driving, config)
     if config.gripper is None:

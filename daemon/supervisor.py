@@ -109,6 +109,8 @@ class HealthReporter:
     # Why each of some commands is refused now, or None.
     refusals: dict[str, Callable[[], str | None]] = field(default_factory=dict)
     reporters: dict[str, Reporter] = field(default_factory=dict)
+    # The cap on the robot's speeds and torque, in a sentence; empty where none holds.
+    cap: Callable[[], str] = str
 
     def tasks(self) -> dict[str, TaskFacts]:
         """Return the present state of each task."""
@@ -153,6 +155,7 @@ class HealthReporter:
                 host=platform.node(),
                 rig=self.rig,
                 emulated=self.emulated,
+                cap=self.cap(),
                 tare_refusal=self._refusal("tare"),
                 start_refusal=self._refusal("start"),
                 release_refusal=self._refusal("release"),

@@ -14,11 +14,12 @@ from shearloop.errors import UserError
 from shearloop.words import counted
 
 if TYPE_CHECKING:
+    from shearloop.daemon.commissioning import Commissioning
     from shearloop.daemon.config import CurveConfig, DaemonConfig, EmulatorConfig, SkinConfig
     from shearloop.daemon.control.experiment_schema import Mistake
     from shearloop.daemon.control.plan import Plan
     from shearloop.drivers.robotiq.models import GripperModel
-    from shearloop.drivers.ur.settings import UrLimits, UrSettings
+    from shearloop.drivers.ur.settings import UrLimits
     from shearloop.estimation import Calibration
     from shearloop.yaml_files import Document
 
@@ -91,7 +92,7 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
         if config.experiment is not None:
             document = read_document(config.experiment)
             mistakes = experiment_mistakes(document.content, config, sources, robot)
-            limits = robot.limits if robot is not None else None
+            limits = robot.settings.limits if robot is not None else None
             _add_plan(parts, document, mistakes, limits, gripper_model(config), warm_up_s)
         experiment = check_experiment(config, sources, robot)
         if experiment is not None:
@@ -147,8 +148,9 @@ def _torque(calibration: "Calibration") -> str:
     return f"with torque, assuming that {assumed}" if assumed else "with torque"
 
 
-def _check_rig(config: "DaemonConfig", parts: Parts) -> "UrSettings | None":
-    """Check load cell, gripper and robot; return the robot's settings, if there are any."""
+def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
+    """Check load cell, gripper and robot; return the robot's settings with their cap, if there are any."""
+    from shearloop.daemon.commissioning import commissioning_of
     from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, open_settings
 
     if (cell := config.load_cell) is not None:
@@ -165,7 +167,11 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "UrSettings | None":
         if (settings := open_settings(config)) is not None:
             text = f"{settings.host}, limits of {config.robot}"
             parts.texts["robot"] = f"{text}. {settings.warning}" if settings.warning else text
-            return settings
+            with parts.of("commissioned"):
+                commissioning = commissioning_of(config, settings)
+                if sentence := commissioning.sentence:
+                    parts.texts["commissioned"] = sentence
+                return commissioning
     return None
 
 

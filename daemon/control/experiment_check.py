@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from shearloop.daemon.commissioning import MotionCap
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ApproachStep,
@@ -19,12 +20,16 @@ from shearloop.daemon.control.experiment_schema import (
     TareStep,
     TightenStep,
     TurnToStep,
+    TwistingStep,
     TwistStep,
     demand,
     direction_of,
 )
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
+
+# Numbers of a file may differ from a cap by rounding.
+_ROUNDING = 1e-9
 
 
 class Turn(NamedTuple):
@@ -157,15 +162,36 @@ def _undoing(file: ExperimentFile) -> Iterator[Mistake]:
             )
 
 
-def check_devices(file: ExperimentFile, robot: UrLimits | None, gripper: GripperModel | None) -> Iterator[Mistake]:
+def check_devices(
+    file: ExperimentFile, robot: UrLimits | None, gripper: GripperModel | None, cap: MotionCap | None = None
+) -> Iterator[Mistake]:
     """Yield each step with a pose, angle, torque or grip that the configured devices do not allow.
 
-    Nothing of these is clipped, because another pose than the written one may be anywhere.
+    Nothing of these is clipped, because another pose than the written one may be anywhere. `cap` is of the robot's
+    commissioning: a step that asks for more than it is refused too.
     """
     for number, step in enumerate(file.steps):
-        for outside in (_outside_robot(step, robot), _outside_gripper(step, gripper)):
+        for outside in (_outside_robot(step, robot), _outside_gripper(step, gripper), _beyond_cap(file, step, cap)):
             if outside:
                 yield (("steps", number), f"{step.do} {outside}")
+
+
+def _beyond_cap(file: ExperimentFile, step: Step, cap: MotionCap | None) -> str:
+    """Return which speed or torque of a step the robot's commissioning does not allow, or an empty string."""
+    if cap is None:
+        return ""
+    asked: list[tuple[str, float, float, str]] = []
+    match step:
+        case ApproachStep():
+            asked.append(("speed_m_per_s", step.speed_m_per_s, cap.linear_speed_m_per_s, "m/s"))
+        case TwistStep() | TurnToStep() | TightenStep():
+            asked.append(("speed_rad_per_s", step.speed_rad_per_s, cap.wrist_speed_rad_per_s, "rad/s"))
+    if isinstance(step, TwistingStep):
+        asked.append(("limits.torque_nm", file.limits_of(step).torque_nm, cap.torque_nm, "N·m"))
+    for key, value, most, unit in asked:
+        if value > most + _ROUNDING:
+            return f"has {key} {value:g} {unit}: write {most:g} or less, because {cap.sentence}"
+    return ""
 
 
 def _outside_robot(step: Step, limits: UrLimits | None) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, get
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema, model_validator
 
+from shearloop.daemon.commissioning import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD_PER_S
 from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
@@ -63,7 +64,7 @@ FingerForce = Annotated[float, Field(ge=FORCES_N[0], le=FORCES_N[1])]
 class ExperimentLimits(ConfigModel):
     """Limits of all steps; a step's limits can only be tighter."""
 
-    torque_nm: ranges.TorqueLimit = Field(default=0.5, description="a larger torque stops the motion")
+    torque_nm: ranges.TorqueLimit = Field(default=CAPPED_NM, description="a larger torque stops the motion")
     angle_rad: ranges.Turn = Field(default=3.2, description="from the angle at which the tool was gripped")
 
 
@@ -78,7 +79,7 @@ class ApproachStep(_Step):
     do: Literal["approach"]
     pose_m_rad: ranges.Pose | None = Field(None, description="x, y, z and rotation vector; else `along_tool_m`")
     along_tool_m: float | None = Field(None, ge=-0.5, le=0.5, description="along the tool's axis; else `pose_m_rad`")
-    speed_m_per_s: float = Field(0.1, gt=0, le=0.5, description="speed of the tool centre")
+    speed_m_per_s: float = Field(CAPPED_M_PER_S, gt=0, le=0.5, description="speed of the tool centre")
 
     _one_end = either("pose_m_rad", "along_tool_m")
 
@@ -133,7 +134,7 @@ class TwistStep(_Step):
     do: Literal["twist"]
     angles_rad: Angles
     absolute: bool = Field(False, description="angles of the wrist joint, not from the angle at the grip")
-    speed_rad_per_s: ranges.WristSpeed = Field(0.2, description="speed of the wrist")
+    speed_rad_per_s: ranges.WristSpeed = Field(CAPPED_RAD_PER_S, description="speed of the wrist")
     hold_s: ranges.Seconds = Field(2.0, description="time at each angle")
     return_to_start: bool = Field(True, description="turn back after each round")
     repeats: int = Field(1, ge=1, le=1000, description="rounds over all angles")
@@ -144,7 +145,7 @@ class TurnToStep(_Step):
 
     do: Literal["turn_to"]
     angle_rad: ranges.Angle = Field(description="angle of the wrist joint")
-    speed_rad_per_s: ranges.WristSpeed = Field(0.4, description="speed of the wrist")
+    speed_rad_per_s: ranges.WristSpeed = Field(CAPPED_RAD_PER_S, description="speed of the wrist")
 
 
 # Of a turn, for an eye that faces the gripper.

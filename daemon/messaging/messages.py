@@ -266,6 +266,7 @@ class Health(Message):
     host: str = column("", "name of the computer that the daemon runs on")
     rig: str = column("", "name of the rig: the configuration's `name`, else that of its file")
     emulated: bool = column("", "whether every device is emulated, by `emulated: true` in the configuration")
+    cap: str = column("", "cap on a robot's speeds and torque, and why; empty where none holds")
     tare_refusal: str = column("", "why `tare` is refused now, in a sentence; empty when it is not")
     start_refusal: str = column("", "why `start` is refused now, whatever the experiment; empty when it is not")
     release_refusal: str = column("", "why `release` is refused now; empty when it is not")

@@ -101,6 +101,7 @@ class UrArm:
             connected=self._receiver.connected and self._control.isConnected(),
             moving_linearly=self._may_move_linearly
             and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
+            rest_rad_per_s=self._settings.rest_rad_per_s,
         )
 
     def take_errors(self) -> list[ControllerError]:

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Coroutine
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import ProtocolError
@@ -23,6 +23,8 @@ from shearloop.drivers.ur.control_box import silent_sentence
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import Six, UrSettings
 
+# The settings for a controller, by its version and its serial number.
+SettingsFor: TypeAlias = Callable[[str, str], UrSettings]
 # A disconnecting worker stops the arm (1 s) and ends the program; after this time it is killed.
 EXIT_S = 3.0
 # The worker's own alarms end it at a known place; the daemon kills it this much later.
@@ -55,9 +57,20 @@ def missing_library() -> str:
 class UrRobot:
     """A UR arm: `run` in a task of the daemon, `send` commands, read `state` (None while there is no connection)."""
 
-    def __init__(self, settings: UrSettings, monitor: LinkMonitor | None = None, *, warns: bool = True) -> None:
-        """`warns`: say at each connection that the deadlines are longer than promised."""
+    def __init__(
+        self,
+        settings: UrSettings,
+        monitor: LinkMonitor | None = None,
+        *,
+        warns: bool = True,
+        settings_for: SettingsFor | None = None,
+    ) -> None:
+        """`warns`: say at each connection that the deadlines are longer than promised.
+
+        `settings_for` returns the settings for a controller of this version and serial number, else these.
+        """
         self.settings = settings
+        self._settings_for = settings_for
         self._promise = settings.warning if warns else ""
         self.state: messages.RobotState | None = None
         self.monitor = monitor or LinkMonitor()
@@ -163,11 +176,23 @@ class UrRobot:
                     replied.set_result(message)
             case messages.WorkerPhase():
                 self._warning = message.warning
+                if message.controller is not None and self._settings_for is not None:
+                    self._use(self._settings_for(*message.controller))
             case messages.ControllerError():
                 code = f"The controller reports {message} ({message.level})"
                 self.monitor.noted(f"{code}: look it up in Universal Robots' list of error codes.")
             case messages.Failed():
                 raise RobotLostError(message.kind, message.sentence)
+
+    def _use(self, settings: UrSettings) -> None:
+        """Drive with these settings; raises RobotLostError where the worker has others, before it sends a program."""
+        if settings != self.settings:
+            self.settings = settings
+            raise RobotLostError(
+                "other-limits",
+                f"The controller at {settings.host} is not the one before, or not the one of the rig's report: the "
+                "robot's process starts again with the limits for it.",
+            )
 
 
 class WorkerConnection(asyncio.SubprocessProtocol):

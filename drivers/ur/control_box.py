@@ -18,7 +18,7 @@ from typing import Final
 from shearloop.drivers.defaults import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs
-from shearloop.drivers.ur.script import LOWER, UPPER, ScriptRegisters
+from shearloop.drivers.ur.script import LOWER, NO_MOTION_TICKS, UPPER, ScriptRegisters
 from shearloop.drivers.ur.settings import GENERATIONS, UrSettings
 
 # The services behind the ports, as PolyScope's menu names them.
@@ -41,6 +41,8 @@ _CARRIED_OUT: Final = {
 }
 # Without these the arm does not get ready.
 _INDISPENSABLE: Final = ("unlock protective stop", "power on", "brake release")
+# The dashboard's request for the robot's serial number.
+SERIAL_NUMBER: Final = "get serial number"
 SCRIPT_READY: Final = 1
 HEADER: Final = struct.Struct(">HB")
 _PROTOCOL, _CONTROLLER_VERSION, _OUTPUTS, _INPUTS, _START, _DATA = b"VvOISU"
@@ -87,6 +89,7 @@ class ControllerInfo:
     """A controller's mode. `remote` is None where the controller has no remote mode (CB series)."""
 
     version: str
+    serial_number: str
     robot_mode: str
     safety_mode: str
     remote: bool | None
@@ -146,10 +149,11 @@ def untested_sentence(version: str) -> str:
 def query_controller(host: str, timeout_s: float) -> ControllerInfo:
     """Return a controller's mode without changing anything; DriverError where it is absent or silent."""
     version = probe_controller(host, timeout_s)
-    requests = ("robotmode", "safetymode", "is in remote control")
-    robot_mode, safety_mode, remote = ask_dashboard(host, timeout_s, requests)
+    requests = ("robotmode", "safetymode", "is in remote control", SERIAL_NUMBER)
+    robot_mode, safety_mode, remote, serial_number = ask_dashboard(host, timeout_s, requests)
     return ControllerInfo(
         version,
+        serial_number_in(serial_number),
         robot_mode.removeprefix("Robotmode: "),
         safety_mode.removeprefix("Safetymode: "),
         {"true": True, "false": False}.get(remote.lower()),
@@ -166,6 +170,11 @@ def free_registers(host: str, timeout_s: float) -> ScriptRegisters | None:
             if b"IN_USE" not in _request(connection, _INPUTS, ",".join(registers.inputs).encode()):
                 return registers
     return None
+
+
+def serial_number_in(answer: str) -> str:
+    """Return the serial number in an answer to `SERIAL_NUMBER`; empty where the request is unknown."""
+    return answer if answer.isalnum() else ""
 
 
 def ask_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> list[str]:
@@ -353,6 +362,32 @@ def _receive_exactly(connection: socket.socket, size: int) -> bytes:
     return data
 
 
+def register_round_trip(host: str, timeout_s: float, registers: ScriptRegisters, value: int) -> int:
+    """Write a value into our register, and return what the controller reports of it; no program may run.
+
+    Raises:
+        RobotLostError: the register is in use, or the controller does not answer.
+    """
+    with _connected(host, RTDE_PORT, timeout_s, "writing a register") as connection:
+        _agree_on_protocol(connection)
+        name = registers.deadline.encode()
+        _request(connection, _OUTPUTS, struct.pack(">d", 125.0) + name)
+        answer = _request(connection, _INPUTS, name)
+        if b"IN_USE" in answer:
+            raise registers_in_use(host)
+        _request(connection, _START)
+        connection.sendall(_DEADLINE.pack(_DEADLINE.size, _DATA, answer[0], value))
+        read = value + 1
+        for _ in range(_OTHER_PACKAGES):
+            size, kind = HEADER.unpack(_receive_exactly(connection, HEADER.size))
+            content = _receive_exactly(connection, size - HEADER.size)
+            if kind == _DATA and (read := struct.unpack(">i", content[1:5])[0]) == value:
+                break
+        # An old deadline must not stay.
+        connection.sendall(_DEADLINE.pack(_DEADLINE.size, _DATA, answer[0], NO_MOTION_TICKS))
+        return read
+
+
 class SampleParser:
     """Finds the newest sample in the controller's byte stream. No I/O."""
 
@@ -365,8 +400,18 @@ class SampleParser:
         Raises:
             ProtocolError: a package is invalid, so that the start of the next one is unknown.
         """
+        data, starts = self._split(data)
+        return _outputs_at(data, starts[-1]) if starts else None
+
+    def feed_all(self, data: bytes) -> list[RtdeOutputs]:
+        """Return every sample that `data` completes, oldest first; raises as `feed` does."""
+        data, starts = self._split(data)
+        return [_outputs_at(data, start) for start in starts]
+
+    def _split(self, data: bytes) -> tuple[bytes, list[int]]:
+        """Return all bytes, and where a whole sample begins in them; keep the rest for later."""
         data = self._buffer + data
-        start, newest, received = 0, -1, len(data)
+        start, starts, received = 0, [], len(data)
         while received - start >= HEADER.size:
             size, kind = HEADER.unpack_from(data, start)
             if size < HEADER.size or (kind == _DATA and size not in _PACKAGE_SIZES):
@@ -374,17 +419,20 @@ class SampleParser:
             if received - start < size:
                 break
             if kind == _DATA:
-                newest = start
+                starts.append(start)
             start += size
         self._buffer = data[start:]
-        if newest < 0:
-            return None
-        (size, _), start = HEADER.unpack_from(data, newest), newest + HEADER.size + 1
-        v = _VALUES.unpack_from(data, start)
-        tool = _NO_TOOL if size == _PACKAGE_BYTES else _TOOL_VALUES.unpack_from(data, start + _VALUES.size)
-        motion = v[0], v[1:7], v[7:13], v[13:19], v[19:25], v[25:31]
-        modes, scalings, script = (v[31], v[32], v[33]), (v[34], v[35]), (v[36], v[37], v[38])
-        return RtdeOutputs(*motion, *modes, *scalings, *script, tool[0], tool[1:4], tool[4:])
+        return data, starts
+
+
+def _outputs_at(data: bytes, start: int) -> RtdeOutputs:
+    """Return the sample in the package that begins at `start`."""
+    (size, _), start = HEADER.unpack_from(data, start), start + HEADER.size + 1
+    v = _VALUES.unpack_from(data, start)
+    tool = _NO_TOOL if size == _PACKAGE_BYTES else _TOOL_VALUES.unpack_from(data, start + _VALUES.size)
+    motion = v[0], v[1:7], v[7:13], v[13:19], v[19:25], v[25:31]
+    modes, scalings, script = (v[31], v[32], v[33]), (v[34], v[35]), (v[36], v[37], v[38])
+    return RtdeOutputs(*motion, *modes, *scalings, *script, tool[0], tool[1:4], tool[4:])
 
 
 class RtdeReceiver:
@@ -394,14 +442,17 @@ class RtdeReceiver:
     takes a third of the worker's processor time at rest.
     """
 
-    def __init__(self, host: str, rate_hz: float, timeout_s: float, registers: ScriptRegisters = UPPER) -> None:
-        """Connect and wait for the first sample.
+    def __init__(
+        self, host: str, rate_hz: float, timeout_s: float, registers: ScriptRegisters = UPPER, *, writes: bool = True
+    ) -> None:
+        """Connect and wait for the first sample. One that only observes leaves our register to others.
 
         Raises:
             RobotLostError: the controller is absent or silent, does not send the outputs, or our register is in use.
         """
-        self._host = host
+        self._host, self._writes = host, writes
         self._registers = registers
+        self._recipe = 0
         self._parser = SampleParser()
         self.connected = True
         with explain_failure(host, timeout_s, "asking for its state"):
@@ -430,10 +481,11 @@ class RtdeReceiver:
                 break
         else:
             raise OSError(f"its outputs are of the types {types}")
-        answer = _request(self._connection, _INPUTS, self._registers.deadline.encode())
-        if b"IN_USE" in answer:
-            raise registers_in_use(self._host)
-        self._recipe = answer[0]
+        if self._writes:
+            answer = _request(self._connection, _INPUTS, self._registers.deadline.encode())
+            if b"IN_USE" in answer:
+                raise registers_in_use(self._host)
+            self._recipe = answer[0]
         if _request(self._connection, _START) != b"\x01":
             raise OSError("it does not send its state")
         while self.connected:
@@ -460,12 +512,23 @@ class RtdeReceiver:
         """Wait for data, at most this long, and return whether there is any."""
         return self.connected and bool(select.select([self._connection], [], [], max(0.0, seconds))[0])
 
-    def _receive(self) -> RtdeOutputs | None:
+    def receive_all(self) -> list[RtdeOutputs]:
+        """Return every sample received since the last call, oldest first, without waiting."""
+        samples: list[RtdeOutputs] = []
+        if self.connected:
+            self._receive(samples)
+        return samples
+
+    def _receive(self, every: list[RtdeOutputs] | None = None) -> RtdeOutputs | None:
+        """Return the newest sample received, if any; `every` gets all."""
         newest, more = None, True
         while more:
             try:
                 data = self._connection.recv(_READ_BYTES)
-                newest = self._parser.feed(data) or newest
+                if every is None:
+                    newest = self._parser.feed(data) or newest
+                else:
+                    every += self._parser.feed_all(data)
             except BlockingIOError:
                 break
             except (OSError, ProtocolError) as error:

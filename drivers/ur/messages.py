@@ -5,26 +5,23 @@ On the pipe each message is a line: its number, its type's name, and its fields 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Final, Literal, get_args
 
 from pydantic import TypeAdapter
 
 from shearloop.drivers.errors import DeviceLostError, ProtocolError
-from shearloop.drivers.ur.settings import Six, Three, UrSettings
+from shearloop.drivers.ur.settings import REST_RAD_PER_S, Six, Three, UrSettings
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal[
     "unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "script", "lost", "crashed",
-    "hung", "garbled",
+    "hung", "garbled", "other-limits",
 ]  # fmt: skip
 
 # `RobotState.end_reason` of a motion that ended as commanded; any other reason is a sentence.
 ARRIVED: Final = "arrived"
 STOPPED_ON_COMMAND: Final = "stopped on command"
-
-# A joint slower than this is at rest: speeds of up to 0.003 rad/s were reported from arms that stand.
-REST_RAD_PER_S: Final = 0.01
 
 # The longest cycle during recovery: the dashboard client waits 2.5 s for a reply, the control client 3 s for a program.
 RECOVERY_HANG_S: Final = 6.0
@@ -201,6 +198,8 @@ class RtdeSample(RtdeOutputs):
     age_ns: int
     connected: bool
     moving_linearly: bool
+    # A joint slower than this is at rest.
+    rest_rad_per_s: float = field(default=REST_RAD_PER_S, kw_only=True)
 
     @property
     def program_running(self) -> bool:
@@ -245,7 +244,7 @@ class RtdeSample(RtdeOutputs):
     @property
     def rests(self) -> bool:
         """Whether every joint is at rest."""
-        return self.fastest_rad_per_s < REST_RAD_PER_S
+        return self.fastest_rad_per_s < self.rest_rad_per_s
 
     @property
     def fastest_rad_per_s(self) -> float:
@@ -318,11 +317,13 @@ class Heartbeat:
 class WorkerPhase:
     """What the worker is about to do; sent first, because it may hang or crash there.
 
-    `warning` is what the operator has to know of the controller.
+    `warning` is what the operator has to know of the controller. `controller` has its version and its serial number
+    once they are known.
     """
 
     activity: str
     warning: str = ""
+    controller: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True, slots=True)

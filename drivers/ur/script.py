@@ -207,6 +207,11 @@ def hash_of(script: str) -> str:
     return hashlib.sha256(script.encode()).hexdigest()
 
 
+def own_script_hash() -> str:
+    """Return the SHA-256 of what this module adds to ur-rtde's script, before the settings' values."""
+    return hash_of("".join((_GUARD, _START, _NO_BIAS, _CARRY)))
+
+
 def guard_script(script: str, settings: UrSettings, registers: ScriptRegisters = UPPER) -> str:
     """Return ur-rtde's script as a program with its watchdog and its limits, or "" where it is of an unknown form.
 

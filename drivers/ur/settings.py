@@ -29,6 +29,8 @@ _CYCLES_S = 0.02
 _SHORTEST_LEASE = 0.3
 # The watchdog is slower than a stop by this factor.
 _WATCHDOG_FACTOR = 1.5
+# Speeds of up to 0.003 rad/s were reported from arms that stand.
+REST_RAD_PER_S = 0.01
 
 
 Generation = Literal["e-series", "cb3"]
@@ -248,6 +250,8 @@ class UrSettings(_Checked):
     """Time for one attempt to make the robot ready."""
     reaction_s: Annotated[float, Field(gt=0, le=0.5)] = 0.04
     """Delay until a commanded speed takes effect; distances to the joint limits include it."""
+    rest_rad_per_s: Annotated[float, Field(gt=0, le=0.05)] = REST_RAD_PER_S
+    """A joint slower than this is at rest."""
 
     def __post_init__(self) -> None:
         """Refuse an invalid host."""

@@ -19,12 +19,14 @@ from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import (
     REMOTE_CURE,
+    SERIAL_NUMBER,
     ask_dashboard,
     check_generation,
     check_ports,
     free_registers,
     probe_controller,
     registers_in_use,
+    serial_number_in,
     untested_sentence,
 )
 from shearloop.drivers.ur.messages import RobotLostError
@@ -134,13 +136,14 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
         version = probe_controller(host, settings.connect_timeout_s / 4)
         check_generation(settings, version)
         # To a silent dashboard, ur-rtde says "Operation canceled".
-        ask_dashboard(host, settings.connect_timeout_s / 4, ("PolyscopeVersion",))
+        (answer,) = ask_dashboard(host, settings.connect_timeout_s / 4, (SERIAL_NUMBER,))
+        controller = version, serial_number_in(answer)
         primary = PrimaryPort(host, settings.connect_timeout_s / 8)
         registers = free_registers(host, settings.connect_timeout_s / 8)
         if registers is None:
             raise registers_in_use(host)
         warning = " ".join(filter(None, (untested_sentence(version), primary.warning)))
-        pipe.send(messages.WorkerPhase("connecting", warning))
+        pipe.send(messages.WorkerPhase("connecting", warning, controller))
         return UrArm(settings, version, registers, primary)
     except RuntimeError as error:
         text = str(error)

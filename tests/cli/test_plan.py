@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from shearloop.cli import main
+from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.ur.settings import read_settings
@@ -23,11 +24,12 @@ def written(folder: Path, *steps: dict[str, object], **keys: object) -> Path:
     return path
 
 
-def rig(folder: Path, model: str = "2F-140") -> Path:
+def rig(folder: Path, model: str = "2F-140", **keys: object) -> Path:
     content = {
         "load_cell": {"device": {"path": "load"}},
         "robot": str(ROBOT),
         "gripper": {"model": model, "socket": {"host": "192.168.1.10"}},
+        **keys,
     }
     path = folder / "rig.yaml"
     path.write_text(yaml.safe_dump(content))
@@ -83,8 +85,9 @@ async def test_what_lies_outside_the_devices_is_refused_by_check_and_by_start(st
     assert f"REFUSED: {said}" in out, "the plan shows where"
     assert f"steps[1]: {said}" in err
     # As `command start` does, before the experiment begins.
+    robot = Commissioning(read_settings(ROBOT), None, emulated=True)
     with pytest.raises(InvalidExperimentError):
-        await ExperimentFiles((tmp_path,), read_settings(ROBOT).limits, MODELS["2F-140"]).read(path)
+        await ExperimentFiles((tmp_path,), robot, MODELS["2F-140"]).read(path)
 
 
 @pytest.mark.parametrize(
@@ -106,9 +109,11 @@ def test_a_smaller_gripper_has_its_own_ranges(model, step, said, tmp_path, capsy
 def test_what_the_robot_slows_down_is_said(tmp_path, ran):
     steps = ({"do": "turn_to", "angle_rad": 1, "speed_rad_per_s": 3}, {"do": "approach", "along_tool_m": 0.1,
              "speed_m_per_s": 0.5})  # fmt: skip
-    said = ran("check", written(tmp_path, *steps), "--config", rig(tmp_path)).out
-    assert "the robot's limit allows 0.2 rad/s" in said
-    assert "the robot's limit allows 0.05 m/s" in said
+    # No report caps an emulated robot.
+    emulated = {"emulated": True, "robot": str(ROBOT.with_name("demo_ur.yaml")), "gripper": None}
+    said = ran("check", written(tmp_path, *steps), "--config", rig(tmp_path, **emulated)).out
+    assert "the robot's limit allows 0.5 rad/s" in said
+    assert "the robot's limit allows 0.1 m/s" in said
 
 
 def test_an_option_for_experiments_is_refused_for_a_configuration(tmp_path, mistake):

@@ -12,14 +12,16 @@ from pathlib import Path
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
+from shearloop.daemon.commissioning import commissioning_of
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
+from shearloop.daemon.rig import open_settings
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import missing_library
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 from shearloop.tools.check import CheckEmulators, check_parts
 from shearloop.tools.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
-from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, trouble
+from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, split_cure, trouble
 from shearloop.tools.serial_ports import HiddenBoard, has_brltty, list_hidden_boards, list_serial_ports
 
 __all__ = ["Finding", "examine"]
@@ -52,6 +54,7 @@ def examine(
     yield from check_files(config, config_path, check_emulators, geometry)
     if config.robot is not None and not config.emulated:
         yield from check_robot_values(config.robot)
+        yield from check_cap(config)
     tasks = daemon_tasks(config.commands)
     if tasks is not None:
         yield good("daemon", f"answers at {config.commands}; it holds the devices and reports on them")
@@ -184,6 +187,23 @@ def check_robot_values(path: Path) -> Iterator[Finding]:
             means,
             "enter the pendant's payload and tool centre point",
         )
+
+
+def check_cap(config: DaemonConfig) -> Iterator[Finding]:
+    """Say which cap holds for the robot, and why."""
+    try:
+        settings = open_settings(config)
+        commissioning = commissioning_of(config, settings) if settings is not None else None
+    except (DriverError, UserError):
+        # The mistakes are among the findings on files.
+        return
+    if commissioning is None or commissioning.cap is None:
+        return
+    if commissioning.counts:
+        yield good("commissioning", commissioning.sentence)
+    else:
+        what, cure = split_cure(commissioning.sentence)
+        yield note("commissioning", what, "an experiment that asks for more is refused", cure)
 
 
 def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = None) -> Finding:

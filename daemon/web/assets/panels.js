@@ -204,6 +204,9 @@ export function gripperPanel(link) {
 export function headPanel(link) {
   const health = link.get("health")?.content;
   show(byId("emulated"), Boolean(health?.emulated));
+  const cap = health?.cap ?? "";
+  put(byId("cap"), cap && `${cap[0].toUpperCase()}${cap.slice(1)}. A record, not a safety function.`);
+  show(byId("cap"), cap !== "");
   const name = [health?.rig, health?.host && `on ${health.host}`].filter(Boolean).join(" ");
   put(byId("rig"), name);
   const title = [stateWord(link), health?.emulated ? "EMULATED" : "", name].filter(Boolean).join(" · ");

@@ -185,7 +185,7 @@ def test_no_straight_move_begins_with_a_tool_that_is_or_may_be_gripped(sense):
     [
         ([WAIT], "no step moves anything"),
         ([{"do": "tare"}, {"do": "release"}], "step 2 of 2 (release): the fingers open to"),
-        ([{"do": "approach", "along_tool_m": 0.03}], "the arm moves +30 mm along the tool's axis, at 0.1 m/s"),
+        ([{"do": "approach", "along_tool_m": 0.03}], "the arm moves +30 mm along the tool's axis, at 0.05 m/s"),
         ([{"do": "retreat", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0]}], "the arm moves to x 400, y 0, z 300 mm"),
         ([{"do": "turn_to", "angle_rad": 1.5}], "the wrist turns to 1.5 rad"),
         ([{"do": "identify"}], "the wrist turns to and fro"),

@@ -1,0 +1,335 @@
+"""What a rig's commissioning allows: the record of measurements, and the cap on a robot that has no valid one.
+
+It is a record, not a safety function: only the pendant's safety configuration is rated.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final, Literal, TypeVar
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict
+
+from shearloop.daemon.config import DaemonConfig
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.robotiq.gripper import WidthCalibration
+from shearloop.drivers.robotiq.models import ModelName
+from shearloop.drivers.ur.script import own_script_hash
+from shearloop.drivers.ur.settings import Bound, UrSettings
+from shearloop.errors import UserError
+from shearloop.yaml_files import load_model
+
+Verdict = Literal["passed", "failed", "noted"]
+BoundT = TypeVar("BoundT", bound=Bound)
+
+# A robot without a valid report turns and moves no faster than this, and bears no larger torque.
+CAPPED_RAD_PER_S: Final = 0.2
+CAPPED_M_PER_S: Final = 0.05
+CAPPED_NM: Final = 0.3
+# A report counts for this time after its oldest stage.
+MOST_AGE_DAYS: Final = 180
+# A computer's clock may be this much behind the one that dated the report.
+_CLOCKS_DIFFER = timedelta(days=1)
+# A measured value beyond this multiple of a capped speed stops the motion.
+_HARD: Final = 1.6
+CURE: Final = "run `shearloop commission CONFIG --out FILE`, then write `commissioned: FILE` into the configuration"
+# What a report is about: the parts of a configuration that name devices.
+_DEVICE_KEYS: Final[Any] = {
+    "fingertips": {"__all__": {"device", "frame_period_s"}},
+    "skin": {"source", "daq"},
+    "load_cell": True,
+    "robot": True,
+    "gripper": True,
+}
+# The stages, by the first figure of their names, that a quantity needs: the daemon's limits of it depend on them.
+_SPEED_NEEDS: Final = "0134"
+_TORQUE_NEEDS: Final = "01357"
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Line(_Record):
+    """One measured or noted value: its name, its limit, the number of measurements, and the promise it checks."""
+
+    what: str
+    value: str
+    limit: str = ""
+    count: int = 1
+    promise: str = ""
+    verdict: Verdict = "noted"
+
+
+class Supplied(_Record):
+    """Values that the daemon takes from a stage; a key that is absent was not measured."""
+
+    wrist_speed_rad_per_s: float | None = None
+    torque_nm: float | None = None
+    rest_rad_per_s: float | None = None
+    actuation_s: float | None = None
+    reaction_s: float | None = None
+    stop_rad: float | None = None
+    widths: tuple[tuple[float, float], ...] | None = None
+    """Pairs of counts and mm."""
+
+
+NOTHING_SUPPLIED: Final = Supplied()
+
+
+class StageResult(_Record):
+    """The lines of one stage, who ran it, and when."""
+
+    stage: str
+    operator: str
+    date: AwareDatetime
+    lines: tuple[Line, ...]
+    supplies: Supplied = NOTHING_SUPPLIED
+
+    @property
+    def passed(self) -> bool:
+        """Whether no line failed."""
+        return all(line.verdict != "failed" for line in self.lines)
+
+
+class RigIdentity(_Record):
+    """Which rig a report is about: hashes in hexadecimal, versions, and the robot's serial number."""
+
+    emulated: bool
+    configuration_sha256: str
+    robot_settings_sha256: str
+    script_sha256: str
+    ur_rtde: str
+    polyscope: str
+    robot_serial_number: str
+
+    def differences(self, other: "RigIdentity") -> Iterator[str]:
+        """Yield each difference in words."""
+        for key, what in _IDENTITY.items():
+            if getattr(self, key) != getattr(other, key):
+                yield what
+
+
+_IDENTITY: Final = {
+    "emulated": "`emulated`",
+    "configuration_sha256": "the devices in the configuration",
+    "robot_settings_sha256": "the robot's settings",
+    "script_sha256": "the script for the robot",
+    "ur_rtde": "the version of ur-rtde",
+    "polyscope": "the version of PolyScope",
+    "robot_serial_number": "the robot's serial number",
+}
+
+
+class Report(_Record):
+    """All stages of one rig."""
+
+    version: Literal[2] = 2
+    rig: RigIdentity
+    stages: tuple[StageResult, ...] = ()
+
+    @property
+    def passed(self) -> bool:
+        """Whether there is a stage, and none has a failed line."""
+        return bool(self.stages) and all(stage.passed for stage in self.stages)
+
+    def with_stage(self, result: StageResult) -> "Report":
+        """Return the report with this result in the place of an earlier one of the same stage."""
+        others = [stage for stage in self.stages if stage.stage != result.stage]
+        stages = sorted([*others, result], key=lambda stage: stage.stage)
+        return self.model_copy(update={"stages": tuple(stages)})
+
+    def stage(self, number: str) -> StageResult | None:
+        """Return the stage whose name begins with this figure, if it was run."""
+        return next((stage for stage in self.stages if stage.stage.startswith(number)), None)
+
+    def supplied(self) -> Supplied:
+        """Return the values of all stages."""
+        values: dict[str, object] = {}
+        for stage in self.stages:
+            values |= stage.supplies.model_dump(exclude_none=True)
+        return Supplied.model_validate(values)
+
+    def has(self, numbers: str) -> bool:
+        """Return whether all of these stages were run."""
+        return all(self.stage(number) is not None for number in numbers)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionCap:
+    """The largest speeds and torque that a rig's report allows, and why no more."""
+
+    why: str
+    wrist_speed_rad_per_s: float = CAPPED_RAD_PER_S
+    linear_speed_m_per_s: float = CAPPED_M_PER_S
+    torque_nm: float = CAPPED_NM
+
+    @property
+    def sentence(self) -> str:
+        """Return the cap in words."""
+        return (
+            f"the robot is capped at {self.wrist_speed_rad_per_s:g} rad/s, {self.linear_speed_m_per_s:g} m/s and "
+            f"{self.torque_nm:g} N·m: {self.why}"
+        )
+
+
+class Commissioning:
+    """The robot's settings as its report allows them. An emulated robot needs no report."""
+
+    def __init__(
+        self, settings: UrSettings, report: Report | None, reason: str = "", *, emulated: bool = False
+    ) -> None:
+        """`reason` is why the report, or its absence, raises nothing; empty for a report that counts."""
+        self._given, self._report, self._reason, self._emulated = settings, report, reason, emulated
+        # How the connected controller differs from the report's.
+        self._other = ""
+
+    @property
+    def cap(self) -> MotionCap | None:
+        """The cap that holds now; None for an emulated robot."""
+        if self._emulated:
+            return None
+        if self._report is None or not self.counts:
+            return MotionCap(f"{self._reason or self._other}; {CURE}")
+        found = self._report.supplied()
+        wrist_rad_per_s = found.wrist_speed_rad_per_s if self._report.has(_SPEED_NEEDS) else None
+        torque_nm = found.torque_nm if self._report.has(_TORQUE_NEEDS) else None
+        return MotionCap(
+            "its report covers no more",
+            wrist_speed_rad_per_s=max(CAPPED_RAD_PER_S, wrist_rad_per_s or 0.0),
+            torque_nm=max(CAPPED_NM, torque_nm or 0.0),
+        )
+
+    @property
+    def settings(self) -> UrSettings:
+        """The robot's settings within the cap, with what a report that counts supplies."""
+        cap, settings = self.cap, self._given
+        if cap is None:
+            return settings
+        limits = settings.limits
+        joints = limits.joints
+        if self.supplied.stop_rad is not None:
+            joints = replace(joints, margin_rad=max(joints.margin_rad, self.supplied.stop_rad))
+        limits = replace(
+            limits,
+            joints=joints,
+            wrist_speed_rad_per_s=_lowered(limits.wrist_speed_rad_per_s, cap.wrist_speed_rad_per_s),
+            linear_speed_m_per_s=_lowered(limits.linear_speed_m_per_s, cap.linear_speed_m_per_s),
+        )
+        supplied = {
+            key: value for key in ("rest_rad_per_s", "reaction_s") if (value := getattr(self.supplied, key)) is not None
+        }
+        return replace(settings, limits=limits, **supplied)
+
+    @property
+    def supplied(self) -> Supplied:
+        """The values of a report that counts; without one, none."""
+        return self._report.supplied() if self._report is not None and self.counts else NOTHING_SUPPLIED
+
+    @property
+    def counts(self) -> bool:
+        """Whether there is a report, and it raises what its stages cover."""
+        return self._report is not None and not (self._reason or self._other)
+
+    def on_controller(self, polyscope: str, serial_number: str) -> UrSettings:
+        """Compare the connected controller with the report's, and return the settings for it."""
+        if self._report is not None:
+            seen = {"polyscope": polyscope, "robot_serial_number": serial_number}
+            differs = list(self._report.rig.differences(self._report.rig.model_copy(update=seen)))
+            self._other = f"{' and '.join(differs)} changed since its report" if differs else ""
+        return self.settings
+
+    @property
+    def sentence(self) -> str:
+        """The cap in words; empty for an emulated robot."""
+        return self.cap.sentence if self.cap is not None else ""
+
+
+def _lowered(bound: BoundT, cap: float) -> BoundT:
+    """Return a bound on a speed with commands at or below the cap, and the measured value not far above it."""
+    if bound.inner <= cap:
+        return bound
+    return replace(bound, inner=cap, hard=min(bound.hard, _HARD * cap))
+
+
+def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime | None = None) -> Commissioning:
+    """Return what a rig's report allows at a time, by default now.
+
+    Raises UserError for a file that cannot be read or is no report: a mistake in the configuration.
+    """
+    if config.emulated:
+        return Commissioning(settings, None, emulated=True)
+    if config.commissioned is None:
+        return Commissioning(settings, None, "`commissioned` is not in the configuration")
+    report = load_report(config.commissioned)
+    return Commissioning(settings, report, why_not(report, config, now or datetime.now(UTC)))
+
+
+def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
+    """Return why a report does not count for a configuration, or an empty string."""
+    seen = identity_of(config, report.rig.polyscope, report.rig.robot_serial_number)
+    if differs := list(report.rig.differences(seen)):
+        return f"{' and '.join(differs)} changed since {config.commissioned} was measured"
+    failed = [f"{line.what} in stage {stage.stage}" for stage in report.stages for line in stage.lines
+              if line.verdict == "failed"]  # fmt: skip
+    if failed:
+        return f"{config.commissioned} says that {failed[0]} failed"
+    if not report.stages:
+        return f"{config.commissioned} has no stage"
+    dates = [stage.date for stage in report.stages]
+    if now - min(dates) > timedelta(days=MOST_AGE_DAYS):
+        return f"{config.commissioned} is of {min(dates):%Y-%m-%d}, older than {MOST_AGE_DAYS} days"
+    if max(dates) - now > _CLOCKS_DIFFER:
+        return f"{config.commissioned} is of {max(dates):%Y-%m-%d}, which is in the future by this computer's clock"
+    return ""
+
+
+def load_report(path: Path) -> Report:
+    """Return the report in a file; raises UserError for a file that is none."""
+    return load_model(path, Report, UserError, "report of a commissioning", "; make it with `shearloop commission`")
+
+
+def identity_of(config: DaemonConfig, polyscope: str, robot_serial_number: str) -> RigIdentity:
+    """Return which rig this is; raises UserError where the robot's settings cannot be read."""
+    devices = config.model_dump(mode="json", exclude_unset=True, include=_DEVICE_KEYS)
+    return RigIdentity(
+        emulated=config.emulated,
+        configuration_sha256=_sha256(json.dumps(devices, sort_keys=True).encode()),
+        robot_settings_sha256=_sha256(_content(config.robot)),
+        script_sha256=own_script_hash(),
+        ur_rtde=_installed("ur-rtde"),
+        polyscope=polyscope,
+        robot_serial_number=robot_serial_number,
+    )
+
+
+def _content(path: Path | None) -> bytes:
+    try:
+        return path.read_bytes() if path is not None else b""
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _installed(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def measured_widths(found: Supplied, model: ModelName) -> WidthCalibration | None:
+    """Return the gripper's calibration by a report's table, or None without one."""
+    if found.widths is None:
+        return None
+    try:
+        return WidthCalibration.of_gauges(found.widths, model)
+    except DriverError as error:
+        raise UserError(f"the report's table of widths: {error}") from error

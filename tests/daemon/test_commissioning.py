@@ -1,0 +1,254 @@
+"""The cap on a robot that is not commissioned, each reason for it, and what a report raises and supplies."""
+
+import dataclasses
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import yaml
+
+from shearloop.cli import main
+from shearloop.cli.init import packaged_files
+from shearloop.daemon.commissioning import (
+    CAPPED_M_PER_S,
+    CAPPED_NM,
+    CAPPED_RAD_PER_S,
+    MOST_AGE_DAYS,
+    NOTHING_SUPPLIED,
+    Line,
+    Report,
+    StageResult,
+    Supplied,
+    commissioning_of,
+    identity_of,
+    measured_widths,
+)
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
+from shearloop.daemon.rig import make_loop
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import RobotLostError, WorkerPhase
+from shearloop.drivers.ur.settings import read_settings
+from shearloop.errors import UserError
+from shearloop.tools.commission.report import save_report
+from shearloop.tools.doctor import check_cap
+from tests.fixtures.daemons import ask, collector, robot_at, running_daemon
+
+NOW = datetime(2026, 11, 1, tzinfo=UTC)
+VERSION, SERIAL = "5.17.3.0", "20235500001"
+SUPPLIED = Supplied(
+    wrist_speed_rad_per_s=0.5,
+    torque_nm=0.4,
+    rest_rad_per_s=0.005,
+    actuation_s=0.03,
+    reaction_s=0.035,
+    stop_rad=0.15,
+    widths=((10.0, 100.0), (60.0, 80.0), (110.0, 60.0), (160.0, 40.0), (210.0, 20.0)),
+)
+
+
+def write_rig(folder: Path, *, wrist: float = 0.8, **content: object) -> Path:
+    robot = yaml.safe_load(packaged_files()[Path("ur.yaml")])
+    robot["limits"]["wrist_speed_rad_per_s"] = {"inner": wrist, "hard": 1.5 * wrist}
+    robot["limits"]["linear_speed_m_per_s"] = {"inner": 0.2, "hard": 0.3}
+    (folder / "ur.yaml").write_text(yaml.safe_dump(robot))
+    path = folder / "rig.yaml"
+    rig = {"load_cell": {"device": {"serial_number": "7583"}}, "robot": "ur.yaml"}
+    path.write_text(yaml.safe_dump(rig | content))
+    return path
+
+
+def report_of(
+    path: Path, stages: str = "01357", supplies: Supplied = NOTHING_SUPPLIED, verdict: str = "passed"
+) -> Report:
+    """Return a report of a rig with these stages; each supplies the same."""
+    results = [
+        StageResult(
+            stage=f"{number} s", operator="O", date=NOW, lines=(Line(what="w", value="v", verdict=verdict),),
+            supplies=supplies,
+        )
+        for number in stages
+    ]  # fmt: skip
+    return Report(rig=identity_of(load_daemon_config(path), VERSION, SERIAL), stages=tuple(results))
+
+
+def commissioned(folder: Path, report: Report, now: datetime = NOW, **content: object):
+    """Return what a rig's report allows."""
+    save_report(folder / "report.yaml", report)
+    path = write_rig(folder, commissioned="report.yaml", **content)
+    config = load_daemon_config(path)
+    return commissioning_of(config, read_settings(config.robot), now)
+
+
+def caps(found) -> tuple[float, float, float]:
+    return found.cap.wrist_speed_rad_per_s, found.cap.linear_speed_m_per_s, found.cap.torque_nm
+
+
+def test_a_robot_without_a_report_is_capped_where_its_process_and_its_script_clip(tmp_path):
+    config = load_daemon_config(write_rig(tmp_path))
+    found = commissioning_of(config, read_settings(config.robot), NOW)
+    limits = found.settings.limits
+    assert (limits.wrist_speed_rad_per_s.inner, limits.linear_speed_m_per_s.inner) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S)
+    assert limits.wrist_speed_rad_per_s.hard < 0.4, "a measured speed far above the cap stops the motion"
+    assert make_loop(config, found.settings, {}, {}).config.wrist_speed_rad_per_s == CAPPED_RAD_PER_S
+    assert "commissioned" in found.cap.why
+
+
+def test_an_emulated_robot_needs_no_report(tmp_path):
+    path = write_rig(tmp_path, emulated=True, load_cell={"device": {"path": "cell"}})
+    config = load_daemon_config(path)
+    settings = read_settings(config.robot)
+    found = commissioning_of(config, settings, NOW)
+    assert (found.cap, found.settings, found.sentence) == (None, settings, "")
+
+
+def changed(report: Report, **rig: str | bool) -> Report:
+    return report.model_copy(update={"rig": report.rig.model_copy(update=rig)})
+
+
+@pytest.mark.parametrize(
+    ("change", "now", "why"),
+    [
+        (lambda report: changed(report, emulated=True), NOW, "`emulated`"),
+        (lambda report: changed(report, configuration_sha256="0"), NOW, "the devices in the configuration"),
+        (lambda report: changed(report, robot_settings_sha256="0"), NOW, "the robot's settings"),
+        (lambda report: changed(report, script_sha256="0"), NOW, "the script for the robot"),
+        (lambda report: changed(report, ur_rtde="1.0"), NOW, "the version of ur-rtde"),
+        (lambda report: report.model_copy(update={"stages": ()}), NOW, "no stage"),
+        (lambda report: report, NOW + timedelta(days=MOST_AGE_DAYS, hours=1), "older than"),
+        (lambda report: report, NOW - timedelta(days=2), "in the future"),
+    ],
+)
+def test_a_report_that_does_not_count_raises_and_supplies_nothing(tmp_path, change, now, why):
+    report = change(report_of(write_rig(tmp_path), "013457", SUPPLIED))
+    found = commissioned(tmp_path, report, now)
+    assert why in found.cap.why
+    assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
+    assert found.supplied == NOTHING_SUPPLIED
+
+
+def test_one_failed_line_caps(tmp_path):
+    found = commissioned(tmp_path, report_of(write_rig(tmp_path), "013457", SUPPLIED, "failed"))
+    assert "w in stage 0 s failed" in found.cap.why
+    assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
+
+
+@pytest.mark.parametrize(
+    ("stages", "raised"),
+    [
+        ("013457", (0.5, CAPPED_M_PER_S, 0.4)),
+        ("0134", (0.5, CAPPED_M_PER_S, CAPPED_NM)),
+        ("034", (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)),
+        ("01357", (CAPPED_RAD_PER_S, CAPPED_M_PER_S, 0.4)),
+        ("0137", (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)),
+    ],
+)
+def test_a_report_raises_only_what_its_stages_cover(tmp_path, stages, raised):
+    found = commissioned(tmp_path, report_of(write_rig(tmp_path), stages, SUPPLIED))
+    assert caps(found) == raised
+    assert found.settings.limits.wrist_speed_rad_per_s.inner == raised[0], "the settings alone would allow 0.8 rad/s"
+
+
+def test_a_report_supplies_rest_delay_stop_margin_and_widths(tmp_path):
+    found = commissioned(tmp_path, report_of(write_rig(tmp_path), "013457", SUPPLIED))
+    settings = found.settings
+    assert (settings.rest_rad_per_s, settings.reaction_s) == (0.005, 0.035)
+    assert settings.limits.joints.margin_rad == 0.15
+    config = load_daemon_config(tmp_path / "rig.yaml")
+    assert make_loop(config, settings, {}, {}, found.supplied).config.actuation_s == 0.03
+    widths = measured_widths(found.supplied, "2F-140")
+    assert widths.width_mm(110.0) == pytest.approx(60.0, abs=0.1)
+    assert measured_widths(NOTHING_SUPPLIED, "2F-140") is None
+
+
+@pytest.mark.parametrize(("version", "serial"), [("5.17.4.0", SERIAL), (VERSION, "20235500002")])
+def test_another_controller_is_capped_once_it_is_connected(tmp_path, version, serial):
+    found = commissioned(tmp_path, report_of(write_rig(tmp_path), "013457", SUPPLIED))
+    full = found.settings
+    assert found.on_controller(version, serial).limits.wrist_speed_rad_per_s.inner == CAPPED_RAD_PER_S
+    assert "changed since its report" in found.sentence
+    assert found.on_controller(VERSION, SERIAL) == full
+
+
+BEYOND = [
+    ({"do": "turn_to", "angle_rad": 0.1, "speed_rad_per_s": 0.21}, "speed_rad_per_s 0.21 rad/s"),
+    ({"do": "approach", "along_tool_m": 0.01, "speed_m_per_s": 0.06}, "speed_m_per_s 0.06 m/s"),
+    ({"do": "twist", "angles_rad": [0.1], "limits": {"torque_nm": 0.31}}, "limits.torque_nm 0.31 N·m"),
+]
+
+
+@pytest.mark.parametrize(("step", "named"), BEYOND)
+def test_an_experiment_that_asks_for_more_is_refused_with_its_key_and_a_cure(tmp_path, step, named, capsys):
+    rig = write_rig(tmp_path)
+    path = tmp_path / "one.yaml"
+    content = {"name": "one", "torque_source": "load_cell", "limits": {"torque_nm": 0.4}, "steps": [step]}
+    path.write_text(yaml.safe_dump(content))
+    assert main(["check", str(path), "--config", str(rig)]) == 2
+    printed = capsys.readouterr()
+    assert named in printed.err
+    assert "shearloop commission" in printed.err
+    assert "REFUSED" in printed.out
+
+
+async def test_a_running_daemon_refuses_it_too(tmp_path):
+    path = tmp_path / "one.yaml"
+    content = {"name": "one", "limits": {"torque_nm": 0.3}, "steps": [BEYOND[0][0]]}
+    path.write_text(yaml.safe_dump(content))
+    config = load_daemon_config(write_rig(tmp_path))
+    files = ExperimentFiles((tmp_path,), commissioning_of(config, read_settings(config.robot), NOW))
+    with pytest.raises(InvalidExperimentError):
+        await files.read(path)
+
+
+def test_check_and_doctor_say_that_the_cap_holds(tmp_path, capsys):
+    path = write_rig(tmp_path)
+    assert main(["check", str(path)]) == 0
+    assert "capped at 0.2 rad/s, 0.05 m/s and 0.3 N·m" in capsys.readouterr().out
+    (finding,) = check_cap(load_daemon_config(path))
+    assert (finding.state, "capped" in finding.found, "commission" in finding.next_step) == ("note", True, True)
+
+
+def test_a_missing_report_is_a_mistake_of_the_configuration(tmp_path):
+    config = load_daemon_config(write_rig(tmp_path, commissioned="absent.yaml"))
+    with pytest.raises(UserError, match=r"absent\.yaml.*shearloop commission"):
+        commissioning_of(config, read_settings(config.robot), NOW)
+
+
+def test_the_key_and_another_experiment_do_not_make_it_another_rig(tmp_path):
+    plain = identity_of(load_daemon_config(write_rig(tmp_path)), VERSION, SERIAL)
+    path = write_rig(tmp_path, commissioned="report.yaml", experiment="other.yaml", name="other")
+    assert identity_of(load_daemon_config(path), VERSION, SERIAL) == plain
+    path = write_rig(tmp_path, load_cell={"device": {"serial_number": "7584"}})
+    assert identity_of(load_daemon_config(path), VERSION, SERIAL) != plain
+
+
+def test_the_robots_process_starts_again_with_the_limits_for_its_controller(tmp_path):
+    found = commissioned(tmp_path, report_of(write_rig(tmp_path), "013457", SUPPLIED))
+    robot = UrRobot(found.settings, settings_for=found.on_controller)
+    same, other = (WorkerPhase("connecting", "", (VERSION, serial)) for serial in (SERIAL, "2"))
+    robot.handle_message(0, same)
+    with pytest.raises(RobotLostError, match="starts again with the limits"):
+        robot.handle_message(0, other)
+    assert robot.settings.limits.wrist_speed_rad_per_s.inner == CAPPED_RAD_PER_S
+    # The new process meets the same controller.
+    robot.handle_message(0, other)
+    with pytest.raises(RobotLostError):
+        robot.handle_message(0, same)
+    assert robot.settings.limits.wrist_speed_rad_per_s.inner == 0.5
+
+
+@pytest.mark.usefixtures("ur_rtde")
+async def test_status_and_health_say_that_the_cap_holds(config, tmp_path):
+    robot_at("127.0.0.9", tmp_path)
+    async with running_daemon(config(robot="ur.yaml")) as daemon:
+        health = collector(daemon, "health")
+        assert "capped at 0.2 rad/s" in (await ask(daemon, "status"))["cap"]
+        assert "`commissioned` is not in the configuration" in (await health.get())["cap"]
+
+
+def test_settings_are_compared_without_their_cap(tmp_path):
+    """A cap lowers nothing that is lower already."""
+    config = load_daemon_config(write_rig(tmp_path, wrist=0.1))
+    settings = read_settings(config.robot)
+    limits = commissioning_of(config, settings, NOW).settings.limits
+    assert dataclasses.replace(limits, linear_speed_m_per_s=settings.limits.linear_speed_m_per_s) == settings.limits

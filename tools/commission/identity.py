@@ -2,14 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from importlib import metadata
 
+from shearloop.daemon.commissioning import Line
 from shearloop.daemon.config import DaemonConfig, SerialDevice
-from shearloop.drivers.ur.control_box import RtdeReceiver, query_controller, untested_sentence
+from shearloop.drivers.ur.control_box import ControllerInfo, RtdeReceiver, untested_sentence
 from shearloop.drivers.ur.messages import RtdeOutputs
-from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import UrSettings
-from shearloop.tools.commission.report import Line, Verdict
+from shearloop.tools.commission.context import Context
+from shearloop.tools.commission.report import Measured, judged
 
 STAGE = "0 identity"
 CHECKSUM_QUESTION = "The safety checksum, as the pendant shows it at the top right (CB3: under Safety):"
@@ -21,60 +21,59 @@ PAYLOAD_TOLERANCE_KG = 0.1
 class Identity:
     """What the robot and this computer report, and what the operator read from the pendant."""
 
-    polyscope: str
-    robot_mode: str
-    safety_mode: str
+    controller: ControllerInfo
     outputs: RtdeOutputs
-    ur_rtde: str
     safety_checksum: str
 
 
-def read_identity(settings: UrSettings, safety_checksum: str) -> Identity:
-    """Ask the controller; raises RobotLostError if it does not answer."""
-    seen = query_controller(settings.host, settings.connect_timeout_s)
-    registers = seen.registers or UPPER
-    receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s, registers)
+def measure(context: Context) -> Measured:
+    """Return the stage's lines; raises RobotLostError if the controller does not answer."""
+    settings = context.settings
+    checksum = context.operator.ask(CHECKSUM_QUESTION)
+    receiver = RtdeReceiver(
+        settings.host, settings.rate_hz, settings.connect_timeout_s, context.registers, writes=False
+    )
     try:
         outputs = receiver.latest()
     finally:
         receiver.close()
-    try:
-        ur_rtde = metadata.version("ur-rtde")
-    except metadata.PackageNotFoundError:
-        ur_rtde = "not installed"
-    return Identity(seen.version, seen.robot_mode, seen.safety_mode, outputs, ur_rtde, safety_checksum)
+    return Measured(judge_identity(Identity(context.controller, outputs, checksum), settings, context.config))
 
 
 def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfig) -> tuple[Line, ...]:
     """Return the stage's lines: versions and modes are known, payload and tool centre point are as in the settings."""
-    outputs, tool = identity.outputs, settings.tool
-    untested = untested_sentence(identity.polyscope)
+    outputs, tool, seen = identity.outputs, settings.tool, identity.controller
+    untested = untested_sentence(seen.version)
+    major = int(seen.version.split(".", maxsplit=1)[0])
+    slider = outputs.speed_slider
     lines = [
-        _judged("PolyScope", identity.polyscope, "a version that ur-rtde is tested on", not untested, "known versions"),
-        _judged(
+        judged("PolyScope", seen.version, "a version that ur-rtde is tested on", "known versions", passed=not untested),
+        judged(
             "generation",
-            f"PolyScope {identity.polyscope.split('.', maxsplit=1)[0]}",
+            f"PolyScope {major}",
             settings.facts.name,
-            int(identity.polyscope.split(".", maxsplit=1)[0]) == settings.facts.major,
             "limits of force and torque fit the arm",
+            passed=major == settings.facts.major,
         ),
-        Line(what="ur-rtde", value=identity.ur_rtde),
-        _judged("robot mode", identity.robot_mode, "RUNNING", identity.robot_mode == "RUNNING", "ready to move"),
-        _judged("safety mode", identity.safety_mode, "NORMAL", identity.safety_mode == "NORMAL", "ready to move"),
-        _judged(
-            "speed slider",
-            f"{outputs.speed_slider:.0%}",
-            "100%",
-            math.isclose(outputs.speed_slider, 1.0, abs_tol=1e-6),
-            "the loop's gain",
+        judged("robot mode", seen.robot_mode, "RUNNING", "ready to move", passed=seen.robot_mode == "RUNNING"),
+        judged("safety mode", seen.safety_mode, "NORMAL", "ready to move", passed=seen.safety_mode == "NORMAL"),
+        judged(
+            "registers",
+            "free" if seen.registers is not None else "in use",
+            "free",
+            "nobody else commands the robot",
+            passed=seen.registers is not None,
+        ),
+        judged(
+            "speed slider", f"{slider:.0%}", "100%", "the loop's gain", passed=math.isclose(slider, 1.0, abs_tol=1e-6)
         ),
         _payload(outputs.payload_kg, tool.payload_kg),
-        _judged(
+        judged(
             "safety checksum",
             identity.safety_checksum or "not given",
             "typed from the pendant",
-            bool(identity.safety_checksum),
             "the rated limits are known",
+            passed=bool(identity.safety_checksum),
         ),
         Line(what="tool centre point", value=" ".join(f"{value:.4g}" for value in outputs.tcp_offset)),
     ]
@@ -89,12 +88,8 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
 def _payload(set_kg: float, wanted_kg: float | None) -> Line:
     value = "not reported" if math.isnan(set_kg) else f"{set_kg:.3f} kg"
     if wanted_kg is None:
-        return _judged("payload", value, "`tool.payload_kg` of the robot's settings, which is absent", False, "payload")
+        limit = "`tool.payload_kg` of the robot's settings, which is absent"
+        return judged("payload", value, limit, "payload", passed=False)
     limit = f"{wanted_kg:g} ± {PAYLOAD_TOLERANCE_KG:g} kg"
     # The sum keeps a payload at the edge inside.
-    return _judged("payload", value, limit, abs(set_kg - wanted_kg) <= PAYLOAD_TOLERANCE_KG + 1e-9, "payload")
-
-
-def _judged(what: str, value: str, limit: str, passed: bool, promise: str) -> Line:
-    verdict: Verdict = "passed" if passed else "failed"
-    return Line(what=what, value=value, limit=limit, promise=promise, verdict=verdict)
+    return judged("payload", value, limit, "payload", passed=abs(set_kg - wanted_kg) <= PAYLOAD_TOLERANCE_KG + 1e-9)

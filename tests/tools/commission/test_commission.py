@@ -12,17 +12,34 @@ import yaml
 
 from shearloop.cli import main
 from shearloop.cli.init import packaged_files
+from shearloop.daemon.commissioning import Line, Report, RigIdentity, StageResult
 from shearloop.daemon.config import load_daemon_config
+from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 from shearloop.tools.commission.identity import Identity, judge_identity
-from shearloop.tools.commission.report import Line, Report, StageResult, open_report, save_report
+from shearloop.tools.commission.report import open_report, save_report
 from tests.emulator_process import EmulatorProcess
 
 SIX = (0.0,) * 6
 OUTPUTS = RtdeOutputs(0.0, SIX, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 1.0, 0, 0, 0.0, 1.4, (0.0, 0.0, 0.0), SIX)
-GOOD = Identity("5.17.3.0", "RUNNING", "NORMAL", OUTPUTS, "1.6.5", "A1B2")
+CONTROLLER = ControllerInfo("5.17.3.0", "20235500001", "RUNNING", "NORMAL", remote=True, registers=UPPER)
+GOOD = Identity(CONTROLLER, OUTPUTS, "A1B2")
+RIG = RigIdentity(
+    emulated=False,
+    configuration_sha256="a",
+    robot_settings_sha256="b",
+    script_sha256="c",
+    ur_rtde="1.6.5",
+    polyscope="5.17.3.0",
+    robot_serial_number="20235500001",
+)
+
+
+def seen(**changed: object) -> Identity:
+    return replace(GOOD, controller=replace(CONTROLLER, **changed))
 
 
 def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
@@ -37,10 +54,11 @@ def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
     ("found", "failed"),
     [
         (GOOD, []),
-        (replace(GOOD, polyscope="5.99.0.0"), ["PolyScope"]),
-        (replace(GOOD, polyscope="3.15.8.0"), ["generation"]),
-        (replace(GOOD, robot_mode="IDLE"), ["robot mode"]),
-        (replace(GOOD, safety_mode="PROTECTIVE_STOP"), ["safety mode"]),
+        (seen(version="5.99.0.0"), ["PolyScope"]),
+        (seen(version="3.15.8.0"), ["generation"]),
+        (seen(robot_mode="IDLE"), ["robot mode"]),
+        (seen(safety_mode="PROTECTIVE_STOP"), ["safety mode"]),
+        (seen(registers=None), ["registers"]),
         (replace(GOOD, safety_checksum=""), ["safety checksum"]),
         (replace(GOOD, outputs=replace(OUTPUTS, speed_slider=0.5)), ["speed slider"]),
         (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.5)), []),
@@ -56,29 +74,30 @@ def test_a_fault_fails_exactly_its_own_line(tmp_path, found, failed):
 
 
 def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
-    begun = Report(emulated=False, configuration_sha256="a", robot_settings_sha256="b")
+    begun = Report(rig=RIG)
     assert not begun.passed, "nothing measured is nothing passed"
     bad, good = (
         StageResult(stage="0 identity", operator="O", date=date, lines=(Line(what="w", value="<v>", verdict=verdict),))
-        for date, verdict in (("d1", "failed"), ("d2", "passed"))
+        for date, verdict in (("2026-01-01T00:00:00Z", "failed"), ("2026-01-02T00:00:00Z", "passed"))
     )
     path = tmp_path / "report.yaml"
     save_report(path, begun.with_stage(bad))
-    found = open_report(path, begun)
+    found = open_report(path, RIG)
     assert (found.stages, found.passed) == ((bad,), False)
-    page = save_report(path, found.with_stage(good))
-    assert open_report(path, begun).stages == (good,)
+    page = save_report(path, found.with_stage(good), ["4 stops"])
+    assert open_report(path, RIG).stages == (good,)
     text = page.read_text()
     HTMLParser().feed(text)
     assert "&lt;v&gt;" in text, "an operator's words are no markup"
+    assert "Not measured" in text
+    assert "4 stops" in text
 
 
-@pytest.mark.parametrize("changed", ["emulated", "configuration_sha256", "robot_settings_sha256"])
+@pytest.mark.parametrize("changed", list(RigIdentity.model_fields))
 def test_a_report_of_another_rig_is_not_continued(tmp_path, changed):
-    begun = Report(emulated=False, configuration_sha256="a", robot_settings_sha256="b")
     path = tmp_path / "report.yaml"
-    save_report(path, begun)
-    other = begun.model_copy(update={changed: True if changed == "emulated" else "c"})
+    save_report(path, Report(rig=RIG))
+    other = RIG.model_copy(update={changed: True if changed == "emulated" else "other"})
     with pytest.raises(UserError, match="changed since this report was begun"):
         open_report(path, other)
 
@@ -89,10 +108,10 @@ def test_stage_0_is_run_on_an_emulated_controller_with_scripted_answers(tmp_path
     try:
         path, out = write_rig(tmp_path, robot.host), tmp_path / "report.yaml"
         monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
-        assert main(["commission", str(path), "--out", str(out)]) == 0
+        assert main(["commission", str(path), "--out", str(out), "--stages", "0"]) == 0
         assert "passed payload: 1.400 kg" in capsys.readouterr().out
         monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
-        assert main(["commission", str(path), "--out", str(out), "--json"]) == 0
+        assert main(["commission", str(path), "--out", str(out), "--stages", "0", "--json"]) == 0
         assert json.loads(capsys.readouterr().out) == yaml.safe_load(out.read_text())
         (stage,) = yaml.safe_load(out.read_text())["stages"]
         assert (stage["stage"], stage["operator"]) == ("0 identity", "Ada")
@@ -100,7 +119,7 @@ def test_stage_0_is_run_on_an_emulated_controller_with_scripted_answers(tmp_path
         robot.process.stdin.write(b"payload 2\n")
         robot.process.stdin.flush()
         monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
-        while main(["commission", str(path), "--out", str(out)]) == 0:
+        while main(["commission", str(path), "--out", str(out), "--stages", "0"]) == 0:
             monkeypatch.setattr(sys, "stdin", io.StringIO("Ada\nA1B2\n"))
         failed = [
             line["what"]

@@ -1,0 +1,228 @@
+"""What the stages make of their measurements: each fault fails its own line, and no other."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from shearloop.drivers.eit_kit import Frame
+from shearloop.drivers.load_cell import LoadSample
+from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.tools.commission.boards import judge_frames, judge_load
+from shearloop.tools.commission.bounds import LARGEST_RAD, LARGEST_RAD_PER_S, bounded
+from shearloop.tools.commission.gripper import judge_widths
+from shearloop.tools.commission.motion import SIGMAS, Turn, judge_noise
+from shearloop.tools.commission.observer import Seen
+from shearloop.tools.commission.rtde import judge_clock, judge_samples
+from shearloop.tools.commission.stops import Stop, judge_stops
+from shearloop.tools.commission.tool import Held, judge_signs, judge_twists
+from shearloop.tools.commission.wrench import Reading, judge_mass, judge_rest
+from tests.drivers.ur.robots import DELIVERED
+
+SIX = (0.0,) * 6
+AT_REST = RtdeOutputs(0.0, SIX, SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1.0, 1, 0, 0.002, 1.0, (0.0, 0.0, 0.0), SIX)
+PERIOD_S = 0.008
+RANDOM = np.random.default_rng(3)
+
+
+def failed(lines) -> list[str]:
+    return [line.what for line in lines if line.verdict == "failed"]
+
+
+def samples(seconds: float, late_s: float = 0.0, **changed) -> list[Seen]:
+    """Return samples of an arm that stands; `late_s` is a pause in the middle."""
+    found = []
+    for number in range(round(seconds / PERIOD_S)):
+        t_s = number * PERIOD_S
+        arrived_s = t_s + (late_s if number == round(seconds / PERIOD_S) // 2 else 0.0)
+        outputs = dataclasses.replace(AT_REST, timestamp_s=t_s, script_ticks=round(t_s / 0.002), **changed)
+        found.append(Seen(round(t_s * 1e9), round(arrived_s * 1e9), outputs))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("seen", "lines"),
+    [
+        (samples(4.0), []),
+        ([seen for number, seen in enumerate(samples(4.0)) if number % 20], ["rate"]),
+        (samples(4.0, late_s=0.05), ["largest gap"]),
+    ],
+)
+def test_lost_and_late_states_fail_their_lines(seen, lines):
+    assert failed(judge_samples(seen, DELIVERED)) == lines
+
+
+@pytest.mark.parametrize(("rate", "lines"), [(1.0, []), (0.977, ["script's clock"]), (1.02, ["script's clock"])])
+def test_a_clock_that_loses_cycles_fails(rate, lines):
+    seen = [
+        dataclasses.replace(
+            one, outputs=dataclasses.replace(one.outputs, script_ticks=round(rate * one.outputs.script_ticks))
+        )
+        for one in samples(4.0)
+    ]
+    assert failed([judge_clock(seen)]) == lines
+
+
+@pytest.mark.parametrize(("sigma", "lines"), [(0.0005, []), (0.003, ["velocity noise at rest"])])
+def test_noise_that_looks_like_motion_fails(sigma, lines):
+    seen = [
+        dataclasses.replace(
+            one, outputs=dataclasses.replace(one.outputs, qd_rad_per_s=tuple(RANDOM.normal(0.0, sigma, 6)))
+        )
+        for one in samples(8.0)
+    ]
+    line, found = judge_noise(seen, DELIVERED.rest_rad_per_s)
+    assert failed([line]) == lines
+    assert found == pytest.approx(sigma, rel=0.2)
+    assert f"{SIGMAS:g} σ" in line.value
+
+
+def test_a_turn_has_its_delay_speed_and_acceleration():
+    speeds = [0.0] * 3 + [0.05, 0.1, 0.15] + [0.2] * 100 + [0.15, 0.1, 0.05, 0.0]
+    seen = [
+        Seen(
+            round(number * PERIOD_S * 1e9),
+            0,
+            dataclasses.replace(AT_REST, timestamp_s=number * PERIOD_S, qd_rad_per_s=(*SIX[:5], speed)),
+        )
+        for number, speed in enumerate(speeds)
+    ]
+    turn = Turn(0, 0.2, seen)
+    assert turn.delay_s(0.004) == pytest.approx(3 * PERIOD_S)
+    assert np.mean(turn.cruise()) == pytest.approx(1.0)
+    assert turn.largest_acceleration() == pytest.approx(0.2 / 0.04, rel=0.01)
+    assert Turn(0, 0.2, seen[:2]).delay_s(0.004) == math.inf
+
+
+GOOD = Stop("worker killed", 0.15, 0.02, 1, "")
+
+
+@pytest.mark.parametrize(
+    ("stop", "lines"),
+    [
+        (GOOD, []),
+        (dataclasses.replace(GOOD, time_s=0.21), ["time to rest at 0.2 rad/s"]),
+        (dataclasses.replace(GOOD, safety_mode=3), ["safety mode after stops at 0.2 rad/s"]),
+        (dataclasses.replace(GOOD, refusal="no"), ["recovery at 0.2 rad/s"]),
+    ],
+)
+def test_one_bad_stop_fails_its_line(stop, lines):
+    assert failed(judge_stops([GOOD, stop], 0.2)) == lines
+
+
+READING = Reading(SIX, 0.5, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("reading", "lines"),
+    [
+        (READING, []),
+        (dataclasses.replace(READING, mean=(8.0, *SIX[1:])), ["force at rest"]),
+        (dataclasses.replace(READING, force_sigma_n=9.0), ["force: 5 σ + bias"]),
+        (dataclasses.replace(READING, mean=(*SIX[:5], 0.3)), ["torque at rest"]),
+    ],
+)
+def test_a_wrench_without_a_load_fails_its_line(reading, lines):
+    assert failed(judge_rest([READING, reading], DELIVERED)) == lines
+
+
+@pytest.mark.parametrize(("force_n", "lines"), [(-19.6, []), (-12.0, ["hung mass"])])
+def test_a_hung_mass_is_weighed(force_n, lines):
+    after = dataclasses.replace(READING, mean=(0.0, 0.0, force_n, 0.0, 0.0, 0.0))
+    assert failed([judge_mass(READING, after, 2.0, DELIVERED)]) == lines
+
+
+def frames(period_s: float = 0.5, dead: int | None = None, noise_v: float = 0.001) -> list[Frame]:
+    found = []
+    for number in range(20):
+        channels = 0.5 + RANDOM.normal(0.0, noise_v, 8)
+        is_dead = np.array([position == dead for position in range(8)])
+        t_ns = round(number * period_s * 1e9)
+        found.append(
+            Frame(
+                channels=channels, raw=channels, t_begin_ns=t_ns, t_mid_ns=t_ns, t_arrival_ns=t_ns, seq=number,
+                saturated=is_dead & False, dead=is_dead, repeated=False,
+            )
+        )  # fmt: skip
+    return found
+
+
+@pytest.mark.parametrize(
+    ("seen", "lines"),
+    [
+        (frames(), []),
+        (frames(period_s=0.6), ["rate of right"]),
+        (frames(noise_v=0.05), ["noise of right"]),
+        (frames(dead=3), ["dead channels of right"]),
+    ],
+)
+def test_a_board_fails_its_line(seen, lines):
+    assert failed(judge_frames("right", seen, 0.5)) == lines
+
+
+def loads(torque_nm: float, noise_nm: float = 0.0005, rate_hz: float = 10.0) -> list[LoadSample]:
+    return [
+        LoadSample(0.0, torque_nm + noise_nm * RANDOM.normal(), round(n / rate_hz * 1e9), round(n / rate_hz * 1e9))
+        for n in range(40)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rest", "loaded", "lines"),
+    [
+        (loads(0.01), loads(0.11), []),
+        (loads(0.01), loads(-0.09), []),
+        (loads(0.01), loads(0.115), ["scale of the load cell"]),
+        (loads(0.01, rate_hz=12.0), loads(0.11), ["rate of the load cell"]),
+        (loads(0.01, noise_nm=0.004), loads(0.11), ["noise of the load cell"]),
+    ],
+)
+def test_the_load_cell_fails_its_line(rest, loaded, lines):
+    assert failed(judge_load(rest, loaded, 0.1, 10.0)) == lines
+
+
+@pytest.mark.parametrize(
+    ("after", "said", "lines"),
+    [
+        (Held(0.08, 0.05, 0.05), "counterclockwise", []),
+        (Held(0.08, -0.05, 0.05), "counterclockwise", ["sign of the load cell"]),
+        (Held(0.08, 0.05, -0.05), "counterclockwise", ["sign of the wrench"]),
+        (Held(-0.08, 0.05, 0.05), "counterclockwise", ["sign of the wrist"]),
+        (Held(0.08, 0.05, 0.05), "clockwise", ["sign of the command"]),
+    ],
+)
+def test_each_flipped_sign_fails_its_line(after, said, lines):
+    assert failed(judge_signs(Held(0.0, 0.0, 0.0), after, said)) == lines
+
+
+def held(stiffness: float, left_nm: float = 0.0) -> list[Held]:
+    angles = [0.0, *(0.08 * (-1) ** number for number in range(10)), 0.0]
+    found = [Held(angle, stiffness * angle, 0.0) for angle in angles]
+    return [*found[:-1], dataclasses.replace(found[-1], load_nm=left_nm)]
+
+
+@pytest.mark.parametrize(
+    ("turned", "lines"), [(held(0.8), []), (held(0.7), ["stiffness"]), (held(0.8, left_nm=0.02), ["slip in the grip"])]
+)
+def test_a_wrong_spring_and_a_slipping_grip_fail_their_lines(turned, lines):
+    assert failed(judge_twists(turned, 0.8)) == lines
+
+
+def test_five_gauges_make_a_table_of_widths():
+    gauges = [(10.0 + 40.0 * number, 100.0 - 20.0 * number) for number in range(5)]
+    line, supplied = judge_widths(gauges, SimpleNamespace(model="2F-140"))
+    assert (failed([line]), len(supplied.widths)) == ([], 5)
+    line, supplied = judge_widths([*gauges[:2], (90.0, 66.0), *gauges[3:]], SimpleNamespace(model="2F-140"))
+    assert (failed([line]), supplied.widths) == (["widths"], None)
+
+
+def test_the_robot_itself_bounds_every_motion():
+    limits = bounded(dataclasses.replace(DELIVERED), 1.0).limits
+    margin = limits.joints.margin_rad
+    assert limits.joints.lower_rad[5] + margin == pytest.approx(1.0 - LARGEST_RAD)
+    assert limits.joints.upper_rad[5] - margin == pytest.approx(1.0 + LARGEST_RAD)
+    assert limits.joints.upper_rad[:5] == DELIVERED.limits.joints.upper_rad[:5]
+    assert limits.wrist_speed_rad_per_s.inner <= LARGEST_RAD_PER_S
+    assert limits.linear_speed_m_per_s.inner == 0.05

@@ -1,0 +1,183 @@
+"""Stage 3: an empty gripper turns by 0.1 rad either way: noise at rest, delay, tracking, acceleration, slider."""
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from shearloop.daemon.commissioning import Line, Supplied
+from shearloop.drivers.ur.motion import ACCELERATION_S
+from shearloop.errors import UserError
+from shearloop.tools.commission.bounds import LARGEST_RAD
+from shearloop.tools.commission.context import Context
+from shearloop.tools.commission.observer import WRIST, Seen
+from shearloop.tools.commission.report import Measured, judged
+
+STAGE: Final = "3 empty gripper"
+SPEED_RAD_PER_S: Final = 0.2
+# Noise that many standard deviations high is rare enough for a threshold of rest.
+SIGMAS: Final = 4.0
+_LEAST_REST_RAD_PER_S: Final = 0.002
+TRACKING: Final = 0.03
+# Either way from the confirmed pose; the distance to the bound is for braking.
+TURN_RAD: Final = 0.08
+_SLIDER: Final = 0.5
+_COMES_TO_REST_S: Final = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One turn: when it was sent, what was asked, and its samples."""
+
+    sent_ns: int
+    asked_rad_per_s: float
+    samples: Sequence[Seen]
+
+    def delay_s(self, noise_rad_per_s: float) -> float:
+        """Return the time until the wrist moved, beyond the noise; infinite where it did not."""
+        for seen in self.samples:
+            if seen.made_ns >= self.sent_ns and abs(seen.wrist_rad_per_s) > noise_rad_per_s:
+                return (seen.made_ns - self.sent_ns) / 1e9
+        return math.inf
+
+    def cruise(self) -> list[float]:
+        """Return the speeds after the start and before the stop, as fractions of the asked one."""
+        fractions = [seen.wrist_rad_per_s / self.asked_rad_per_s for seen in self.samples]
+        fast = [number for number, one in enumerate(fractions) if one > 0.5]
+        if len(fast) < 10:
+            return fractions[fast[0] : fast[-1] + 1] if fast else []
+        quarter = (fast[-1] - fast[0]) // 4
+        return fractions[fast[0] + quarter : fast[-1] - quarter + 1]
+
+    def largest_acceleration(self) -> float:
+        """Return the largest change of the wrist's speed over `ACCELERATION_S`, in rad/s²."""
+        largest, first = 0.0, 0
+        for seen in self.samples:
+            while seen.outputs.timestamp_s - self.samples[first].outputs.timestamp_s > ACCELERATION_S + 1e-6:
+                first += 1
+            before = self.samples[first]
+            span_s = seen.outputs.timestamp_s - before.outputs.timestamp_s
+            if span_s > 0.5 * ACCELERATION_S:
+                largest = max(largest, abs(seen.wrist_rad_per_s - before.wrist_rad_per_s) / span_s)
+        return largest
+
+
+def measure(context: Context) -> Measured:
+    """Return the stage's lines, and the threshold of rest and the delays."""
+    rest = context.observer.listen(context.counts.rest_s)
+    noise_line, sigma_rad_per_s = judge_noise(rest, context.settings.rest_rad_per_s)
+    mover, middle_rad = context.ready(), context.pose_rad
+    count, speed = context.counts.turns, min(SPEED_RAD_PER_S, context.settings.limits.wrist_speed_rad_per_s.inner)
+    context.operator.allow(
+        f"wrist 3 turns {count} times between {middle_rad - TURN_RAD:.3f} and {middle_rad + TURN_RAD:.3f} rad at "
+        f"{speed:g} rad/s; the gripper is empty"
+    )
+    turns = []
+    mover.move("turn", rad_per_s=-speed, to_rad=middle_rad - TURN_RAD)
+    for number in range(count):
+        sign = 1.0 if number % 2 == 0 else -1.0
+        _come_to_rest(context)
+        asked_ns = mover.request("turn", rad_per_s=sign * speed, to_rad=middle_rad + sign * TURN_RAD)
+        sent = mover.event("sent", asked_ns, _COMES_TO_REST_S)
+        if (refusal := mover.ended(asked_ns)) or sent is None:
+            raise UserError(f"the wrist did not turn: {refusal}")
+        _come_to_rest(context)
+        turns.append(Turn(sent["t_ns"], sign * speed, context.observer.since(sent["t_ns"])))
+        context.observer.forget()
+    lines, supplies = judge_turns(turns, context, SIGMAS * sigma_rad_per_s)
+    rest_rad_per_s = max(_LEAST_REST_RAD_PER_S, round(SIGMAS * sigma_rad_per_s, 4))
+    return Measured(
+        [noise_line, *lines, _slider(context)], supplies.model_copy(update={"rest_rad_per_s": rest_rad_per_s})
+    )
+
+
+def judge_noise(samples: Sequence[Seen], rest_rad_per_s: float) -> tuple[Line, float]:
+    """Return the line on the speeds of an arm that stands, and the standard deviation of the noisiest joint."""
+    sigma = max(statistics.pstdev(seen.outputs.qd_rad_per_s[joint] for seen in samples) for joint in range(WRIST + 1))
+    line = judged(
+        "velocity noise at rest",
+        f"{SIGMAS:g} σ = {1e3 * SIGMAS * sigma:.2f} mrad/s",
+        f"below {1e3 * rest_rad_per_s:g} mrad/s",
+        "an arm that stands is known to stand",
+        passed=SIGMAS * sigma < rest_rad_per_s,
+        count=len(samples),
+    )
+    return line, sigma
+
+
+def judge_turns(turns: Sequence[Turn], context: Context, noise_rad_per_s: float) -> tuple[list[Line], Supplied]:
+    """Return the lines on delay, tracking and acceleration, and the delays."""
+    settings = context.settings
+    # The ramp takes some milliseconds to a speed that noise does not have.
+    threshold = max(noise_rad_per_s, 0.02 * SPEED_RAD_PER_S)
+    delays_s = sorted(turn.delay_s(threshold) for turn in turns)
+    p99_s = delays_s[math.ceil(0.99 * len(delays_s)) - 1]
+    fractions = [one for turn in turns for one in turn.cruise()]
+    reached = statistics.mean(fractions) if fractions else 0.0
+    acceleration = max(turn.largest_acceleration() for turn in turns)
+    hard = settings.limits.wrist_acceleration_rad_per_s2.hard
+    farthest = max(abs(seen.wrist_rad - context.pose_rad) for turn in turns for seen in turn.samples)
+    lines = [
+        judged(
+            "command to motion, p99",
+            f"{1e3 * p99_s:.1f} ms (median {1e3 * statistics.median(delays_s):.1f})",
+            f"at most reaction_s, {1e3 * settings.reaction_s:g} ms",
+            "the wrist brakes within its range",
+            passed=p99_s <= settings.reaction_s,
+            count=len(delays_s),
+        ),
+        judged(
+            "speed that is reached",
+            f"{reached:.3f} of the asked one",
+            f"1 ± {TRACKING:g}",
+            "the loop's gain",
+            passed=abs(reached - 1.0) <= TRACKING,
+            count=len(turns),
+        ),
+        judged(
+            "largest acceleration",
+            f"{acceleration:.2f} rad/s²",
+            f"at most {hard:g} rad/s²",
+            "no jerk on the tool",
+            passed=acceleration <= hard,
+            count=len(turns),
+        ),
+        judged(
+            "farthest from the pose",
+            f"{farthest:.3f} rad",
+            f"at most {LARGEST_RAD:g} rad",
+            "motions stay within their bounds",
+            passed=farthest <= LARGEST_RAD,
+            count=len(turns),
+        ),
+    ]
+    supplied = Supplied(actuation_s=round(statistics.median(delays_s), 4), reaction_s=round(p99_s, 4))
+    return lines, supplied if p99_s <= settings.reaction_s else Supplied()
+
+
+def _slider(context: Context) -> Line:
+    """Return the line on a motion at half speed, which has to be refused."""
+    mover, here_rad = context.mover, context.pose_rad
+    context.operator.act(f"Set the speed slider at the pendant to {_SLIDER:.0%}")
+    context.observer.wait_for(
+        lambda seen: abs(seen.outputs.speed_slider - _SLIDER) < 0.2, context.observer.latest().made_ns, 5.0
+    )
+    context.operator.allow(f"a turn of {TURN_RAD:g} rad at {SPEED_RAD_PER_S:g} rad/s, which has to be refused")
+    refusal = mover.ended(mover.request("turn", rad_per_s=SPEED_RAD_PER_S, to_rad=here_rad + TURN_RAD))
+    context.operator.act("Set the speed slider back to 100 %")
+    return judged(
+        "slider at 50 %",
+        refusal or "it turned",
+        "refused, with the slider's name",
+        "the loop's gain",
+        passed="slider" in refusal,
+    )
+
+
+def _come_to_rest(context: Context) -> None:
+    seen = context.observer.rest_since(
+        context.observer.latest().made_ns, context.settings.rest_rad_per_s, _COMES_TO_REST_S
+    )
+    if seen is None:
+        raise UserError("the arm does not come to rest: look at the teach pendant")

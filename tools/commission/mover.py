@@ -1,0 +1,154 @@
+"""The commissioning's end of `mover_process`: requests, events, and a clean start after each kill."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Final, Self
+
+from shearloop.drivers.ur.messages import encode
+from shearloop.drivers.ur.settings import UrSettings
+from shearloop.errors import UserError
+
+Event = dict[str, Any]
+# A controller unlocks a protective stop after 5 s; a worker starts and connects within some seconds more.
+READY_WITHIN_S: Final = 30.0
+_AGAIN_S: Final = 1.0
+_ENDS_WITHIN_S: Final = 6.0
+
+
+class MoveRefusedError(UserError):
+    """The robot did not carry out a motion; the message says why."""
+
+
+class Mover:
+    """Drives the robot through a process of its own; a context, which ends the process at its end."""
+
+    def __init__(self, settings: UrSettings) -> None:
+        """Take the settings whose limits bound every motion; nothing is started yet."""
+        self.settings = settings
+        self._process: subprocess.Popen[str] | None = None
+        self._reader: threading.Thread | None = None
+        self._worker = 0
+        self._events: list[Event] = []
+        self._changed = threading.Condition()
+
+    def __enter__(self) -> Self:
+        """Start the process."""
+        self.start()
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        """Stop the arm and end the process."""
+        self.end()
+
+    def start(self) -> None:
+        """Start a process and its worker, which sends the program to the robot where the robot is ready."""
+        command = [sys.executable, "-m", "shearloop.tools.commission.mover_process"]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._write(encode(self.settings).decode())
+        self._reader = threading.Thread(target=self._read, args=(self._process,), name="mover", daemon=True)
+        self._reader.start()
+
+    def _write(self, line: str) -> None:
+        if self._process is None or self._process.stdin is None:
+            raise UserError("the process that drives the robot does not run")
+        try:
+            self._process.stdin.write(line)
+            self._process.stdin.flush()
+        except BrokenPipeError as error:
+            raise UserError("the process that drives the robot has ended: read its last lines") from error
+
+    def _read(self, process: "subprocess.Popen[str]") -> None:
+        if process.stdout is None:
+            return
+        for line in process.stdout:
+            event: Event = json.loads(line)
+            with self._changed:
+                if event["event"] == "connected":
+                    self._worker = event["worker"]
+                self._events.append(event)
+                self._changed.notify_all()
+
+    def end(self) -> None:
+        """End the process: it stops the arm first."""
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_ENDS_WITHIN_S)
+        self.kill()
+
+    def kill(self) -> None:
+        """End the process and its worker at once; a stopped one ends too."""
+        for pid in (self._process.pid if self._process is not None else 0, self._worker):
+            if pid:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        self._worker = 0
+        if self._process is not None:
+            self._process.wait()
+        if self._reader is not None:
+            self._reader.join()
+        self._process = self._reader = None
+
+    def stop_worker(self) -> int:
+        """Stop the worker process by SIGSTOP, so that nobody feeds the robot's watchdog; return when."""
+        stopped_ns = time.monotonic_ns()
+        os.kill(self._worker, signal.SIGSTOP)
+        return stopped_ns
+
+    def event(self, kind: str, since_ns: int, within_s: float) -> Event | None:
+        """Return the first event of a kind since a moment, or None after `within_s`."""
+
+        def found() -> Event | None:
+            return next((one for one in self._events if one["event"] == kind and one["t_ns"] >= since_ns), None)
+
+        return self._wait(found, within_s)
+
+    def _wait(self, found: Callable[[], Event | None], within_s: float) -> Event | None:
+        until_s = time.monotonic() + within_s
+        with self._changed:
+            while (event := found()) is None:
+                left_s = until_s - time.monotonic()
+                if left_s <= 0 or not self._changed.wait(left_s):
+                    return None
+            return event
+
+    def request(self, do: str, **arguments: object) -> int:
+        """Send a request without waiting for its end; return its time."""
+        asked_ns = time.monotonic_ns()
+        self._write(f"{json.dumps({'do': do, **arguments})}\n")
+        return asked_ns
+
+    def ended(self, asked_ns: int, within_s: float = READY_WITHIN_S) -> str:
+        """Return why a request was refused or ended early, or an empty string."""
+        event = self.event("ended", asked_ns, within_s)
+        if event is not None:
+            return str(event["refusal"])
+        lost = self.event("lost", asked_ns, 0.0)
+        return str(lost["sentence"]) if lost is not None else f"the robot did not answer within {within_s:g} s"
+
+    def unlock(self, within_s: float = READY_WITHIN_S) -> str:
+        """Make the robot ready, again while it refuses; return why it is not ready, or an empty string."""
+        until_s = time.monotonic() + within_s
+        while (refusal := self.ended(self.request("unlock"), max(1.0, until_s - time.monotonic()))) and (
+            time.monotonic() + _AGAIN_S < until_s
+        ):
+            time.sleep(_AGAIN_S)
+        return refusal
+
+    def move(self, do: str, **arguments: object) -> int:
+        """Carry out a motion to its end; return when it was asked for. Raises MoveRefusedError."""
+        asked_ns = self.request(do, **arguments)
+        if refusal := self.ended(asked_ns):
+            raise MoveRefusedError(f"the motion was not carried out: {refusal}")
+        return asked_ns

@@ -1,0 +1,86 @@
+"""The stages of a commissioning in order: each is written into the report as soon as it has ended."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from shearloop.daemon.commissioning import Report, StageResult, identity_of
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.rig import open_settings
+from shearloop.drivers.ur.control_box import query_controller
+from shearloop.drivers.ur.settings import UrSettings
+from shearloop.errors import UserError
+from shearloop.tools.commission import boards, gripper, identity, motion, rtde, stops, tool, wrench
+from shearloop.tools.commission.context import Context, Counts
+from shearloop.tools.commission.operator import Operator
+from shearloop.tools.commission.report import Measured, open_report, save_report
+
+Measure = Callable[[Context], Measured]
+
+STAGES: Final[dict[str, Measure]] = {
+    identity.STAGE: identity.measure,
+    rtde.STAGE: rtde.measure,
+    gripper.STAGE: gripper.measure,
+    motion.STAGE: motion.measure,
+    stops.STAGE: stops.measure,
+    wrench.STAGE: wrench.measure,
+    boards.STAGE: boards.measure,
+    tool.STAGE: tool.measure,
+}
+
+
+def real_settings(config: DaemonConfig) -> UrSettings | None:
+    """Return the robot's settings with its real deadlines, also for an emulated robot; None without a robot."""
+    return open_settings(config.model_copy(update={"emulated_deadlines": "real"}))
+
+
+def commission(
+    config: DaemonConfig, path: Path, out: Path, operator: Operator, counts: Counts, only: Sequence[str] = ()
+) -> tuple[Report, Path]:
+    """Run the stages that the report in `out` lacks, up to the first that fails; return the report and its page.
+
+    `only` names stages by their first figures, and runs these again. The report is written after each stage. Raises
+    UserError for what keeps a stage from being measured, DriverError for a device that is not there.
+    """
+    settings = real_settings(config)
+    if settings is None:
+        raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
+    controller = query_controller(settings.host, settings.connect_timeout_s)
+    report = open_report(out, identity_of(config, controller.version, controller.serial_number))
+    if config.emulated:
+        operator.say("EMULATED: the report will say so.")
+    name = operator.ask("Your name:")
+    with ExitStack() as opened:
+        context = Context(config, settings, controller, operator, report, counts, opened)
+        for stage, measure in STAGES.items():
+            done = context.report.stage(stage[0])
+            if (done is not None and done.passed and stage[0] not in only) or (only and stage[0] not in only):
+                continue
+            if failed := [one.stage for one in context.report.stages if not one.passed and one.stage < stage]:
+                raise UserError(f"stage {failed[0]} failed: mend it and run it again before stage {stage}")
+            operator.say(f"Stage {stage}")
+            measured = measure(context)
+            result = StageResult(
+                stage=stage,
+                operator=name,
+                date=datetime.now(UTC),
+                lines=tuple(measured.lines),
+                supplies=measured.supplies,
+            )
+            context.report = context.report.with_stage(result)
+            page = save_report(out, context.report, not_measured(context.report))
+            for line in result.lines:
+                limit = f" (limit: {line.limit})" if line.limit else ""
+                operator.say(f"{line.verdict:<6} {line.what}: {line.value}{limit}")
+            if not result.passed:
+                operator.say(f"Stage {stage} failed: mend the cause, and run the commissioning again.")
+                break
+    page = save_report(out, context.report, not_measured(context.report))
+    return context.report, page
+
+
+def not_measured(report: Report) -> list[str]:
+    """Return the stages that a report lacks."""
+    return [stage for stage in STAGES if report.stage(stage[0]) is None]

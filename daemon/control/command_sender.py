@@ -1,4 +1,4 @@
-"""Sends wrist speeds and stops to the robot's process, and reports the sent speeds to the control loop."""
+"""Sends wrist speeds and stops to the robot's process, and keeps the speed that it accepted last."""
 
 import asyncio
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from shearloop.drivers.ur.messages import CommandReply, Stop, WristSpeed
 
 @dataclass(slots=True)
 class CommandSender:
-    """Sends wrist velocities and stops to the robot's process, and reports the results to the control loop."""
+    """Sends wrist speeds and stops to the robot's process; a refusal is a fault of the control loop."""
 
     robot: UrRobot
     control_loop: ControlLoop
@@ -61,7 +61,6 @@ class CommandSender:
             if isinstance(reply.sent, Stop):
                 self.stops.on_sent(self.clock.now_ns())
             self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-            self.control_loop.on_speed_sent(self.sent_rad_per_s)
         except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
             self._fail(error)
 

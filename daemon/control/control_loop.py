@@ -158,10 +158,6 @@ class ControlLoop:
         """Take a fault that no input shows, for the next tick."""
         self._reported.append(Fault(code, detail))
 
-    def on_speed_sent(self, wrist_rad_per_s: float) -> None:
-        """Take the wrist speed that was sent, after all clipping."""
-        self.wrist.on_speed_sent(wrist_rad_per_s)
-
     def on_action_ended(self, error: str | None = None) -> None:
         """Take the end of the present action, and why it failed, if it did."""
         experiment, arm, gripped = self.experiment, self.inputs.arm, self._gripped
@@ -339,8 +335,13 @@ class ControlLoop:
         self._gripped.release_error = None
         self.safety.acknowledge()
 
-    def tick(self, t_ns: int, late_s: float = 0.0) -> ControlOutput:
-        """Return the commands for now; the loop is `late_s` late."""
+    def tick(self, t_ns: int, late_s: float = 0.0, sent_rad_per_s: float | None = None) -> ControlOutput:
+        """Return the commands for now; the loop is `late_s` late.
+
+        `sent_rad_per_s` is the wrist speed that the robot's process accepted last, None while it has not answered.
+        """
+        if sent_rad_per_s is not None:
+            self.wrist.sent(sent_rad_per_s)
         running, arm, gripped = self.running, self.inputs.arm, self._gripped
         self.inputs.late_s = late_s
         watched = self._watched

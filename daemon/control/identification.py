@@ -8,6 +8,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.samples import TorqueSource
+from shearloop.daemon.control.wrist_limit import WristLimit
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.errors import UserError
 
@@ -269,6 +270,7 @@ class StiffnessExcitation:
         self._settings = settings
         self._source = source
         self._config = config
+        self._limit = WristLimit.of(config)
         self.result: ToolModel | None = None
         self.failure: str | None = None
         self._origin_ns = 0
@@ -341,11 +343,8 @@ class StiffnessExcitation:
             if now_s - self._arrived_s >= dwell_s:
                 self._end_leg()
             return 0.0
-        own = self._config
-        fastest = own.wrist_speed_rad_per_s
-        speed = max(-fastest, min(fastest, own.angle_bandwidth_per_s * missing_rad))
-        turning = abs(self._speed) if self._speed * speed > 0.0 else 0.0
-        return math.copysign(min(abs(speed), turning + own.planned_acceleration_rad_per_s2 * elapsed_s), speed)
+        wanted = self._limit.clip(self._config.angle_bandwidth_per_s * missing_rad)
+        return self._limit.speed_up(self._speed, wanted, elapsed_s)
 
     def _end_leg(self) -> None:
         self._leg, self._arrived_s = self._leg + 1, None

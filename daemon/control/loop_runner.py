@@ -277,7 +277,8 @@ class ControlLoopRunner:
         # From decision to decision, so that a slow decision is late as well.
         late_s = (now_ns - self._decided_ns) / 1e9 - (LONGEST_REST_S if self._stopped else LONGEST_TICK_S)
         self._decided_ns = now_ns
-        output = self._control_loop.tick(now_ns, max(0.0, late_s))
+        sent_rad_per_s = None if self._sender.unanswered else self._sender.sent_rad_per_s
+        output = self._control_loop.tick(now_ns, max(0.0, late_s), sent_rad_per_s)
         if output.ends_motion:
             self._stop(output, now_ns)
         else:

@@ -34,6 +34,7 @@ from statistics import fmean
 import numpy as np
 
 from shearloop.daemon.control.samples import TorqueSample
+from shearloop.daemon.control.wrist_limit import WristLimit
 from shearloop.errors import UserError
 
 # The ramp does not catch up when the loop was late for longer than this.
@@ -80,8 +81,7 @@ class ControllerSettings:
     # The wrist is held when the torque at a fixed angle has moved by this much: slip, or a screw that broke loose.
     offset_limit_nm: float = math.inf
     torque_limit_nm: float
-    speed_limit_rad_per_s: float
-    acceleration_limit_rad_per_s2: float
+    wrist_limit: WristLimit
     # From the angle at the start, either way.
     travel_limit_rad: float
     # A measurement that is older than this on arrival is refused.
@@ -374,18 +374,16 @@ class TorqueController:
         wanted = 0.0
         if self._moving:
             wanted = (own.wrist_bandwidth_per_s * missing_nm + slope) / own.stiffness_nm_per_rad
-        speed = max(-own.speed_limit_rad_per_s, min(own.speed_limit_rad_per_s, wanted))
-        reasons = [ControllerReason.SPEED] if speed != wanted else []
-        # Only speeding up is limited; braking is not.
-        turning = abs(self._sent) if speed * self._sent > 0.0 else 0.0
-        fastest = turning + own.acceleration_limit_rad_per_s2 * elapsed_s
+        clipped = own.wrist_limit.clip(wanted)
+        reasons = [ControllerReason.SPEED] if clipped != wanted else []
+        speed = own.wrist_limit.speed_up(self._sent, clipped, elapsed_s)
         # Slow down towards the limit of the travel, so that one period does not overshoot it.
         travel = self._angle_rad - self.filter.origin_rad
         room = max(own.travel_limit_rad - travel * math.copysign(1.0, speed), 0.0)
         brakeable = own.wrist_bandwidth_per_s * room
-        if min(abs(speed), fastest) > brakeable:
+        if abs(speed) > brakeable:
             reasons.append(ControllerReason.TRAVEL)
-        speed = math.copysign(min(abs(speed), fastest, brakeable), speed)
+            speed = math.copysign(brakeable, speed)
         self._wanted, self._sent, self._clipped = wanted, speed, abs(wanted) - abs(speed) > 1e-9
         return WristCommand(speed, tuple(reasons))
 
@@ -396,6 +394,6 @@ class TorqueController:
         if blocked or elapsed_s <= 0.0:
             return ramp_nm, 0.0
         towards = math.copysign(1.0, set_point_nm - ramp_nm)
-        turning = max(self._sent * towards, 0.0) + own.acceleration_limit_rad_per_s2 * elapsed_s
+        turning = max(self._sent * towards, 0.0) + own.wrist_limit.acceleration_rad_per_s2 * elapsed_s
         slope = min(own.ramp_nm_per_s, own.stiffness_nm_per_rad * turning, abs(set_point_nm - ramp_nm) / elapsed_s)
         return ramp_nm + towards * slope * elapsed_s, towards * slope

@@ -10,10 +10,12 @@ from shearloop.daemon.control.margins import gain_for_noise, integral_gain, marg
 from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.control.torque_controller import (
     LONGEST_STEP_NS,
+    ControllerReason,
     ControllerSettings,
     TorqueController,
     WristCommand,
 )
+from shearloop.daemon.control.wrist_limit import WristLimit
 from shearloop.daemon.loop_config import LoopConfig
 
 # Torques that wait for the next wrist angle.
@@ -37,6 +39,7 @@ class WristController:
         self.tracked: TrackTorque | None = None
         self._torque_limit_nm = 0.0
         self._config = config
+        self._limit = WristLimit.of(config)
         self._held = False
         # Torques wait for the next angle.
         self._pending: deque[TorqueSample] = deque(maxlen=MOST_PENDING)
@@ -53,8 +56,8 @@ class WristController:
         if self.controller is not None:
             self._pending.append(torque)
 
-    def on_speed_sent(self, speed_rad_per_s: float) -> None:
-        """Store the speed that was sent, after all clipping."""
+    def sent(self, speed_rad_per_s: float) -> None:
+        """Take the speed that the robot's process accepted last."""
         self._sent_rad_per_s = speed_rad_per_s
         if self.controller is not None:
             self.controller.sent(speed_rad_per_s)
@@ -142,9 +145,8 @@ class WristController:
     def _clipped(self, speed_rad_per_s: float) -> WristCommand:
         if not math.isfinite(speed_rad_per_s):
             return WristCommand(0.0, ("the wanted speed is not a number",))
-        limit = self._config.wrist_speed_rad_per_s
-        clipped = max(-limit, min(limit, speed_rad_per_s))
-        reasons = () if clipped == speed_rad_per_s else (f"the wrist turns no faster than {limit:g} rad/s",)
+        clipped = self._limit.clip(speed_rad_per_s)
+        reasons = () if clipped == speed_rad_per_s else (ControllerReason.SPEED,)
         return WristCommand(clipped, reasons)
 
 
@@ -170,7 +172,6 @@ def controller_settings(
         creep_limit_nm_per_s=CREEP_LIMIT_NM_PER_S,
         offset_limit_nm=config.max_offset_drift_nm,
         torque_limit_nm=torque_limit_nm,
-        speed_limit_rad_per_s=config.wrist_speed_rad_per_s,
-        acceleration_limit_rad_per_s2=config.planned_acceleration_rad_per_s2,
+        wrist_limit=WristLimit.of(config),
         travel_limit_rad=TRAVEL_LIMIT_RAD,
     )

@@ -186,7 +186,7 @@ class UncompensatedController:
         self._ramp_nm += max(-most, min(most, self._set_point_nm - self._ramp_nm))
         goal = self._origin_rad + (self._ramp_nm - self._offset_nm) / settings.stiffness_nm_per_rad
         speed = settings.wrist_bandwidth_per_s * (goal - wrist_angle_rad)
-        return WristCommand(max(-settings.speed_limit_rad_per_s, min(settings.speed_limit_rad_per_s, speed)))
+        return WristCommand(settings.wrist_limit.clip(speed))
 
 
 LoopController: TypeAlias = TorqueController | UncompensatedController

@@ -136,9 +136,8 @@ class SkinLoop:
                 self._zero_begun = False
                 self.control_loop.on_action_ended()
         self.control_loop.on_arm(ArmStatus(self._angle_rad, self.t_ns))
-        orders = self.control_loop.tick(self.t_ns)
+        orders = self.control_loop.tick(self.t_ns, sent_rad_per_s=self._speeds[-1])
         speed = 0.0 if orders.ends_motion else orders.wrist_rad_per_s
-        self.control_loop.on_speed_sent(speed)
         self._speeds.append(speed)
         if isinstance(orders.action, TareStep):
             self.estimator.tare()

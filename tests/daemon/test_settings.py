@@ -129,7 +129,7 @@ def test_the_wrists_acceleration_reaches_controller_identification_and_robot(whe
     loop = make_loop(config, robot_settings(tmp_path / "ur.yaml"), {"right": source}, {})
     assert loop.config.wrist_acceleration_rad_per_s2 == 1.5, "sent to the robot"
     tuned = controller_settings(loop.config, FOUND, source, TrackTorque(0.1, 0.05), 0.5)
-    assert tuned.acceleration_limit_rad_per_s2 == 0.75
+    assert tuned.wrist_limit.acceleration_rad_per_s2 == 0.75
     wrist = WristController(source, loop.config)
     wrist.begin_identification(IdentifyStep(do="identify"), 0.5)
     wrist.excitation.command(0, 0.0)

@@ -4,6 +4,7 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController
+from shearloop.daemon.control.wrist_limit import WristLimit
 
 DEFAULTS: dict[str, Any] = {
     "stiffness_nm_per_rad": 0.25,
@@ -19,8 +20,7 @@ DEFAULTS: dict[str, Any] = {
     "creep_limit_nm_per_s": 0.005,
     "offset_limit_nm": 0.06,
     "torque_limit_nm": 0.2,
-    "speed_limit_rad_per_s": 0.6,
-    "acceleration_limit_rad_per_s2": 2.0,
+    "wrist_limit": WristLimit(speed_rad_per_s=0.6, acceleration_rad_per_s2=2.0),
     "travel_limit_rad": 1.0,
 }
 

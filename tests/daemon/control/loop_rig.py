@@ -64,9 +64,8 @@ class Rig:
             if self.tick >= due:
                 self.pending.remove((due, action))
                 self._finish(action)
-        orders = self.orders = self.control_loop.tick(self.t_ns)
+        orders = self.orders = self.control_loop.tick(self.t_ns, sent_rad_per_s=self.speed)
         self.speed = 0.0 if orders.ends_motion else orders.wrist_rad_per_s
-        self.control_loop.on_speed_sent(self.speed)
         if orders.release:
             self.force_n = 0.0
         if orders.action is not None:

@@ -175,7 +175,7 @@ def test_no_command_is_ever_beyond_a_limit(script):
         match kind:
             case "advance":
                 for speed in bench.advance(abs(value)):
-                    assert abs(speed) <= own.speed_limit_rad_per_s
+                    assert abs(speed) <= own.wrist_limit.speed_rad_per_s
             case "measure":
                 bench.measure(0.3 * value)
             case "wild":
@@ -198,12 +198,12 @@ def test_no_command_is_ever_beyond_a_limit(script):
         command = controller.command(bench.t_ns, bench.angle)
         bench.speed = command.speed_rad_per_s
         assert math.isfinite(bench.speed)
-        assert abs(bench.speed) <= own.speed_limit_rad_per_s
+        assert abs(bench.speed) <= own.wrist_limit.speed_rad_per_s
         assert not bench.speed or {ControllerReason.TRAVEL, ControllerReason.SPEED}.issuperset(command.reasons)
         travel = bench.angle - 0.3
         assert not (abs(travel) >= own.travel_limit_rad and travel * bench.speed > 0.0)
         if kind not in ("sent", "late"):  # speeding up is limited from what was really sent
-            assert abs(bench.speed) <= abs(last) + own.acceleration_limit_rad_per_s2 * 0.05 + 1e-9
+            assert abs(bench.speed) <= abs(last) + own.wrist_limit.acceleration_rad_per_s2 * 0.05 + 1e-9
 
 
 def test_the_wrist_comes_to_rest_at_the_limit_of_its_travel():

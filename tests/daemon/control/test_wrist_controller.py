@@ -32,7 +32,7 @@ def test_a_held_angle_is_kept():
     one, angle_rad, errors_rad = wrist(), 0.0, []
     for cycle in range(1000):
         speed = one.turn(MoveToAngle(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad, 0.0).speed_rad_per_s
-        one.on_speed_sent(speed)
+        one.sent(speed)
         angle_rad += speed * CYCLE_NS / 1e9
         errors_rad.append(abs(angle_rad - 0.15))
     # From two seconds after the arrival on.
@@ -50,7 +50,7 @@ def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(allowed_rad_
         for _ in range(2 * cycles):
             speed = one.turn(MoveToAngle(goal_rad, allowed_rad_per_s), t_ns, angle_rad, 0.0).speed_rad_per_s
             assert abs(speed) <= allowed_rad_per_s
-            one.on_speed_sent(speed)
+            one.sent(speed)
             angle_rad += speed * CYCLE_NS / 1e9
             t_ns += CYCLE_NS
         assert angle_rad == pytest.approx(goal_rad, abs=1.5 * CLOSE_RAD)
@@ -85,6 +85,6 @@ def test_each_torque_has_its_own_ramp_and_limit():
         t_ns = 10**9 + cycle * CYCLE_NS
         one.on_torque(TorqueSample("load_cell", 0.2 * angle_rad, "", t_ns - CYCLE_NS // 2, t_ns))
         speed = one.turn(TrackTorque(0.3, 0.01), t_ns, angle_rad, 0.0).speed_rad_per_s
-        one.on_speed_sent(speed)
+        one.sent(speed)
         angle_rad += speed * CYCLE_NS / 1e9
     assert 0.2 * angle_rad == pytest.approx(0.01 * 500 * CYCLE_NS / 1e9, rel=0.15)

@@ -18,7 +18,7 @@ from shearloop.errors import UserError
 RETRY_S = 0.05
 # Before ordinary programs, behind the system's own.
 NICENESS = -10
-# Many times what the daemon and all its clients use; see `messaging/bound_sockets.py`.
+# Many times what the daemon and all its clients use.
 MAX_DESCRIPTORS = 4096
 _PR_SET_PDEATHSIG = 1
 _MCL_CURRENT, _MCL_FUTURE = 1, 2

@@ -135,12 +135,11 @@ class CommandServer:
         self._socket.setsockopt(zmq.LINGER, 100)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_REQUEST_BYTES)
         self._socket.setsockopt(zmq.RCVHWM, MAX_WAITING)
-        self._connections = bind(context, self._socket, address, "commands", refusals, keys)
+        bind(self._socket, address, "commands", keys)
 
     async def run(self) -> None:
         """Serve requests until cancelled; a slow command such as `unlock` does not delay a `stop`."""
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._connections.run())
             while True:
                 parts = await self._socket.recv_multipart()
                 # Receiving a message that has already arrived does not yield to other tasks.
@@ -169,5 +168,4 @@ class CommandServer:
 
     def close(self) -> None:
         """Close the socket after the last replies are sent."""
-        self._connections.close()
         self._socket.close()

@@ -13,15 +13,12 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_map
-from shearloop.daemon.messaging.refusals import Refusals, is_logged
+from shearloop.daemon.messaging.refusals import is_logged
 
 # Messages kept for a slow subscriber. It loses later ones; others are not delayed.
 HIGH_WATER_MARK = 1000
 # A subscription is a topic's beginning, after 25 bytes of handshake or 300 with CURVE. Longer ones end the connection.
 LARGEST_SUBSCRIPTION_BYTES, LARGEST_WITH_KEYS_BYTES = 64, 512
-# A client that subscribes to one more topic that does not exist is disconnected. libzmq keeps every subscription, and
-# walks through each byte of all of them for each client that disconnects.
-MAX_UNKNOWN_TOPICS = 16
 # The last messages may wait this long for their subscribers.
 LINGER_MS = 200
 # Subscriptions read at a time, so that a subscriber that keeps changing them cannot block the publisher.
@@ -45,9 +42,7 @@ class Publisher:
         self._listeners: list[tuple[Listener, bool]] = []
         # Topic beginnings that have subscribers.
         self._prefixes: tuple[bytes, ...] = ()
-        # Topics that do not exist and have subscribers.
-        self._unknown: set[bytes] = set()
-        self._refusals = Refusals()
+        self._errors: Counter[str] = Counter()
         # An XPUB socket is a PUB socket that also receives the subscriptions.
         self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
         largest = LARGEST_SUBSCRIPTION_BYTES if keys is None else LARGEST_WITH_KEYS_BYTES
@@ -57,22 +52,20 @@ class Publisher:
         # Every subscription is passed on, even if another client has the same.
         self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
         self._socket.setsockopt(zmq.LINGER, 0)
-        self._connections = bind(context, self._socket, address, "publish", self._refusals, keys)
+        bind(self._socket, address, "publish", keys)
 
     async def run(self) -> None:
-        """Bound the number of subscribers and of their topics until cancelled."""
+        """Read the subscriptions until cancelled."""
         arrived = zmq.asyncio.Socket.from_socket(self._socket)
-        async with asyncio.TaskGroup() as group:
-            group.create_task(self._connections.run())
-            while True:
-                await arrived.poll()
-                self._read_subscriptions()
-                # Subscriptions that have already arrived do not yield to other tasks.
-                await asyncio.sleep(0)
+        while True:
+            await arrived.poll()
+            self._read_subscriptions()
+            # Subscriptions that have already arrived do not yield to other tasks.
+            await asyncio.sleep(0)
 
     def diagnostics(self) -> Mapping[str, Mapping[str, int]]:
-        """Return the refused subscribers and the listeners' errors for `health`."""
-        return self._refusals.diagnostics()
+        """Return the listeners' errors for `health`."""
+        return {"errors": dict(self._errors)}
 
     def add_listener(self, listener: Listener, *, raises: bool = False) -> None:
         """Call `listener` with topic and content of each message from now on.
@@ -104,8 +97,8 @@ class Publisher:
 
     def _on_listener_error(self, topic: str) -> None:
         """Count the present exception, and log it at counts 1, 10, 100 and so on."""
-        self._refusals.counts[LISTENER_FAILED] += 1
-        count = self._refusals.counts[LISTENER_FAILED]
+        self._errors[LISTENER_FAILED] += 1
+        count = self._errors[LISTENER_FAILED]
         if is_logged(count):
             structlog.get_logger().exception("a listener of the messages failed", topic=topic, count=count)
 
@@ -122,23 +115,15 @@ class Publisher:
 
     def close(self) -> None:
         """Close the socket; subscribers have a moment to take the last messages."""
-        self._connections.close()
         self._socket.close(linger=LINGER_MS)
 
     def _read_subscriptions(self) -> None:
         for _ in range(SUBSCRIPTIONS_AT_ONCE):
             if not int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
                 return
-            message = self._socket.recv(zmq.NOBLOCK, copy=False)
-            kind, prefix = message.bytes[:1], message.bytes[1:]
+            message = self._socket.recv(zmq.NOBLOCK)
+            kind, prefix = message[:1], message[1:]
             if kind == b"\x00":
                 self._prefixes = tuple(one for one in self._prefixes if one != prefix)
-                self._unknown.discard(prefix)
             elif kind == b"\x01" and any(topic.encode().startswith(prefix) for topic in TOPICS):
                 self._prefixes = tuple({*self._prefixes, prefix})
-            elif kind == b"\x01":
-                self._unknown.add(prefix)
-                # Some of its subscriptions may still come after its end.
-                if len(self._unknown) > MAX_UNKNOWN_TOPICS and self._connections.disconnect(message.get(zmq.SRCFD)):
-                    reason = f"a subscriber was disconnected: there are {MAX_UNKNOWN_TOPICS} topics without messages"
-                    self._refusals.add("too many unknown topics", reason, frequent=True)

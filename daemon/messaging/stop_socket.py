@@ -52,9 +52,15 @@ class StopSocket:
 
     def _reply(self, client: Any, reply: Reply) -> None:
         try:
-            # Unread replies of a shared socket would fill its send buffer, and then no client could get one.
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as own:
-                own.sendto(encode(reply), client)
+            try:
+                # Unread replies of a shared socket would fill its send buffer, and then no client could get one.
+                own = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+            except OSError:
+                # A flood of clients has taken every descriptor.
+                self._socket.sendto(encode(reply), client)
+            else:
+                with own:
+                    own.sendto(encode(reply), client)
         except OSError:
             self._refusals.counts["client does not read its replies"] += 1
 

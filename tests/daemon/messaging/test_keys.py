@@ -23,7 +23,6 @@ from shearloop.daemon.messaging.keys import (
     load_server_keys,
 )
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.errors import UserError
 from tests.fixtures.daemons import DEADLINE_S, running_daemon
@@ -57,7 +56,7 @@ def test_valid_ports():
         assert not has_valid_port(f"tcp://127.0.0.1:{port}"), port
     assert not has_valid_port("tcp://127.0.0.1")
     with zmq.Context() as context, pytest.raises(UserError, match=r"has no valid port \(a whole number"):
-        bind(context, context.socket(zmq.PUB), "tcp://127.0.0.1:70000", "publish", Refusals())
+        bind(context.socket(zmq.PUB), "tcp://127.0.0.1:70000", "publish")
 
 
 @pytest.mark.parametrize("command", ["run", "check"])

@@ -143,29 +143,6 @@ async def test_a_subscriber_is_iterated_with_and_without_asyncio(publisher, tmp_
     until(lambda: not publisher.has_subscribers())
 
 
-def test_a_client_with_many_unknown_topics_is_disconnected(publisher, connect, tmp_path):
-    with connect("health") as known, socket.socket(socket.AF_UNIX) as stranger:
-        until(lambda: publisher.has_subscriber("health"))
-        stranger.connect(f"{tmp_path}/publish")
-        # ZMTP 3.0: the greeting without security, then READY.
-        stranger.sendall(b"\xff%b\x7f\x03\x00NULL%b" % (bytes(8), bytes(48)))
-        stranger.sendall(b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB")
-        answer = b""
-        while b"XPUB" not in answer:
-            answer += stranger.recv(1000)
-
-        def subscribe() -> None:
-            for number in range(100_000):
-                stranger.sendall(b"\x00\x33\x01%050d" % number)
-                publisher.publish(sample(LoadTorque))
-
-        with pytest.raises(ConnectionError):
-            subscribe()
-        assert publisher.diagnostics() == {"errors": {"too many unknown topics": 1}}
-        publisher.forward("health", {"number": 1})
-        assert known.recv_multipart()[0] == b"health"
-
-
 async def test_an_ipc_path_that_is_removed_while_it_is_looked_at_is_bound(tmp_path, monkeypatch):
     path = tmp_path / "publish"
     with socket.socket(socket.AF_UNIX) as left:

@@ -73,9 +73,9 @@ def test_opening_the_gripper_lets_the_torque_go_for_good(joint, at_rad, again_ra
     st.sampled_from(Joint),
     st.lists(st.tuples(st.floats(-3, 3), st.floats(0, 60), st.floats(0.001, 5)), min_size=1, max_size=30),
 )
-def test_the_torque_never_exceeds_what_the_grip_bears(joint, story):
+def test_the_torque_never_exceeds_what_the_grip_bears(joint, moves):
     twin = Twin(TwinSettings(joint=joint))
-    for wrist_rad, force_n, dt_s in story:
+    for wrist_rad, force_n, dt_s in moves:
         state = twin.step(dt_s, wrist_rad, force_n)
         assert math.isfinite(state.torque_nm)
         assert abs(state.torque_nm) <= 0.012 * force_n + 1e-6

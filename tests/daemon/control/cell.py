@@ -19,7 +19,7 @@ from shearloop.daemon.control.samples import GripperStatus, TorqueSample
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, MoveLinear, RobotState, WristSpeed
-from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm, Flight
+from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS, FakeArm, HandlerBench
 
 SPEED_M_PER_S = 0.1
 # Steps of experiments.
@@ -33,13 +33,13 @@ class Robot(UrRobot):
 
     def __init__(self, arm: FakeArm | None = None) -> None:
         super().__init__(SETTINGS)
-        self.flight = Flight(arm=arm)
+        self.bench = HandlerBench(arm=arm)
         self.commands: list[Command] = []
         self.dies_of: Exception | None = None
         self._goal: MoveLinear | None = None
         # How many cycles a straight move goes on after it was told to stop, ever slower than a joint at rest.
         self.brakes_for = 0
-        self.flight.fly(5)
+        self.bench.run(5)
         self._held: list[tuple[asyncio.Future[CommandReply], CommandReply]] = []
         self._unread: list[RobotState] = []
         # For how many cycles there is no process yet.
@@ -59,7 +59,7 @@ class Robot(UrRobot):
     def _obey(self, command: Command, replied: asyncio.Future[CommandReply]) -> None:
         if isinstance(command, MoveLinear):
             self._goal = command
-        reply = self.flight.ask(command)
+        reply = self.bench.ask(command)
         if isinstance(command, WristSpeed):
             # Its reply comes with the next state.
             self._held.append((replied, reply))
@@ -68,7 +68,7 @@ class Robot(UrRobot):
 
     def keep_moving(self) -> None:
         if self.state is not None and self.state.motion == "linear":
-            self.flight.handler.request(0, Heartbeat(), self.flight.arm.reading, self.flight.now_ns)
+            self.bench.handler.request(0, Heartbeat(), self.bench.arm.reading, self.bench.now_ns)
 
     def die(self, gone_for: int) -> None:
         """End the process with all that it has not said; the next one is there after so many cycles."""
@@ -80,16 +80,16 @@ class Robot(UrRobot):
 
     def cycle(self, *, read: bool = True) -> None:
         """Let 8 ms pass, and tell who waits for the next state; what is not read now is read with the next one."""
-        arm = self.flight.arm
+        arm = self.bench.arm
         if self.gone_for:
             self.gone_for -= 1
-            self.flight.be_alone()
+            self.bench.run_without_handler()
             if not self.gone_for:
-                self.flight.begin_anew()
+                self.bench.replace_handler()
             return
         # A real arm's move is under way until its end is told, though its joints rest.
         arm.stops_moves = not self.brakes_for
-        if self.brakes_for and self.flight.state.motion == "stopping":
+        if self.brakes_for and self.bench.state.motion == "stopping":
             self.brakes_for -= 1
             arm.be(moving_linearly=bool(self.brakes_for))
         elif arm.reading.moving_linearly and self._goal is not None:
@@ -98,10 +98,10 @@ class Robot(UrRobot):
             missing_m = self._goal.pose[2] - z
             z += math.copysign(min(step_m, abs(missing_m)), missing_m)
             arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
-        arm.be(t_mono_ns=self.flight.now_ns)
+        arm.be(t_mono_ns=self.bench.now_ns)
         # A straight move goes on as long as the loop decides so.
-        self.flight.fly(1, daemon_alive=self.flight.state.motion != "linear")
-        self._unread.append(self.flight.state)
+        self.bench.run(1, daemon_alive=self.bench.state.motion != "linear")
+        self._unread.append(self.bench.state)
         if not read:
             return
         held, self._held = self._held, []
@@ -117,18 +117,18 @@ class Robot(UrRobot):
 
     @property
     def z_m(self) -> float:
-        return self.flight.arm.reading.tcp_pose[2]
+        return self.bench.arm.reading.tcp_pose[2]
 
 
 class StepClock(Clock):
     """The robot's time, which stands between its cycles."""
 
-    def __init__(self, flight: Flight) -> None:
+    def __init__(self, bench: HandlerBench) -> None:
         super().__init__()
-        self._flight = flight
+        self._bench = bench
 
     def now_ns(self) -> int:
-        return self._flight.now_ns
+        return self._bench.now_ns
 
 
 class Gripper:
@@ -200,7 +200,7 @@ class Cell:
         self.control_loop = control_loop or ControlLoop(
             LoopConfig(), {WRENCH: source}, ("robot",), dead_tasks=self.died
         )
-        clock = StepClock(self.robot.flight)
+        clock = StepClock(self.robot.bench)
         self.runner = ControlLoopRunner(self.control_loop, self.robot, self.gripper, {}, self.published, clock)
         self.task: asyncio.Task[None] | None = None
         self.holding = True
@@ -216,7 +216,7 @@ class Cell:
     def sense(self) -> None:
         """Take what the sensors measure before a state of the robot."""
         width_mm = 30.0 if self.holding else 140.0
-        status = GripperStatus(self.robot.flight.now_ns, width_mm, holding=self.holding, moving=False)
+        status = GripperStatus(self.robot.bench.now_ns, width_mm, holding=self.holding, moving=False)
         self.control_loop.on_gripper(status)
 
     async def cycles(self, count: int) -> None:
@@ -230,7 +230,7 @@ class Cell:
 
     def exceed_torque(self) -> None:
         """Measure a torque beyond the limit."""
-        now_ns = self.robot.flight.now_ns
+        now_ns = self.robot.bench.now_ns
         self.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
 
     async def start(self, *steps: Mapping[str, Any], **keys: Any) -> None:
@@ -260,7 +260,7 @@ class Cell:
 
     @property
     def state(self) -> RobotState:
-        return self.robot.flight.state
+        return self.robot.bench.state
 
 
 def no_tick(*_: object) -> ControlOutput:

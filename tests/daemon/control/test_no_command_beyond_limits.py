@@ -17,7 +17,7 @@ from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 from shearloop.emulators.scene import Twin, TwinSettings
 from tests.daemon.control.cell import GRIP, Cell, Gripper, driven
 from tests.daemon.control.loop_rig import EIT, new_loop
-from tests.drivers.ur.flight import CYCLE_NS, LIMITS, FakeArm
+from tests.drivers.ur.handler_bench import CYCLE_NS, LIMITS, FakeArm
 
 SPEEDS = st.floats(0.01, 3.14)
 STEPS = st.one_of(
@@ -116,12 +116,12 @@ class WholeRig(Cell):
 
     def sense_gripper(self) -> None:
         holding = self.gripper.force_n > 0
-        status = GripperStatus(self.robot.flight.now_ns, 20.0, holding=holding, moving=False, fault=self.fault)
+        status = GripperStatus(self.robot.bench.now_ns, 20.0, holding=holding, moving=False, fault=self.fault)
         self.control_loop.on_gripper(status)
 
     def sense(self) -> None:
         self.number += 1
-        now_ns, reading = self.robot.flight.now_ns, self.arm.reading
+        now_ns, reading = self.robot.bench.now_ns, self.arm.reading
         torque_nm = self.twin.step(CYCLE_NS / 1e9, reading.wrist_rad, self.gripper.force_n).torque_nm
         self.arm.be(wrench=(0.0, 0.0, 0.0, 0.0, 0.0, torque_nm))
         self.sense_gripper()
@@ -158,11 +158,11 @@ FAULTS: dict[str, Callable[[WholeRig], Any]] = {
 }
 
 
-async def tell(steps: list[dict[str, Any]], story: list[tuple[int, str]], **keys: Any) -> None:
+async def run_scenario(steps: list[dict[str, Any]], faults: list[tuple[int, str]], **keys: Any) -> None:
     async with driven(cell=WholeRig()) as rig:
         await rig.cycles(100)
         await rig.start(GRIP, *steps, **keys)
-        for cycles, fault in [*story, (150, "resume")]:
+        for cycles, fault in [*faults, (150, "resume")]:
             await rig.cycles(cycles)
             happened = FAULTS[fault](rig)
             if asyncio.iscoroutine(happened):
@@ -183,5 +183,5 @@ async def tell(steps: list[dict[str, Any]], story: list[tuple[int, str]], **keys
     st.floats(0.05, 2.0),
 )
 @example([{"do": "turn_to", "angle_rad": 1.0, "speed_rad_per_s": 1.0}], [(32, "protective")], "right", 1.0)
-def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits(steps, story, drive, torque_limit_nm):
-    asyncio.run(tell(steps, story, torque_source=drive, limits={"torque_nm": torque_limit_nm}))
+def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits(steps, faults, drive, torque_limit_nm):
+    asyncio.run(run_scenario(steps, faults, torque_source=drive, limits={"torque_nm": torque_limit_nm}))

@@ -19,7 +19,7 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
 from shearloop.errors import ActionError
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment, no_tick
-from tests.drivers.ur.flight import SETTINGS
+from tests.drivers.ur.handler_bench import SETTINGS
 
 
 async def test_an_action_that_dies_fails_its_step_and_is_told():
@@ -101,10 +101,10 @@ async def test_who_waits_for_an_experiments_end_is_told_of_that_one():
         await cell.cycles(5)
         cell.runner.stop()
         # The next one begins before whoever waits has had his turn.
-        cell.control_loop.tick(cell.robot.flight.now_ns)
+        cell.control_loop.tick(cell.robot.bench.now_ns)
         cell.control_loop.acknowledge()
         again = {"name": "again", "torque_source": WRENCH, "steps": [{"do": "wait", "wait_s": 60}]}
-        assert cell.control_loop.start(ExperimentFile.model_validate(again), cell.robot.flight.now_ns) is None
+        assert cell.control_loop.start(ExperimentFile.model_validate(again), cell.robot.bench.now_ns) is None
         async with asyncio.timeout(20):
             while not waiting.done():
                 await cell.cycles(1)
@@ -254,11 +254,11 @@ async def test_a_straight_move_goes_on_though_the_pause_was_shorter_than_its_bra
 
 async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pause_in_the_same_moment():
     async with driven(MOVE, cycles=40) as cell:
-        arm, flight = cell.robot.flight.arm, cell.robot.flight
+        arm, bench = cell.robot.bench.arm, cell.robot.bench
         # The pause is said while the state that tells of the force is on its way.
         arm.be(wrench=(0.0, 0.0, SETTINGS.limits.force_n.inner + 5.0, 0.0, 0.0, 0.0))
-        flight.fly(1)
-        assert "force" in flight.state.end_reason
+        bench.run(1)
+        assert "force" in bench.state.end_reason
         cell.runner._actions.interrupt()
         arm.be(wrench=(0.0,) * 6)
         await cell.cycles(1)
@@ -276,17 +276,17 @@ async def test_a_wrist_speed_is_sent_at_each_state():
         cell.robot.commands.clear()
         await cell.cycles(50)
         assert cell.robot.commands == [TURN] * 50
-        assert cell.robot.flight.wrist_speed == pytest.approx(0.3)
+        assert cell.robot.bench.wrist_speed == pytest.approx(0.3)
 
 
 async def test_the_speed_after_clipping_is_published():
     async with driven(TWIST, cycles=20) as cell:
         # Close to the limit of the force, the robot's process lets less through.
-        cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
+        cell.robot.bench.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
         await cell.cycles(150)
         state = next(one for one in reversed(cell.published.messages) if one.topic == "loop.state")
         assert state.speed_command_rad_per_s == pytest.approx(0.3)
-        assert state.speed_sent_rad_per_s == cell.robot.flight.wrist_speed
+        assert state.speed_sent_rad_per_s == cell.robot.bench.wrist_speed
         assert 0.0 < state.speed_sent_rad_per_s < 0.3
 
 
@@ -294,7 +294,7 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
     """Nobody has sent one that could be mended; what helps is told instead."""
     async with driven(TWIST) as cell:
         # What is clipped is told in each cycle, so that one is unanswered whenever the process dies.
-        cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
+        cell.robot.bench.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
         await cell.cycles(20)
         cell.control_loop.on_link("robot", "The robot's process died of SIGKILL.", up=False)
         cell.robot.die(50)
@@ -319,7 +319,7 @@ def stops(cell: Cell) -> list[LoopStop]:
 async def test_times_of_a_stop_are_published_once():
     async with driven(TWIST, cycles=50) as cell:
         assert cell.state.motion == "wrist"
-        cause_ns = cell.robot.flight.now_ns
+        cause_ns = cell.robot.bench.now_ns
         cell.exceed_torque()
         await cell.until_ended(10)
         assert not stops(cell), "the wrist still turns"
@@ -334,7 +334,7 @@ async def test_times_of_a_stop_are_published_once():
 
 async def test_cause_of_a_requested_stop_is_the_request():
     async with driven(TWIST, cycles=50) as cell:
-        asked_ns = cell.robot.flight.now_ns
+        asked_ns = cell.robot.bench.now_ns
         assert cell.runner.stop() == "test"
         await cell.cycles(60)
         (stop,) = stops(cell)

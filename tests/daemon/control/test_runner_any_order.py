@@ -20,12 +20,12 @@ STANDS_AFTER, EXCUSED_FOR = 60, 60
 BEGUN_AGAIN_AFTER = 65
 
 
-class Story:
+class Scenario:
     """A cell to which things happen; after each cycle it is looked at."""
 
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
-        self.arm = cell.robot.flight.arm
+        self.arm = cell.robot.bench.arm
         self.idle = self.excused = self.dead = 0
         self.moved = False
 
@@ -97,43 +97,43 @@ class Story:
             self.cell.robot.cycle(read=False)
 
 
-HAPPENINGS: dict[str, Callable[[Story], Any]] = {
-    "turn": lambda story: story.start(TURN, GRIP, TWIST),
-    "move": lambda story: story.start(MOVE, TURN),
-    "twist": lambda story: story.start(TWIST),
-    "mend": lambda story: story.mend(),
-    "wait": lambda story: story.go(40),
-    "wait long": lambda story: story.go(90),
-    "pause": lambda story: story.cell.control_loop.pause(),
-    "resume": lambda story: story.cell.control_loop.resume(),
-    "stop": lambda story: story.cell.runner.stop(),
-    "protective stop": lambda story: story.protective_stop(),
-    "resumed at the pendant": lambda story: story.resumed(),
-    "program ends": lambda story: story.arm.end_program(),
-    "dashboard hangs": lambda story: setattr(story.arm, "stoppable", False),
-    "states are late": lambda story: story.arm.be(age_ns=150_000_000),
-    "states are old": lambda story: story.arm.be(age_ns=300_000_000),
-    "states are new": lambda story: story.arm.be(age_ns=0),
-    "states are not read": lambda story: story.unread(),
-    "the robot's process dies": lambda story: story.process_dies(),
-    "a task dies": lambda story: story.cell.died.update(right="it died"),
-    "the loop dies": lambda story: story.tick_dies(),
-    "torque beyond its limit": lambda story: story.cell.exceed_torque(),
-    "pushed": lambda story: story.arm.be(wrench=(100.0, 0.0, 0.0, 0.0, 0.0, 0.0)),
+HAPPENINGS: dict[str, Callable[[Scenario], Any]] = {
+    "turn": lambda scenario: scenario.start(TURN, GRIP, TWIST),
+    "move": lambda scenario: scenario.start(MOVE, TURN),
+    "twist": lambda scenario: scenario.start(TWIST),
+    "mend": lambda scenario: scenario.mend(),
+    "wait": lambda scenario: scenario.go(40),
+    "wait long": lambda scenario: scenario.go(90),
+    "pause": lambda scenario: scenario.cell.control_loop.pause(),
+    "resume": lambda scenario: scenario.cell.control_loop.resume(),
+    "stop": lambda scenario: scenario.cell.runner.stop(),
+    "protective stop": lambda scenario: scenario.protective_stop(),
+    "resumed at the pendant": lambda scenario: scenario.resumed(),
+    "program ends": lambda scenario: scenario.arm.end_program(),
+    "dashboard hangs": lambda scenario: setattr(scenario.arm, "stoppable", False),
+    "states are late": lambda scenario: scenario.arm.be(age_ns=150_000_000),
+    "states are old": lambda scenario: scenario.arm.be(age_ns=300_000_000),
+    "states are new": lambda scenario: scenario.arm.be(age_ns=0),
+    "states are not read": lambda scenario: scenario.unread(),
+    "the robot's process dies": lambda scenario: scenario.process_dies(),
+    "a task dies": lambda scenario: scenario.cell.died.update(right="it died"),
+    "the loop dies": lambda scenario: scenario.tick_dies(),
+    "torque beyond its limit": lambda scenario: scenario.cell.exceed_torque(),
+    "pushed": lambda scenario: scenario.arm.be(wrench=(100.0, 0.0, 0.0, 0.0, 0.0, 0.0)),
 }
 
 
 async def stays_safe(happenings: Sequence[str]) -> bool:
     """Let things happen, one after the other; return whether anything has moved at all."""
     async with driven() as cell:
-        story = Story(cell)
+        scenario = Scenario(cell)
         for name in happenings:
-            happened = HAPPENINGS[name](story)
+            happened = HAPPENINGS[name](scenario)
             if asyncio.iscoroutine(happened):
                 await happened
-            await story.go(5)
-        await story.go(STANDS_AFTER)
-        return story.moved
+            await scenario.go(5)
+        await scenario.go(STANDS_AFTER)
+        return scenario.moved
 
 
 @settings(max_examples=40, deadline=None)

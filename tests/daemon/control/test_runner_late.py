@@ -8,7 +8,7 @@ from shearloop.daemon.control import fault_detection
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.safety import Fault, FaultCode
 from tests.daemon.control.cell import TWIST, driven
-from tests.drivers.ur.flight import CYCLE_NS
+from tests.drivers.ur.handler_bench import CYCLE_NS
 
 
 async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch):
@@ -18,7 +18,7 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch):
         def at_length(*given: Any) -> Any:
             monkeypatch.undo()
             orders = decide(*given)
-            cell.robot.flight.now_ns += 200_000_000
+            cell.robot.bench.now_ns += 200_000_000
             return orders
 
         monkeypatch.setattr(cell.control_loop, "tick", at_length)

@@ -135,9 +135,9 @@ STRETCHES = st.tuples(CAUSES, st.integers(1, 3 * SECOND))
 
 
 @given(st.lists(STRETCHES, min_size=1, max_size=60))
-def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop(story):
+def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop(sequence):
     gate, t_ns, held_ns = SafetyMonitor(), 0, 0.0
-    for events, lasts_ns in story:
+    for events, lasts_ns in sequence:
         if gate.judge([trouble(event) for event in events], t_ns).response in STOPS:
             return
         assert not events or held_ns <= HELD_AT_MOST_S * SECOND
@@ -174,9 +174,9 @@ def test_a_stop_outlives_its_cause_until_it_is_acknowledged():
 
 
 @given(st.lists(st.tuples(st.lists(st.sampled_from(FaultCode), max_size=4), st.integers(0, 10 * SECOND)), max_size=20))
-def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(story):
+def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(sequence):
     gate, t_ns, strongest = SafetyMonitor(), 0, Response.NOTE
-    for events, pause_ns in story:
+    for events, pause_ns in sequence:
         t_ns += pause_ns
         verdict = gate.judge([trouble(event) for event in events], t_ns)
         assert verdict.response >= max((TABLE[event].response for event in events), default=Response.NOTE)

@@ -19,7 +19,7 @@ from shearloop.daemon.loop_config import LoopConfig
 from shearloop.drivers.errors import DriverError
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
 from tests.daemon.control.loop_rig import GRIP, LOAD, Rig, new_loop, phase, started, stop
-from tests.drivers.ur.flight import SETTINGS
+from tests.drivers.ur.handler_bench import SETTINGS
 
 WAIT = {"do": "wait", "wait_s": 60}
 
@@ -41,7 +41,7 @@ async def released(cell: Cell) -> str | None:
 
 
 def emergency_stop(cell: Cell) -> None:
-    cell.robot.flight.arm.be(safety_mode=7, robot_mode=3)
+    cell.robot.bench.arm.be(safety_mode=7, robot_mode=3)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.daemon.loop_config import LoopConfig
 from tests.daemon.control.cell import Cell, driven
-from tests.drivers.ur.flight import CYCLE_NS, SETTINGS
+from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 
 CONFIG = LoopConfig()
 # A tenth of what the wrist resolves.

@@ -136,9 +136,9 @@ ANY = st.floats(-2, 2) | st.just(9.9e37)
     st.lists(st.tuples(ANY, ANY, st.integers(1, 4)), max_size=30),
     st.sampled_from([None, GOOD, STUCK_OPEN, SourceReading(0, output_on=False)]),
 )
-def test_whatever_comes_a_trusted_sample_has_two_resistances_that_a_gauge_can_have(story, source):
+def test_whatever_comes_a_trusted_sample_has_two_resistances_that_a_gauge_can_have(sequence, source):
     one, number = judge(), 0
-    for v1_v, v2_v, step in story:
+    for v1_v, v2_v, step in sequence:
         number += step
         reading = source and replace(source, t_ns=number * 10**8)
         sample = one.sample(voltages(v1_v, v2_v, number, over_1=v1_v > 1, over_2=v2_v > 1), reading)

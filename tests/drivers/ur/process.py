@@ -8,7 +8,7 @@ import pytest
 
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import Message, MessageDecoder, RobotState, RtdeSample, WristSpeed, encode
-from tests.drivers.ur.flight import SETTINGS, FakeArm
+from tests.drivers.ur.handler_bench import SETTINGS, FakeArm
 
 BEGUN_S = 1000.0
 Event = Message | Callable[[], object]
@@ -75,7 +75,7 @@ class CyclingArm(FakeArm):
         super().end_program()
 
 
-def fly(daemon: Daemon, arm: CyclingArm) -> None:
+def drive(daemon: Daemon, arm: CyclingArm) -> None:
     with pytest.raises(ExitedError):
         worker._control(daemon.pipe, SETTINGS, arm)  # an arm in all that counts
 
@@ -107,7 +107,7 @@ class Timed:
         self._script = sorted(script, key=lambda entry: entry[0])
         monkeypatch.setattr(worker, "time", self.time)
         monkeypatch.setattr(daemon.pipe, "wait", self._wait)
-        fly(daemon, arm)
+        drive(daemon, arm)
         self.states = [message for _, message in daemon.receive() if isinstance(message, RobotState)]
 
     def _wait(self, timeout_s: float) -> bool:

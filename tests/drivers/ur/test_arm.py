@@ -13,7 +13,7 @@ import pytest
 from shearloop.drivers.ur import settings as ur
 from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeOutputs, WristSpeed
 from shearloop.drivers.ur.script import LOWER, NO_MOTION_TICKS, UPPER
-from tests.drivers.ur.flight import SETTINGS, received
+from tests.drivers.ur.handler_bench import SETTINGS, received
 
 SIX = (0.0,) * 6
 VERSION = "5.17.3.0"

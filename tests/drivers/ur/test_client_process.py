@@ -58,7 +58,7 @@ DISCONNECTS = """
 import os, sys
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import Disconnect, MessageDecoder, encode
-from tests.drivers.ur.flight import SETTINGS, FakeArm
+from tests.drivers.ur.handler_bench import SETTINGS, FakeArm
 
 os.write(1, encode(CommandHandler(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
 decoder, last = MessageDecoder(), None

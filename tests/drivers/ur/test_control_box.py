@@ -26,7 +26,7 @@ from shearloop.drivers.ur.motion import why_unfit
 from shearloop.drivers.ur.settings import TorqueBound, UrSettings
 from shearloop.emulators.ur_controller import Controller
 from shearloop.emulators.ur_robot import Robot
-from tests.drivers.ur.flight import AT_REST, LIMITS, SETTINGS, flying
+from tests.drivers.ur.handler_bench import AT_REST, LIMITS, SETTINGS, enabled
 from tests.emulator_process import own_address
 
 HOST = own_address(7)
@@ -126,20 +126,20 @@ async def test_what_is_carried_out_says_nothing_and_a_refused_necessity_says_why
 
 
 def test_a_refused_request_ends_the_recovery_at_once_with_its_words():
-    flight = flying()
-    flight.arm.be(robot_mode=3, runtime_state=1)
-    flight.arm.refuses["power on"] = "The controller answered “not now” to `power on`: look at the teach pendant."
-    since_ns = flight.now_ns
-    assert flight.ask(Unlock()).refusal == flight.arm.refuses["power on"]
-    assert flight.now_ns - since_ns < 1e9
+    bench = enabled()
+    bench.arm.be(robot_mode=3, runtime_state=1)
+    bench.arm.refuses["power on"] = "The controller answered “not now” to `power on`: look at the teach pendant."
+    since_ns = bench.now_ns
+    assert bench.ask(Unlock()).refusal == bench.arm.refuses["power on"]
+    assert bench.now_ns - since_ns < 1e9
 
 
 def test_a_recovery_that_times_out_names_the_modes_and_quotes_the_last_refusal(monkeypatch):
-    flight = flying()
-    flight.arm.be(robot_mode=3, runtime_state=4)
-    flight.arm.ignores["close popup"] = "The controller answered “no popup” to `close popup`"
-    monkeypatch.setattr(flight.arm, "ask_dashboard", lambda *requests: flight.arm.ignores.get(requests[0], ""))
-    refusal = flight.ask(Unlock()).refusal
+    bench = enabled()
+    bench.arm.be(robot_mode=3, runtime_state=4)
+    bench.arm.ignores["close popup"] = "The controller answered “no popup” to `close popup`"
+    monkeypatch.setattr(bench.arm, "ask_dashboard", lambda *requests: bench.arm.ignores.get(requests[0], ""))
+    refusal = bench.ask(Unlock()).refusal
     assert "robot mode: power off, safety mode: normal, program: paused" in refusal
     assert "“no popup” to `close popup`" in refusal
 

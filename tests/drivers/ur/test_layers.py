@@ -10,7 +10,7 @@ from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, carry_wrench
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.emulators.ur_robot import PLAYING, Robot
 from tests.drivers.ur import robots
-from tests.drivers.ur.flight import AT_REST, CYCLE_NS, FakeArm, Flight, flying
+from tests.drivers.ur.handler_bench import AT_REST, CYCLE_NS, FakeArm, HandlerBench, enabled
 from tests.drivers.ur.robots import DELIVERED, VERSIONS, control_script, do, send
 
 LIMITS, TIMEOUT_S = DELIVERED.limits, DELIVERED.command_timeout_s
@@ -109,33 +109,33 @@ def turn(arm: ScriptedArm, command: WristSpeed, seconds: float) -> list[RtdeSamp
     return found
 
 
-def at_full_speed(script: str) -> tuple[Flight, WristSpeed]:
-    """Return a flight at the largest speed, at the moment of a decision, and the command."""
-    flight = flying(DELIVERED, ScriptedArm(script))
+def at_full_speed(script: str) -> tuple[HandlerBench, WristSpeed]:
+    """Return a bench at the largest speed, at the moment of a decision, and the command."""
+    bench = enabled(DELIVERED, ScriptedArm(script))
     for _ in range(50):
-        command = WristSpeed(FASTEST, LIMITS.wrist_acceleration_rad_per_s2.inner, flight.now_ns)
-        assert flight.ask(command).accepted
-        flight.fly(1)
-    assert flight.wrist_speed == pytest.approx(FASTEST)
-    assert flight.ask(dataclasses.replace(command, decided_ns=flight.now_ns)).accepted
-    return flight, command
+        command = WristSpeed(FASTEST, LIMITS.wrist_acceleration_rad_per_s2.inner, bench.now_ns)
+        assert bench.ask(command).accepted
+        bench.run(1)
+    assert bench.wrist_speed == pytest.approx(FASTEST)
+    assert bench.ask(dataclasses.replace(command, decided_ns=bench.now_ns)).accepted
+    return bench, command
 
 
 def test_worker_alone_stops_the_wrist_in_time():
     """ur-rtde's own script has no deadline; the daemon is alive and decides nothing."""
-    flight, _ = at_full_speed(control_script())
-    decided_ns = flight.now_ns
-    while not flight.arm.reading.rests:
-        flight.fly(1)
-        assert flight.now_ns - decided_ns <= PROMISED_S * 1e9
-    assert "was not renewed" in flight.state.end_reason
+    bench, _ = at_full_speed(control_script())
+    decided_ns = bench.now_ns
+    while not bench.arm.reading.rests:
+        bench.run(1)
+        assert bench.now_ns - decided_ns <= PROMISED_S * 1e9
+    assert "was not renewed" in bench.state.end_reason
 
 
 @pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "own"])
 def test_script_alone_stops_the_wrist_in_time(guarded):
     """The worker repeats its last command for ever, which feeds the watchdog. Without our script the wrist turns on."""
-    flight, command = at_full_speed(control_script(DELIVERED if guarded else None))
-    arm, rested_s = flight.arm, None
+    bench, command = at_full_speed(control_script(DELIVERED if guarded else None))
+    arm, rested_s = bench.arm, None
     for cycle in range(1, 126):
         arm.repeat(command)
         arm.cycle()
@@ -150,95 +150,95 @@ def test_script_alone_stops_the_wrist_in_time(guarded):
         assert arm.reading.qd_rad_per_s[5] == pytest.approx(FASTEST)
 
 
-def moving_at_full_speed(script: str, settings: UrSettings = DELIVERED) -> Flight:
-    """Return a flight in a linear move at its largest speed, at the moment of the daemon's last message."""
-    flight = flying(settings, ScriptedArm(script, settings))
-    flight.fly(1)
-    x, y, z, *turn = flight.arm.robot.arm.pose
+def moving_at_full_speed(script: str, settings: UrSettings = DELIVERED) -> HandlerBench:
+    """Return a bench in a linear move at its largest speed, at the moment of the daemon's last message."""
+    bench = enabled(settings, ScriptedArm(script, settings))
+    bench.run(1)
+    x, y, z, *turn = bench.arm.robot.arm.pose
     inner = LIMITS.linear_speed_m_per_s.inner
-    assert flight.ask(MoveLinear((x, y, z - 0.2, *turn), inner, LIMITS.linear_acceleration_m_per_s2.inner)).accepted
-    flight.fly(60)
-    assert flight.state.motion == "linear"
-    assert not flight.arm.reading.rests
-    return flight
+    assert bench.ask(MoveLinear((x, y, z - 0.2, *turn), inner, LIMITS.linear_acceleration_m_per_s2.inner)).accepted
+    bench.run(60)
+    assert bench.state.motion == "linear"
+    assert not bench.arm.reading.rests
+    return bench
 
 
 def test_worker_alone_stops_a_linear_move_in_time():
-    flight = moving_at_full_speed(control_script())
-    flight.fly(round(PROMISED_S * 1e9 / CYCLE_NS), daemon_alive=False)
-    assert flight.arm.reading.rests
-    assert "was silent" in flight.state.end_reason
+    bench = moving_at_full_speed(control_script())
+    bench.run(round(PROMISED_S * 1e9 / CYCLE_NS), daemon_alive=False)
+    assert bench.arm.reading.rests
+    assert "was silent" in bench.state.end_reason
 
 
 @pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "own"])
 def test_script_alone_ends_a_linear_move_in_time(guarded):
     """The worker feeds the watchdog for ever, and does not stop."""
-    flight = moving_at_full_speed(control_script(DELIVERED if guarded else None))
+    bench = moving_at_full_speed(control_script(DELIVERED if guarded else None))
     for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
-        flight.arm.send_heartbeat()
-        flight.arm.cycle()
-    assert flight.arm.reading.rests == guarded
-    assert flight.arm.reading.program_running != guarded
+        bench.arm.send_heartbeat()
+        bench.arm.cycle()
+    assert bench.arm.reading.rests == guarded
+    assert bench.arm.reading.program_running != guarded
 
 
-def ends(flight: Flight) -> list[str]:
+def ends(bench: HandlerBench) -> list[str]:
     """Write nothing for a second, and return how the robot's programs have ended, and its stops."""
     told = ("motion-stopped", "program-ended", "protective-stop")
-    flight.arm.robot.take_events()
+    bench.arm.robot.take_events()
     for _ in range(125):
-        flight.arm.cycle()
-    return [event.name for event in flight.arm.robot.take_events() if event.name in told]
+        bench.arm.cycle()
+    return [event.name for event in bench.arm.robot.take_events() if event.name in told]
 
 
 @pytest.mark.parametrize("straight", [False, True])
 def test_stop_by_the_robot_itself_is_gentle(straight):
     """A killed worker causes no protective stop, also where a program that ends while the arm moves would."""
     script = control_script(DELIVERED)
-    flight = moving_at_full_speed(script) if straight else at_full_speed(script)[0]
-    flight.arm.robot.protects_abrupt_ends = True
-    assert ends(flight) == ["motion-stopped", "program-ended"]
-    assert "not renewed in time" in flight.arm.robot.log[-1]
+    bench = moving_at_full_speed(script) if straight else at_full_speed(script)[0]
+    bench.arm.robot.protects_abrupt_ends = True
+    assert ends(bench) == ["motion-stopped", "program-ended"]
+    assert "not renewed in time" in bench.arm.robot.log[-1]
 
 
 @pytest.mark.parametrize("protects", [True, False])
 def test_watchdog_alone_is_the_last_resort(protects):
     """A program without our deadlines has nothing else; what then happens differs between controllers."""
-    flight, _ = at_full_speed(control_script())
-    flight.arm.robot.protects_abrupt_ends = protects
-    found = ends(flight)
+    bench, _ = at_full_speed(control_script())
+    bench.arm.robot.protects_abrupt_ends = protects
+    found = ends(bench)
     assert ("protective-stop" in found) == protects
-    assert flight.arm.reading.rests
+    assert bench.arm.reading.rests
 
 
 @pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "own"])
 def test_linear_move_of_a_living_daemon_arrives(guarded):
-    flight = moving_at_full_speed(control_script(DELIVERED if guarded else None))
-    state = flight.fly_until(lambda state: state.motion != "linear")
+    bench = moving_at_full_speed(control_script(DELIVERED if guarded else None))
+    state = bench.run_until(lambda state: state.motion != "linear")
     assert state.end_reason == "arrived"
     assert not state.blocked
 
 
 def test_killed_worker_stops_the_wrist_in_time():
     """Nothing is written: the deadline, and later the watchdog."""
-    flight, _ = at_full_speed(control_script(DELIVERED))
+    bench, _ = at_full_speed(control_script(DELIVERED))
     for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
-        flight.arm.cycle()
-    assert flight.arm.reading.rests
-    assert flight.arm.reading.program_running
+        bench.arm.cycle()
+    assert bench.arm.reading.rests
+    assert bench.arm.reading.program_running
     for _ in range(round(1e9 / DELIVERED.watchdog_hz / CYCLE_NS)):
-        flight.arm.cycle()
-    assert not flight.arm.reading.program_running
+        bench.arm.cycle()
+    assert not bench.arm.reading.program_running
 
 
 @pytest.mark.parametrize("worker_lives", [True, False])
 def test_resumed_program_does_not_turn_the_wrist(worker_lives):
     """The worker has withdrawn the deadline. Without a worker the wrist turns until the deadline."""
-    flight, _ = at_full_speed(control_script(DELIVERED))
-    arm = flight.arm
+    bench, _ = at_full_speed(control_script(DELIVERED))
+    arm = bench.arm
     arm.robot.protective_stop("a person")
     for _ in range(10):
         if worker_lives:
-            flight.fly(1)
+            bench.run(1)
         else:
             arm.cycle()
     assert arm.reading.rests
@@ -253,10 +253,10 @@ def test_resumed_program_does_not_turn_the_wrist(worker_lives):
 
 
 def test_gentle_stop_of_the_worker_stays_gentle():
-    flight, _ = at_full_speed(control_script(DELIVERED))
-    assert flight.ask(Stop(1.0)).accepted
-    flight.fly(40)
-    assert flight.wrist_speed == pytest.approx(FASTEST - 1.0 * 40 * CYCLE_NS / 1e9, abs=0.02)
+    bench, _ = at_full_speed(control_script(DELIVERED))
+    assert bench.ask(Stop(1.0)).accepted
+    bench.run(40)
+    assert bench.wrist_speed == pytest.approx(FASTEST - 1.0 * 40 * CYCLE_NS / 1e9, abs=0.02)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.09, 0.11, 0.5])
@@ -343,10 +343,10 @@ def test_a_straight_move_may_begin_before_its_deadline_arrives(comes):
 def test_a_worker_that_is_late_for_less_than_the_silence_costs_no_straight_move(silence_s, late_s, goes_on):
     """1 s is what an emulated rig allows a busy computer."""
     settings = dataclasses.replace(DELIVERED, command_timeout_s=silence_s, silence_timeout_s=silence_s)
-    flight = moving_at_full_speed(control_script(settings), settings)
+    bench = moving_at_full_speed(control_script(settings), settings)
     for _ in range(round(late_s * 1e9) // CYCLE_NS):
-        flight.be_alone()
-    assert flight.arm.reading.program_running == goes_on
+        bench.run_without_handler()
+    assert bench.arm.reading.program_running == goes_on
 
 
 @pytest.mark.parametrize("held", [True, False])

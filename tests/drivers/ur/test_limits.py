@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.motion import clip_linear, clip_stop, clip_wrist, is_close, line_violation, violation
 from shearloop.drivers.ur.settings import InstalledTool
-from tests.drivers.ur.flight import AT_REST, LIMITS, POSE, SETTINGS, flying
+from tests.drivers.ur.handler_bench import AT_REST, LIMITS, POSE, SETTINGS, enabled
 
 CYCLE_S = 0.008
 
@@ -97,13 +97,13 @@ def test_a_linear_move_keeps_its_end_and_reports_a_slower_speed(asked):
 @example(2, 488.0)
 @example(0, 1e300)
 def test_a_linear_move_that_ends_outside_the_workspace_is_refused_and_moves_nothing(axis, value):
-    flight, box = flying(), LIMITS.workspace
+    bench, box = enabled(), LIMITS.workspace
     pose = tuple(value if index == axis else here for index, here in enumerate(POSE))
     inside = box.lower_m[axis] + box.margin_m <= value <= box.upper_m[axis] - box.margin_m
-    reply = flight.ask(MoveLinear(pose, 0.1, 0.1))
+    reply = bench.ask(MoveLinear(pose, 0.1, 0.1))
     assert reply.accepted == inside
     assert inside or f"{'xyz'[axis]} = {value:g} m, outside the robot's workspace" in reply.refusal
-    assert inside or flight.state.motion == "idle"
+    assert inside or bench.state.motion == "idle"
     assert not inside or reply.sent.pose == pose
 
 
@@ -133,15 +133,15 @@ MEASURED: list[tuple[str, Callable[[float], dict[str, object]], float]] = [
 @pytest.mark.parametrize(("named", "changes", "hard"), MEASURED)
 @given(share=st.floats(1.001, 100.0))
 def test_measured_value_beyond_its_hard_limit_stops_every_motion(command, named, changes, hard, share):
-    flight = flying()
-    assert flight.ask(command).accepted
-    flight.fly(20)
-    moving = flight.state.motion
-    flight.arm.be(**changes(max(share * hard, hard + 1e-6)))
-    flight.fly(1)
-    assert flight.state.motion == "stopping" != moving
-    assert named in flight.state.end_reason
-    assert named in flight.ask(command).refusal
+    bench = enabled()
+    assert bench.ask(command).accepted
+    bench.run(20)
+    moving = bench.state.motion
+    bench.arm.be(**changes(max(share * hard, hard + 1e-6)))
+    bench.run(1)
+    assert bench.state.motion == "stopping" != moving
+    assert named in bench.state.end_reason
+    assert named in bench.ask(command).refusal
 
 
 @settings(max_examples=20, deadline=None)
@@ -155,27 +155,27 @@ def test_measured_value_beyond_its_hard_limit_stops_every_motion(command, named,
 )
 @given(share=st.floats(0.01, 0.99) | st.floats(1.01, 2.0), index=st.integers(0, 2))
 def test_measured_acceleration_beyond_its_hard_limit_stops_the_motion(named, command, changes, bound, share, index):
-    flight = flying()
-    assert flight.ask(command).accepted
+    bench = enabled()
+    assert bench.ask(command).accepted
     for cycle in range(8):
         speed = share * bound.hard * CYCLE_S * cycle
-        flight.arm.be(**{changes: six(5 if changes == "qd_rad_per_s" else index, speed)})
-        flight.fly(1)
-    assert (named in flight.state.end_reason) == (share > 1)
+        bench.arm.be(**{changes: six(5 if changes == "qd_rad_per_s" else index, speed)})
+        bench.run(1)
+    assert (named in bench.state.end_reason) == (share > 1)
 
 
 def test_a_stop_may_brake_harder_than_a_motion_may_accelerate():
-    flight = flying()
-    assert flight.ask(WristSpeed(0.3, 4.0)).accepted
-    flight.fly(20)
-    assert flight.ask(Stop(4.0)).accepted
+    bench = enabled()
+    assert bench.ask(WristSpeed(0.3, 4.0)).accepted
+    bench.run(20)
+    assert bench.ask(Stop(4.0)).accepted
     for speed in (0.1, 0.0, 0.0, 0.0):
-        flight.arm.be(tcp_speed=six(0, speed))
-        flight.fly(1)
-    flight.fly_until(lambda state: state.motion == "idle")
-    assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
-    flight.fly(10)
-    assert flight.state.motion == "linear"
+        bench.arm.be(tcp_speed=six(0, speed))
+        bench.run(1)
+    bench.run_until(lambda state: state.motion == "idle")
+    assert bench.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
+    bench.run(10)
+    assert bench.state.motion == "linear"
 
 
 @pytest.mark.parametrize(

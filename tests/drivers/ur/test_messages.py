@@ -11,7 +11,7 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import messages as wire
 from shearloop.drivers.ur.messages import MessageDecoder, MoveLinear, Stop, WristSpeed, encode
 from shearloop.drivers.ur.settings import UrSettings
-from tests.drivers.ur.flight import LIMITS
+from tests.drivers.ur.handler_bench import LIMITS
 from tests.slices import slices
 
 finite = st.floats(allow_nan=False, allow_infinity=False)

@@ -7,7 +7,7 @@ import pytest
 from shearloop.drivers.ur import control_box as ready_module
 from shearloop.drivers.ur.control_box import ScriptReadiness
 from shearloop.drivers.ur.messages import RtdeOutputs
-from tests.drivers.ur.flight import received
+from tests.drivers.ur.handler_bench import received
 
 READY, DONE = 1, 2
 PLAYING, STOPPED, PAUSED = 2, 1, 4

@@ -7,8 +7,8 @@ import pytest
 
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Unlock, WristSpeed
-from tests.drivers.ur.flight import Flight, flying
-from tests.drivers.ur.process import CyclingArm, fly
+from tests.drivers.ur.handler_bench import HandlerBench, enabled
+from tests.drivers.ur.process import CyclingArm, drive
 from tests.drivers.ur.robots import ROOT
 
 
@@ -16,7 +16,7 @@ def test_unlocking_ended_by_a_disconnection_is_answered(daemon):
     arm = CyclingArm()
     arm.be(robot_mode=3)
     daemon.send(Unlock(), Disconnect())
-    fly(daemon, arm)
+    drive(daemon, arm)
     assert arm.calls == []
     replies = {number: message for number, message in daemon.receive() if isinstance(message, CommandReply)}
     assert "disconnects" in replies[1].refusal
@@ -26,7 +26,7 @@ def test_unlocking_ended_by_a_disconnection_is_answered(daemon):
 def test_commands_after_a_disconnection_are_refused(daemon):
     arm = CyclingArm()
     daemon.send(Disconnect(), Enable(), WristSpeed(0.5, 4.0), Unlock())
-    fly(daemon, arm)
+    drive(daemon, arm)
     assert arm.calls == []
     replies = [message for _, message in daemon.receive() if isinstance(message, CommandReply)]
     assert [reply.accepted for reply in replies] == [True, False, False, False]
@@ -38,7 +38,7 @@ def test_foreign_program_is_left_alone_on_exit(daemon, runtime_state):
     arm = CyclingArm()
     arm.be(runtime_state=runtime_state)
     daemon.send(Disconnect())
-    fly(daemon, arm)
+    drive(daemon, arm)
     assert arm.calls == []
     assert arm.reading.runtime_state == runtime_state
 
@@ -46,7 +46,7 @@ def test_foreign_program_is_left_alone_on_exit(daemon, runtime_state):
 CRASHING = """
 import threading
 from shearloop.drivers.ur import worker
-from tests.drivers.ur.flight import SETTINGS, FakeArm
+from tests.drivers.ur.handler_bench import SETTINGS, FakeArm
 
 class Arm(FakeArm):
     def read(self):
@@ -68,7 +68,7 @@ def test_exception_ends_the_process_and_is_printed():
 
 
 def test_state_is_dropped_while_others_are_unsent(daemon):
-    state = Flight().state
+    state = HandlerBench().state
     while not daemon.pipe._unsent:
         daemon.pipe.send(state)
     unsent = daemon.pipe._unsent
@@ -80,15 +80,15 @@ def test_state_is_dropped_while_others_are_unsent(daemon):
 
 
 def test_each_command_is_answered_at_once(daemon):
-    flight = flying()
+    bench = enabled()
     for acceleration, accepted in ((4.0, True), (-4.0, False)):
         daemon.send(WristSpeed(0.1, acceleration))
-        worker._handle_commands(daemon.pipe, flight.handler, flight.state)
+        worker._handle_commands(daemon.pipe, bench.handler, bench.state)
         assert [message.accepted for _, message in daemon.receive() if isinstance(message, CommandReply)] == [accepted]
 
 
 def test_unsent_output_is_bounded(daemon):
-    state = Flight().state
+    state = HandlerBench().state
     for _ in range(10_000):
         daemon.pipe.send(state)
         if not daemon.pipe.open:

@@ -203,7 +203,7 @@ class FakeArm:
         return True
 
 
-class Flight:
+class HandlerBench:
     """A handler, its arm and the time."""
 
     def __init__(self, settings: UrSettings = SETTINGS, *, arm: FakeArm | None = None) -> None:
@@ -212,14 +212,14 @@ class Flight:
         self.number = self.cycle = 0
         self.decided: dict[int, messages.CommandReply] = {}
         self._settings = settings
-        self.begin_anew()
+        self.replace_handler()
 
-    def begin_anew(self) -> None:
+    def replace_handler(self) -> None:
         """Replace the handler."""
         self.cycle = 0
         self.handler = CommandHandler(self._settings, self.arm, self.now_ns)
 
-    def be_alone(self) -> None:
+    def run_without_handler(self) -> None:
         """Run a cycle of the program without a handler."""
         self.arm.cycle()
         self.now_ns += CYCLE_NS
@@ -231,10 +231,10 @@ class Flight:
         for _ in range(6000):
             if reply is not None or self.number in self.decided:
                 break
-            self.fly(1)
+            self.run(1)
         return reply or self.decided[self.number]
 
-    def fly(self, cycles: int, *, daemon_alive: bool = True) -> None:
+    def run(self, cycles: int, *, daemon_alive: bool = True) -> None:
         for _ in range(cycles):
             if daemon_alive:
                 self.handler.request(0, messages.Heartbeat(), self.arm.reading, self.now_ns)
@@ -246,11 +246,11 @@ class Flight:
             self.now_ns += CYCLE_NS
             self.cycle += 1
 
-    def fly_until(self, condition: Callable[[messages.RobotState], bool], cycles: int = 1000) -> messages.RobotState:
+    def run_until(self, condition: Callable[[messages.RobotState], bool], cycles: int = 1000) -> messages.RobotState:
         for _ in range(cycles):
             if condition(self.state):
                 return self.state
-            self.fly(1)
+            self.run(1)
         raise AssertionError(f"never came about; now {self.state}")
 
     @property
@@ -262,25 +262,25 @@ class Flight:
         return self.arm.reading.qd_rad_per_s[5]
 
 
-def flying(settings: UrSettings = SETTINGS, arm: FakeArm | None = None) -> Flight:
-    flight = Flight(settings, arm=arm)
-    flight.fly(5)
-    assert flight.ask(messages.Enable()).accepted
-    flight.arm.calls.clear()
-    return flight
+def enabled(settings: UrSettings = SETTINGS, arm: FakeArm | None = None) -> HandlerBench:
+    bench = HandlerBench(settings, arm=arm)
+    bench.run(5)
+    assert bench.ask(messages.Enable()).accepted
+    bench.arm.calls.clear()
+    return bench
 
 
-def moving(cycles: int) -> Flight:
-    """Return a flight that has begun a linear move so many cycles ago."""
-    flight = flying()
-    assert flight.ask(messages.MoveLinear(POSE, 0.1, 0.1)).accepted
-    flight.fly(cycles)
-    return flight
+def moving(cycles: int) -> HandlerBench:
+    """Return a bench that has begun a linear move so many cycles ago."""
+    bench = enabled()
+    assert bench.ask(messages.MoveLinear(POSE, 0.1, 0.1)).accepted
+    bench.run(cycles)
+    return bench
 
 
-def turning(speed: float = 0.5) -> Flight:
-    flight = flying()
-    assert flight.ask(messages.WristSpeed(speed, 4.0)).accepted
-    flight.fly(30)
-    assert flight.wrist_speed == pytest.approx(speed)
-    return flight
+def turning(speed: float = 0.5) -> HandlerBench:
+    bench = enabled()
+    assert bench.ask(messages.WristSpeed(speed, 4.0)).accepted
+    bench.run(30)
+    assert bench.wrist_speed == pytest.approx(speed)
+    return bench

@@ -24,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print and run each step, or only print it with --dry-run."""
-    from shearloop.daemon.service import find_program, install_steps, uninstall_steps
+    from shearloop.tools.service import find_program, install_steps, uninstall_steps
 
     root = args.root.absolute()
     running = root == Path("/") and Path("/run/systemd/system").is_dir()

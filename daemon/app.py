@@ -27,8 +27,8 @@ from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, build_rig, open_settings
 from shearloop.daemon.rig_memory import Remembered, lock_robot
 from shearloop.daemon.run_summary import RunSummary
+from shearloop.daemon.sd_notify import notify
 from shearloop.daemon.sensing.sessions import COMBINED
-from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH, HealthReporter, Reporter, Supervisor, Task, TaskFacts
 from shearloop.printable import printable
 

@@ -26,7 +26,6 @@ from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, F
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, torque_sources
-from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, ReplayedSkin, SkinTask
 from shearloop.daemon.supervisor import Supervisor, Task
 from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor, SerialLink
@@ -276,6 +275,9 @@ def build_sensors(
     if pairs is not None:
         tareable[COMBINED] = pairs
     if config.skin is not None:
+        # Only a rig with a skin loads its modules.
+        from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, ReplayedSkin, SkinTask
+
         sources = {name: inputs(name) for name in ReplayedSkin.sources}
         tareable[SKIN] = tasks[SKIN] = skin = SkinTask(config.skin, publisher, clock, loop, sources)
         tasks[SKIN_CURRENT] = skin.source
@@ -398,6 +400,6 @@ def _unadaptable(
 def _why_not_driving(drive: str, config: DaemonConfig) -> str:
     if drive in config.fingertips:
         return "is a fingertip without a calibration, which has no torque: add `calibration`, or choose another"
-    if drive == SKIN and config.skin is not None:
+    if drive == "skin" and config.skin is not None:
         return "has no torque without a radius: add `skin.tool_radius_mm`, or choose another"
     return "is not a measured torque: choose another, or configure its device"

@@ -14,7 +14,7 @@ import structlog
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import DaemonEnd, Health, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.service import notify
+from shearloop.daemon.sd_notify import notify
 from shearloop.words import counted
 
 FIRST_PAUSE_S = 0.5

@@ -13,6 +13,8 @@ COMMAND_ADDRESS = "tcp://127.0.0.1:7762"
 LARGEST_PORT = 65535
 # Bytes of a Unix socket's path (unix(7)).
 LONGEST_IPC = 107
+# Of the stop socket's name, which has the same bound.
+_NAME_BYTES = 80
 # A running daemon answers within milliseconds.
 COMMAND_TIMEOUT_S = 2.0
 # The robot may have to power up, release its brakes and start its program, and the gripper to activate.
@@ -91,3 +93,8 @@ def network_refusal(address: str, key: str) -> str:
         f"`{key}: {address}` would open the robot to the network: use ipc or a loopback address such as "
         "tcp://127.0.0.1:7761, or add `curve` with keys from `shearloop keys`"
     )
+
+
+def stop_name(address: str) -> bytes:
+    """Return the abstract name of the stop socket of a daemon, by the port or the path of its `commands`."""
+    return b"\0shearloop-stop-" + os.fsencode(address.rpartition(":")[2])[-_NAME_BYTES:]

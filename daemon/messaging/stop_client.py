@@ -9,20 +9,14 @@ from typing import Any
 
 import msgpack
 
+from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.errors import UserError
 
-# Of the socket's name; a whole name has at most 107 bytes (unix(7)).
-_NAME_BYTES = 80
 _LARGEST_REPLY_BYTES = 1 << 18
 # struct ucred: process, user, group.
 _CREDENTIALS = struct.Struct("=3i")
 # Columns of /proc/net/tcp (proc(5)), and the state of a listening socket.
 _LOCAL, _STATE, _UID, _LISTENS = 1, 3, 7, "0A"
-
-
-def stop_name(address: str) -> bytes:
-    """Return the abstract name of the stop socket of a daemon, by the port or the path of its `commands`."""
-    return b"\0shearloop-stop-" + os.fsencode(address.rpartition(":")[2])[-_NAME_BYTES:]
 
 
 class StopSocketTakenError(UserError):

@@ -11,10 +11,10 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.daemon.messaging.command_server import Handler, Reply, RequestExecutor
 from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.refusals import Refusals
-from shearloop.daemon.messaging.stop_client import stop_name
 from shearloop.errors import UserError
 
 LARGEST_DATAGRAM_BYTES = 1024

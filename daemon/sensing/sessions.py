@@ -13,7 +13,6 @@ from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfi
 from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
-from shearloop.daemon.sensing.skin_task import skin_torque_source
 from shearloop.errors import UserError
 from shearloop.estimation import Calibration, Session
 from shearloop.estimation.bank_match import PaperMatcher
@@ -111,8 +110,12 @@ def torque_sources(
     sources = {name: _torque_source(session, name, periods_s[name]) for name, session in sessions.items()}
     if combined is not None:
         sources[COMBINED] = _torque_source(combined, COMBINED, max(periods_s.values()))
-    if config.skin is not None and (skin := skin_torque_source(config.skin)) is not None:
-        sources[skin.name] = skin
+    if config.skin is not None:
+        # Only a rig with a skin loads its modules.
+        from shearloop.daemon.sensing.skin_task import skin_torque_source
+
+        if (skin := skin_torque_source(config.skin)) is not None:
+            sources[skin.name] = skin
     if config.load_cell is not None:
         sources[LOAD_CELL] = TorqueSource(name=LOAD_CELL, period_s=1.0 / config.load_cell.rate_hz)
     return sources

@@ -19,7 +19,6 @@ from typing import Any, TypeAlias, cast
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import messages
-from shearloop.drivers.ur.control_box import silent_sentence
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import Six, UrSettings
 
@@ -303,7 +302,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
 
     def _hung_sentence(self, seconds: float) -> str:
         if self._activity != CONTROLLING:
-            sentence = silent_sentence(self._settings.host, self._settings.connect_timeout_s, self._activity)
+            sentence = messages.silent_sentence(self._settings.host, self._settings.connect_timeout_s, self._activity)
         else:
             sentence = (
                 f"The robot's process did not answer for {seconds:.1f} s and was ended. The script on the robot stops "

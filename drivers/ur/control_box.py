@@ -17,7 +17,7 @@ from typing import Final
 
 from shearloop.drivers.defaults import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
 from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
-from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs
+from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs, silent_sentence
 from shearloop.drivers.ur.script import LOWER, NO_MOTION_TICKS, UPPER, ScriptRegisters
 from shearloop.drivers.ur.settings import GENERATIONS, UrSettings
 
@@ -311,15 +311,6 @@ def registers_in_use(host: str) -> RobotLostError:
         f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
         "PROFINET, or a URCap: end the other program, disable the adapter under Installation → Fieldbus, or uninstall "
         "the URCap. A program whose cable was pulled keeps its registers for some minutes.",
-    )
-
-
-def silent_sentence(host: str, seconds: float, activity: str) -> str:
-    """Return the message about a controller that did not answer."""
-    return (
-        f"The UR controller at {host} said nothing for {seconds:.1f} s while {activity}: it is starting, hangs, or "
-        "something else listens on its ports. Look at the teach pendant, and restart the controller "
-        "if it hangs."
     )
 
 

@@ -77,6 +77,15 @@ class RobotLostError(DeviceLostError):
         self.kind: FailureKind = kind
 
 
+def silent_sentence(host: str, seconds: float, activity: str) -> str:
+    """Return the message about a controller that did not answer."""
+    return (
+        f"The UR controller at {host} said nothing for {seconds:.1f} s while {activity}: it is starting, hangs, or "
+        "something else listens on its ports. Look at the teach pendant, and restart the controller "
+        "if it hangs."
+    )
+
+
 class _Finite:
     """Makes pydantic refuse numbers that are not finite."""
 

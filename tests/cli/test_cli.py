@@ -632,7 +632,7 @@ def test_a_stop_imports_little():
         import os, socket, sys, threading
         import msgpack
         from shearloop.cli import main
-        from shearloop.daemon.messaging.stop_client import stop_name
+        from shearloop.daemon.messaging.addresses import stop_name
 
         address = f"ipc:///lean-{os.getpid()}"
         daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

@@ -14,6 +14,7 @@ import zmq
 import zmq.asyncio
 
 from shearloop.cli import main
+from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.command_server import (
     LARGEST_REQUEST_BYTES,
@@ -24,7 +25,7 @@ from shearloop.daemon.messaging.command_server import (
 )
 from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.refusals import Refusals
-from shearloop.daemon.messaging.stop_client import StopSocketTakenError, owners, send_to_stop_socket, stop_name
+from shearloop.daemon.messaging.stop_client import StopSocketTakenError, owners, send_to_stop_socket
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import MAX_DESCRIPTORS
 from shearloop.daemon.supervisor import resident_memory_mb

@@ -14,7 +14,7 @@ from shearloop.daemon import supervisor as supervision
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.process import lock_memory
-from shearloop.daemon.service import notify
+from shearloop.daemon.sd_notify import notify
 from shearloop.daemon.supervisor import Supervisor, TaskRecord
 from shearloop.errors import UserError
 from tests.fixtures.daemons import DEADLINE_S, shearloop

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon.service import EXAMPLE, PLACES, REAL_TIME, find_program, install_steps, service_file
+from shearloop.tools.service import EXAMPLE, PLACES, REAL_TIME, find_program, install_steps, service_file
 
 PROGRAM = "/usr/bin/true"
 
@@ -111,8 +111,8 @@ def test_a_program_hidden_from_the_service_is_refused(tmp_path, mistake, monkeyp
     assert "there is no program" in mistake("install", "--dry-run")
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin/shearloop").touch()
-    monkeypatch.setattr("shearloop.daemon.service._HIDDEN", (str(tmp_path),))
+    monkeypatch.setattr("shearloop.tools.service._HIDDEN", (str(tmp_path),))
     said = mistake("install", "--dry-run")
     assert f"lies in {tmp_path}, which the service is not allowed to see" in said
-    monkeypatch.setattr("shearloop.daemon.service._HIDDEN", ("/nowhere",))
+    monkeypatch.setattr("shearloop.tools.service._HIDDEN", ("/nowhere",))
     assert find_program() == tmp_path / "bin/shearloop"

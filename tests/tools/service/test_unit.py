@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.service import PLACES, UNIT, hidden_folder, service_file, unit_for
+from shearloop.tools.service import PLACES, UNIT, hidden_folder, service_file, unit_for
 
 ROOT = Path(__file__).resolve().parents[3]
 # Any program will do for systemd to look at; that the service may see ours is find_program's business.

@@ -1,8 +1,6 @@
-"""The daemon as a systemd service: state notifications, installation and removal."""
+"""Installs the daemon as a systemd service, and removes it."""
 
-import os
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -27,20 +25,6 @@ PLACES = {
 _PROGRAM = "/opt/shearloop/bin/shearloop"
 # Hidden from the service by ProtectHome and PrivateTmp.
 _HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - nothing is written there
-
-
-def notify(*states: str) -> bool:
-    """Send states such as `READY=1` by sd_notify(3) without blocking; return False if systemd does not get them."""
-    address = os.environ.get("NOTIFY_SOCKET", "")
-    if not address:
-        return False
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as manager:
-        try:
-            # A leading @ stands for the zero byte of an abstract address.
-            manager.sendto("\n".join(states).encode(), f"\0{address[1:]}" if address[0] == "@" else address)
-        except OSError:
-            return False
-    return True
 
 
 class Step(NamedTuple):

@@ -16,11 +16,9 @@ import json
 import subprocess
 import sys
 import tempfile
-import threading
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Coroutine, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import CodeType, FrameType
 from typing import Any
 
 import msgpack
@@ -28,28 +26,23 @@ import yaml
 import zmq
 import zmq.asyncio
 
-import shearloop
 from benchmarks import common
+from benchmarks.call_trace import WORKER, Trace, Way, WayTrace
 from benchmarks.daemon_speed import by_default, recorded_lines
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.client import WorkerConnection
-from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.estimation import Physics
 from shearloop.estimation.estimator_names import DEFAULT
 from shearloop.tools.calibrate import calibrate
 
-PACKAGE = Path(shearloop.__file__).resolve().parent
-# The rooms are links to neighbouring folders.
-ROOMS = (PACKAGE, *(path.resolve() for path in PACKAGE.iterdir() if path.is_symlink()))
 SIDE = "right"
 TRACED = 5
-RECEIVE_MS = 60_000
-WORKER = "worker.json"
+# Each stage ends after this time, whatever happens.
+LONGEST_S = 60.0
 CALIBRATED_ON = ("rig-17.5mm.mcap", "rig-25mm.mcap", "rig-40mm.mcap")
 EXPERIMENT = {
     "name": "hold 0.05 N·m",
@@ -65,10 +58,6 @@ EXPERIMENT = {
     ],
 }
 
-# A function of the package: its module, as a path in the repository, and its name.
-Function = tuple[str, str]
-Way = tuple[Function, ...]
-
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
@@ -76,75 +65,6 @@ class Loaded:
 
     modules: tuple[str, ...]
     lines: int
-
-
-class Trace:
-    """Records the package's function calls in the threads that it is installed in, while `recording`."""
-
-    def __init__(self) -> None:
-        self.recording = False
-        self.calls: list[CodeType] = []
-
-    def install(self) -> None:
-        """Watch this thread and all that begin later."""
-        threading.setprofile(self._on_event)
-        sys.setprofile(self._on_event)
-
-    def remove(self) -> None:
-        """Watch nothing."""
-        threading.setprofile(None)
-        sys.setprofile(None)
-
-    def _on_event(self, frame: FrameType, event: str, _argument: object) -> None:
-        if self.recording and event == "call":
-            self.calls.append(frame.f_code)
-
-    def take(self) -> Way:
-        """Return the package's functions that were called, in the order of their first calls, and forget them."""
-        calls, self.calls = self.calls, []
-        return functions_of(calls)
-
-
-class WayTrace(Trace):
-    """Records ways that begin in one function, continue in others, and end when a last one returns."""
-
-    def __init__(
-        self, begins: Callable[[FrameType], bool], continues: Iterable[CodeType], ends: Callable[[CodeType], bool]
-    ) -> None:
-        super().__init__()
-        self.ways: list[Way] = []
-        self._begins, self._continues, self._ends = begins, frozenset(continues), ends
-        self._root: FrameType | None = None
-
-    def _on_event(self, frame: FrameType, event: str, _argument: object) -> None:
-        if not self.recording:
-            return
-        code = frame.f_code
-        if event == "call" and self._root is None:
-            if self._begins(frame):
-                self.calls, self._root = [], frame
-            elif code in self._continues and self.calls:
-                self._root = frame
-        if self._root is None:
-            return
-        if event == "call":
-            self.calls.append(code)
-        elif event == "return" and self._ends(code):
-            self.ways.append(self.take())
-            self._root = None
-        elif event == "return" and frame is self._root:
-            self._root = None
-
-
-def functions_of(calls: Iterable[CodeType]) -> Way:
-    """Return the package's functions among calls, in the order of their first calls."""
-    found: dict[Function, None] = {}
-    for code in calls:
-        path = Path(code.co_filename).resolve()
-        room = next((room for room in ROOMS if room in path.parents), None)
-        if room is not None and not code.co_name.startswith("<"):
-            found[(str(path.relative_to(room.parent)), code.co_qualname)] = None
-    return tuple(found)
 
 
 def shortest(ways: Sequence[Way]) -> Way:
@@ -162,20 +82,21 @@ async def running(config: Path, *topics: str) -> AsyncIterator["tuple[Daemon, zm
         daemon = Daemon(loaded, context)
         ready = asyncio.Event()
         task = asyncio.create_task(daemon.run(ready.set))
-        await ready.wait()
-        with context.socket(zmq.SUB) as subscriber:
-            subscriber.setsockopt(zmq.RCVHWM, 0)
-            subscriber.setsockopt(zmq.RCVTIMEO, RECEIVE_MS)
-            # Health comes once a second and shows that the daemon knows the subscriptions.
-            for topic in (*topics, "health"):
-                subscriber.setsockopt(zmq.SUBSCRIBE, topic.encode())
-            subscriber.connect(loaded.publish)
-            while (await subscriber.recv_multipart())[0] != b"health":
-                continue
-            subscriber.setsockopt(zmq.UNSUBSCRIBE, b"health")
-            yield daemon, subscriber
-        daemon.stop()
-        await task
+        try:
+            await ready.wait()
+            with context.socket(zmq.SUB) as subscriber:
+                subscriber.setsockopt(zmq.RCVHWM, 0)
+                # Health comes once a second and shows that the daemon knows the subscriptions.
+                for topic in (*topics, "health"):
+                    subscriber.setsockopt(zmq.SUBSCRIBE, topic.encode())
+                subscriber.connect(loaded.publish)
+                while (await subscriber.recv_multipart())[0] != b"health":
+                    continue
+                subscriber.setsockopt(zmq.UNSUBSCRIBE, b"health")
+                yield daemon, subscriber
+        finally:
+            daemon.stop()
+            await task
 
 
 async def trace_frame(rig: Path, folder: Path) -> Way:
@@ -195,7 +116,7 @@ async def trace_frame(rig: Path, folder: Path) -> Way:
                 await asyncio.to_thread(board.wait_for_start)
                 for number, line in enumerate(lines):
                     await asyncio.sleep(FRAME_PERIOD_S)
-                    trace.calls, trace.recording = [], number >= common.FIRST_VALID_FRAME
+                    trace.calls, trace.recording = {}, number >= common.FIRST_VALID_FRAME
                     await asyncio.to_thread(board.send, line)
                     received: dict[str, Any] = {}
                     while len(received) < 2:
@@ -243,7 +164,7 @@ async def trace_command(rig: Path, folder: Path) -> Way:
 def traced_worker(folder: Path) -> Iterator[None]:
     """Let the robot's process be traced: the daemon starts it with a launcher that calls `run_worker`."""
     launcher, python = folder / "python", sys.executable
-    call = f"from pathlib import Path; from benchmarks.call_counts import run_worker; run_worker(Path('{folder}'))"
+    call = f"from pathlib import Path; from benchmarks.call_trace import run_worker; run_worker(Path('{folder}'))"
     launcher.write_text(f'#!/bin/sh\nexec "{python}" -c "{call}"\n')
     launcher.chmod(0o755)
     sys.executable = str(launcher)
@@ -253,35 +174,10 @@ def traced_worker(folder: Path) -> Iterator[None]:
         sys.executable = python
 
 
-def run_worker(folder: Path) -> None:
-    """Run the robot's process; write the shortest path of a wrist speed into a file of the folder."""
-    trace = WorkerTrace(folder / WORKER)
-    trace.recording = True
-    trace.install()
-    worker.main()
-
-
-class WorkerTrace(WayTrace):
-    """Records the ways of wrist speeds through the robot's process; the shortest one is in a file."""
-
-    def __init__(self, path: Path) -> None:
-        begun = worker._handle_commands.__code__
-        super().__init__(
-            lambda frame: frame.f_code is begun,
-            [CommandHandler.tick.__code__],
-            # Named, because ur-rtde is loaded later.
-            lambda code: code.co_qualname == "UrArm.wrist",
-        )
-        self._path = path
-        self._best: Way | None = None
-
-    def take(self) -> Way:
-        """Return the path, and write it if it is the shortest one."""
-        way = super().take()
-        if self._best is None or len(way) < len(self._best):
-            self._best = way
-            self._path.write_text(json.dumps(way))
-        return way
+async def within(seconds: float, tracing: Coroutine[None, None, Way]) -> Way:
+    """Return the traced way; raises TimeoutError if it takes longer."""
+    async with asyncio.timeout(seconds):
+        return await tracing
 
 
 def trace_calibration(rig: Path, folder: Path) -> Way:
@@ -330,8 +226,8 @@ def measure(rig: Path) -> dict[str, Any]:
         for kind in ("frame", "command", "calibration"):
             (Path(name) / kind).mkdir()
         for kind, trace in (
-            ("frame", lambda rig, folder: asyncio.run(trace_frame(rig, folder))),
-            ("command", lambda rig, folder: asyncio.run(trace_command(rig, folder))),
+            ("frame", lambda rig, folder: asyncio.run(within(LONGEST_S, trace_frame(rig, folder)))),
+            ("command", lambda rig, folder: asyncio.run(within(LONGEST_S, trace_command(rig, folder)))),
             ("calibration", trace_calibration),
         ):
             way = ways[kind] = trace(rig, Path(name) / kind)

@@ -2,7 +2,8 @@
 
 import pytest
 
-from benchmarks.call_counts import Trace, WayTrace, counts, loaded_by_run
+from benchmarks.call_counts import counts, loaded_by_run
+from benchmarks.call_trace import Trace, WayTrace
 from shearloop import units
 
 NOT_ON_THE_ROBOTS_PC = ("emulators", "tools", "studies")

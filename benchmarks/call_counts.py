@@ -13,10 +13,12 @@ task publishes once a second do not belong to it. Generators count once, and com
 import asyncio
 import contextlib
 import json
+import multiprocessing
 import subprocess
 import sys
 import tempfile
-from collections.abc import AsyncIterator, Coroutine, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +44,7 @@ from shearloop.tools.calibrate import calibrate
 SIDE = "right"
 TRACED = 5
 # Each stage ends after this time, whatever happens.
-LONGEST_S = 60.0
+LONGEST_S = 120.0
 CALIBRATED_ON = ("rig-17.5mm.mcap", "rig-25mm.mcap", "rig-40mm.mcap")
 EXPERIMENT = {
     "name": "hold 0.05 N·m",
@@ -52,7 +54,6 @@ EXPERIMENT = {
         {"do": "release", "timeout_s": 15},
         {"do": "tare", "timeout_s": 30},
         {"do": "grip", "width_mm": 5, "force_n": 60, "timeout_s": 15},
-        {"do": "wait", "wait_s": 8},
         {"do": "identify", "amplitude_rad": 0.15, "timeout_s": 180},
         {"do": "hold_torque", "torque_nm": 0.05, "ramp_nm_per_s": 0.02, "hold_s": 60, "timeout_s": 120},
     ],
@@ -174,13 +175,7 @@ def traced_worker(folder: Path) -> Iterator[None]:
         sys.executable = python
 
 
-async def within(seconds: float, tracing: Coroutine[None, None, Way]) -> Way:
-    """Return the traced way; raises TimeoutError if it takes longer."""
-    async with asyncio.timeout(seconds):
-        return await tracing
-
-
-def trace_calibration(rig: Path, folder: Path) -> Way:
+async def trace_calibration(rig: Path, folder: Path) -> Way:
     """Return the functions of a calibration of the default estimator, from recordings to its file."""
     trace = Trace()
     trace.recording = True
@@ -219,18 +214,32 @@ def diagram(way: Way) -> str:
     return "\n".join(f"  {module:<{width}}  {' · '.join(names)}" for module, names in functions.items())
 
 
+STAGES: dict[str, Callable[[Path, Path], Coroutine[None, None, Way]]] = {
+    "frame": trace_frame,
+    "command": trace_command,
+    "calibration": trace_calibration,
+}
+
+
+def trace(kind: str, rig: Path) -> Way:
+    """Return the way of one stage; raises TimeoutError if it takes too long."""
+
+    async def within() -> Way:
+        async with asyncio.timeout(LONGEST_S):
+            return await STAGES[kind](rig, Path(folder))
+
+    with tempfile.TemporaryDirectory() as folder:
+        return asyncio.run(within())
+
+
 def measure(rig: Path) -> dict[str, Any]:
     """Return the paths and the modules that `shearloop run` loads, after printing each path."""
     ways: dict[str, Way] = {}
-    with tempfile.TemporaryDirectory() as name:
-        for kind in ("frame", "command", "calibration"):
-            (Path(name) / kind).mkdir()
-        for kind, trace in (
-            ("frame", lambda rig, folder: asyncio.run(within(LONGEST_S, trace_frame(rig, folder)))),
-            ("command", lambda rig, folder: asyncio.run(within(LONGEST_S, trace_command(rig, folder)))),
-            ("calibration", trace_calibration),
-        ):
-            way = ways[kind] = trace(rig, Path(name) / kind)
+    # Each in a process of its own: most of their time they wait for devices.
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn"), max_tasks_per_child=1) as processes:
+        traced = {kind: processes.submit(trace, kind, rig) for kind in STAGES}
+        for kind, result in traced.items():
+            way = ways[kind] = result.result()
             print("A {}: {functions} functions in {modules} modules".format(kind, **counts(way)))
             print(diagram(way), end="\n\n", flush=True)
     loaded = loaded_by_run()

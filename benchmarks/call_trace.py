@@ -14,6 +14,7 @@ from types import CodeType, FrameType
 import shearloop
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.command_handler import CommandHandler
+from shearloop.drivers.ur.motion import MotionExecutor
 
 PACKAGE = Path(shearloop.__file__).resolve().parent
 # The rooms are links to neighbouring folders.
@@ -127,7 +128,9 @@ class WorkerTrace(WayTrace):
     def take(self) -> Way:
         """Return the path, and write it if it is the shortest one."""
         way = super().take()
-        if self._best is None or len(way) < len(self._best):
+        # A stop ends in the same call.
+        turns = any(name == MotionExecutor._keep_turning.__qualname__ for _, name in way)
+        if turns and (self._best is None or len(way) < len(self._best)):
             self._best = way
             self._path.write_text(json.dumps(way))
         return way

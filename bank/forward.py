@@ -108,7 +108,7 @@ class BatchForwardModel:
         n_nodes = len(mesh.nodes)
         place[n_nodes:] += 1
         place[place < 0] = n_nodes - 1
-        self._elimination = Elimination(self.direct.terms.moved(place), n_nodes + mesh.n_electrodes, mesh.n_electrodes)
+        self.elimination = Elimination(self.direct.terms.moved(place), n_nodes + mesh.n_electrodes, mesh.n_electrodes)
 
     def voltages(self, conductivities: FloatArray) -> FloatArray:
         """Return the (m, n) voltages of (m, T) conductivities of the mesh's triangles.
@@ -118,7 +118,7 @@ class BatchForwardModel:
         """
         for each in conductivities:
             require_positive(each, len(self.mesh.triangles))
-        schur = self._elimination.schur_complements(conductivities)
+        schur = self.elimination.schur_complements(conductivities)
         found = np.empty((len(conductivities), self.direct.table.n_channels))
         sound = rounding_leaks(schur) <= MAX_LEAK
         # The last electrode is grounded: only differences of potentials are wanted.

@@ -308,11 +308,11 @@ class _PruningMatcher(Matcher):
         likeliest = int(candidates.cells[candidates.bounds.argmax()])
         reached = max(reached, self.score(likeliest, candidates.frames))
         cells = candidates.cells[candidates.bounds >= reached - ROUNDING]
-        scores = np.concatenate([self._highest_scores(some, candidates.frames) for some in in_chunks(cells)])
+        scores = np.concatenate([self.highest_scores(some, candidates.frames) for some in in_chunks(cells)])
         winner = int(np.argmax(scores >= scores.max() - TIE))
         return int(cells[winner]), min(float(scores[winner]), 1.0)
 
-    def _highest_scores(self, cells: IntArray, frames: FloatArray) -> FloatArray:
+    def highest_scores(self, cells: IntArray, frames: FloatArray) -> FloatArray:
         """Return the highest scores of cells at the lags of (m, n) frames."""
         return np.asarray((frames @ self._magnitudes(self._cells[cells]).T).max(axis=0) / self._norms[cells])
 

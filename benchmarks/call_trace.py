@@ -115,7 +115,7 @@ class WorkerTrace(WayTrace):
     """Records the ways of wrist speeds through the robot's process; the shortest one is in a file."""
 
     def __init__(self, path: Path) -> None:
-        begun = worker._handle_commands.__code__
+        begun = worker.handle_commands.__code__
         super().__init__(
             lambda frame: frame.f_code is begun,
             [CommandHandler.tick.__code__],

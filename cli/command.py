@@ -92,11 +92,11 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"shearloop command: {args.name} was refused: {reply.get('reason')}", file=sys.stderr)
         if reply.get("invalid") and args.experiment is not None:
-            print(_mistakes(args.experiment), file=sys.stderr, end="")
+            print(mistakes_of(args.experiment), file=sys.stderr, end="")
     return 0 if accepted else 1
 
 
-def _mistakes(experiment: Path) -> str:
+def mistakes_of(experiment: Path) -> str:
     """Return the mistakes of an experiment, as lines, which the daemon does not tell.
 
     It may read files that this user may not. Empty if the file is on the daemon's computer only.

@@ -37,17 +37,26 @@ def full_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def arguments_of(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    """Return the arguments of a parser but its parts; argparse has no public list of them."""
+    return [action for action in parser._actions if not isinstance(action, argparse._SubParsersAction)]
+
+
+def parts_of(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Return the parsers of a command's parts by name."""
+    parts = [action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    return {name: below for choices in parts for name, below in choices.items()}
+
+
 def _mark_files(parser: argparse.ArgumentParser) -> None:
     """Let the shell complete file names where an argument is a path."""
     import shtab
 
     from shearloop.cli.options import path_of
 
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for subparser in action.choices.values():
-                _mark_files(subparser)
-            continue
+    for subparser in parts_of(parser).values():
+        _mark_files(subparser)
+    for action in arguments_of(parser):
         if isinstance(action.choices, dict):
             # shtab would take a dictionary of choices for sub-commands.
             action.choices = list(action.choices)

@@ -76,7 +76,7 @@ class EmulatedDevices:
         self._recording = recording
         self._waiting: list[tuple[EventConfig, subprocess.Popen[bytes]]] = []
         self._since_ns: dict[int, int] = {}
-        self._truth: Path | None = None
+        self.truth: Path | None = None
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
@@ -84,7 +84,7 @@ class EmulatedDevices:
         with contextlib.ExitStack() as stack:
             if any(emulator.device == "rig" and "--truth" not in emulator.arguments for emulator in self._emulators):
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="shearloop-"))
-                self._truth = Path(folder) / "truth.jsonl"
+                self.truth = Path(folder) / "truth.jsonl"
             devices: list[tuple[subprocess.Popen[bytes], IO[bytes]]] = []
             for emulator in self._emulators:
                 output: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
@@ -116,10 +116,10 @@ class EmulatedDevices:
 
         from shearloop.daemon.run_summary import TorqueSeries
 
-        if self._truth is None or not self._truth.exists():
+        if self.truth is None or not self.truth.exists():
             return None
         # The last line may be incomplete.
-        lines = self._truth.read_text(encoding="utf-8").rpartition("\n")[0].splitlines()
+        lines = self.truth.read_text(encoding="utf-8").rpartition("\n")[0].splitlines()
         rows = [(row["t_mono_ns"], row["torque_nm"]) for row in map(json.loads, lines)]
         table = np.array(rows, dtype=float).reshape(-1, 2)
         return TorqueSeries(table[:, 0], table[:, 1])
@@ -128,8 +128,8 @@ class EmulatedDevices:
         source = emulator.synthetic
         if self._recording is not None and emulator.device == "eit-kit":
             source = ("--recording", str(self._recording.resolve()))
-        if self._truth is not None and emulator.device == "rig":
-            source = (*source, "--truth", str(self._truth))
+        if self.truth is not None and emulator.device == "rig":
+            source = (*source, "--truth", str(self.truth))
         return [*SHEARLOOP, "emulate", emulator.device, *emulator.arguments, *source]
 
     def _send_events(self, now_ns: int, step: int) -> None:

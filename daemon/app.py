@@ -62,7 +62,7 @@ class Daemon:
         clock = Clock()
         self.supervisor = Supervisor()
         self._summary = summary or RunSummary()
-        self._end = asyncio.Event()
+        self.ending = asyncio.Event()
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
             refusals = Refusals()
@@ -80,23 +80,23 @@ class Daemon:
                 self.publisher.add_listener(self.recorder.record_message)
                 opened.callback(self.recorder.close)
             self.health = HealthReporter(self.publisher, self.supervisor, clock, config.emulated, config.name)
-            self.sensors, self._rig = build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
-            if self._rig is not None:
-                if self._rig.commissioning is not None:
-                    self.health.cap = partial(getattr, self._rig.commissioning, "sentence")
+            self.sensors, self.rig = build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
+            if self.rig is not None:
+                if self.rig.commissioning is not None:
+                    self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
                 self.health.refusals |= {
-                    "tare": self._rig.control_loop.tare_refusal,
-                    "start": self._rig.runner.start_refusal,
-                    "release": self._rig.runner.release_refusal,
+                    "tare": self.rig.control_loop.tare_refusal,
+                    "start": self.rig.runner.start_refusal,
+                    "release": self.rig.runner.release_refusal,
                 }
             self._experiment: ConfiguredExperiment | None = None
-            if config.experiment is not None and self._rig is not None:
-                daemon_end = self._end if config.stop_when_done else None
+            if config.experiment is not None and self.rig is not None:
+                daemon_end = self.ending if config.stop_when_done else None
                 self._experiment = ConfiguredExperiment(
-                    config.experiment, self._rig, autostart=config.autostart, daemon_end=daemon_end
+                    config.experiment, self.rig, autostart=config.autostart, daemon_end=daemon_end
                 )
             self.commands = Commands(
-                self._rig, self.sensors, self._experiment, self.health, self._end, partial(self._report, clock)
+                self.rig, self.sensors, self._experiment, self.health, self.ending, partial(self._report, clock)
             )
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)
@@ -105,17 +105,17 @@ class Daemon:
             self._close = opened.pop_all().close
         tasks: dict[str, Task | None] = {
             **self.sensors.tasks,
-            **(self._rig.tasks if self._rig is not None else {}),
+            **(self.rig.tasks if self.rig is not None else {}),
             "experiment": self._experiment,
-            "recording": RecordingTask(self.recorder, self._rig) if self.recorder is not None else None,
+            "recording": RecordingTask(self.recorder, self.rig) if self.recorder is not None else None,
             "clients": authenticator,
             "commands": server,
             "stop": stop_socket,
             "publish": self.publisher,
             "health": self.health,
         }
-        self._tasks = {name: task for name, task in tasks.items() if task is not None}
-        for name, part in {**self._tasks, COMBINED: self.sensors.combined, "commands": refusals}.items():
+        self.tasks = {name: task for name, task in tasks.items() if task is not None}
+        for name, part in {**self.tasks, COMBINED: self.sensors.combined, "commands": refusals}.items():
             if isinstance(part, Reporter):
                 self.health.reporters[name] = part
 
@@ -123,8 +123,8 @@ class Daemon:
         """Run until `stop`, then end every task and close the sockets; `on_ready` is called once the tasks run."""
         try:
             await self._run_tasks(on_ready)
-            if self._rig is not None and self._rig.memory is not None:
-                await self._rig.memory.save(Remembered.of(self._rig.control_loop))
+            if self.rig is not None and self.rig.memory is not None:
+                await self.rig.memory.save(Remembered.of(self.rig.control_loop))
             self.health.publish_end(finished=self.finished, summary=self._summary.text)
         finally:
             try:
@@ -141,24 +141,24 @@ class Daemon:
         async with asyncio.TaskGroup() as group:
             running = {
                 name: group.create_task(self.supervisor.keep_running(name, task), name=name)
-                for name, task in self._tasks.items()
+                for name, task in self.tasks.items()
             }
             structlog.get_logger().info("running", sensors=list(self.sensors.tareable))
             on_ready()
             notify("READY=1")
-            await self._end.wait()
+            await self.ending.wait()
             notify("STOPPING=1")
-            if self._rig is not None:
-                self._rig.runner.close()
+            if self.rig is not None:
+                self.rig.runner.close()
                 if self._experiment is not None and self._experiment.has_begun.is_set():
                     await asyncio.wait({running["experiment"]}, timeout=REPORTED_WITHIN_S)
-                await self._rig.runner.halt_and_wait()
+                await self.rig.runner.halt_and_wait()
             for task in running.values():
                 task.cancel()
 
     def stop(self) -> None:
         """End `run` as soon as the tasks have ended."""
-        self._end.set()
+        self.ending.set()
 
     def _report(self, clock: Clock, answered: Answered) -> None:
         """Publish a command and its answer."""

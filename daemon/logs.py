@@ -40,8 +40,8 @@ class NonBlockingWriter:
         self._waiting: queue.Queue[str | None] = queue.Queue(most_waiting)
         self._dropped = False
         # A daemon thread: a blocked write must not keep the process alive.
-        self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
-        self._thread.start()
+        self.thread = threading.Thread(target=self._run, name="writer", daemon=True)
+        self.thread.start()
 
     def write(self, text: str) -> int:
         """Queue a text; return its length, as a stream does."""
@@ -59,7 +59,7 @@ class NonBlockingWriter:
         until_s = time.monotonic() + timeout_s
         with contextlib.suppress(queue.Full):
             self._waiting.put(None, timeout=timeout_s)
-        self._thread.join(max(0.0, until_s - time.monotonic()))
+        self.thread.join(max(0.0, until_s - time.monotonic()))
 
     def _run(self) -> None:
         text: str | None = ""

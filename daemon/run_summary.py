@@ -116,7 +116,7 @@ class RunSummary:
         self.text = ""
         # Whether no experiment has been stopped by anything but a person.
         self.ended_as_asked = True
-        self._out = out
+        self.out = out
         self._emulated = emulated
         self._run: _Run | None = None
 
@@ -125,7 +125,7 @@ class RunSummary:
         if topic == "loop.state":
             self._on_loop_state(content)
         elif topic == "loop.stop":
-            self._add(stop_sentence(content))
+            self.add(stop_sentence(content))
         elif self._run is not None:
             _on_sample(self._run, topic, content)
 
@@ -146,12 +146,13 @@ class RunSummary:
             if self._heading:
                 lines.insert(0, self._heading)
             self.text = ""
-            self._add("\n".join(lines))
+            self.add("\n".join(lines))
 
-    def _add(self, text: str) -> None:
+    def add(self, text: str) -> None:
+        """Append to the summary, and write it to the output, if there is one."""
         self.text = f"{self.text}\n{text}".lstrip("\n")
-        if self._out is not None:
-            self._out.write(f"\n{printable(text)}\n\n")
+        if self.out is not None:
+            self.out.write(f"\n{printable(text)}\n\n")
 
 
 def _was_asked_for(content: Mapping[str, Any]) -> bool:

@@ -393,7 +393,8 @@ class EitKit(SerialSensor[Frame]):
         }
 
     @property
-    def _longest_silence_s(self) -> float:
+    def longest_silence_s(self) -> float:
+        """The silence after which the board counts as lost."""
         return max(SILENT_PERIODS * self.period_s, MIN_SILENCE_S)
 
     async def _on_open(self, port: Port) -> None:

@@ -276,7 +276,7 @@ class SerialSensor(Generic[ValueT]):
         self._silence_s = BOOT_S
         # Values of the last read that `readings` has not yielded yet: the parser is ahead of its reader by these.
         self.unread = 0
-        self._least_patience = self._patience = patience
+        self._least_patience = self.patience = patience
         self._prompt_values = 0
         self._value_ns = 0
 
@@ -300,7 +300,7 @@ class SerialSensor(Generic[ValueT]):
                     port = self._link.port or await self._open()
                     received = await port.read(self._silence_s)
                     if received is None:
-                        self._patience = min(2 * self._patience, LONGEST_PATIENCE)
+                        self.patience = min(2 * self.patience, LONGEST_PATIENCE)
                         raise DeviceLostError(
                             f"{port.path} is open but has sent nothing for {self._silence_s:.1f} s; {self.silence_hint}"
                         )
@@ -309,7 +309,7 @@ class SerialSensor(Generic[ValueT]):
                 except DriverError as error:
                     await self._link.lost(error)
                     continue
-                self._silence_s = self._patience * self._longest_silence_s
+                self._silence_s = self.patience * self.longest_silence_s
                 yield values
 
     @property
@@ -336,9 +336,9 @@ class SerialSensor(Generic[ValueT]):
                 raise DeviceLostError(f"{port.path} has sent nothing of use for {waited_s:.1f} s: {why}")
             return
         self._value_ns = now_ns
-        self._prompt_values = self._prompt_values + 1 if waited_s < 0.5 * self._longest_silence_s else 0
+        self._prompt_values = self._prompt_values + 1 if waited_s < 0.5 * self.longest_silence_s else 0
         if self._prompt_values >= PROMPT_VALUES:
-            self._patience = self._least_patience
+            self.patience = self._least_patience
 
     def _dispatch(self, kind: InputKind, t_ns: int, data: bytes = b"") -> Sequence[ValueT]:
         event = RawEvent(kind, t_ns, data)
@@ -354,12 +354,13 @@ class SerialSensor(Generic[ValueT]):
         port = await self._link.open()
         self._value_ns = time.monotonic_ns()
         self._dispatch(InputKind.OPENED, self._value_ns)
-        self._silence_s = max(BOOT_S, self._patience * self._longest_silence_s)
+        self._silence_s = max(BOOT_S, self.patience * self.longest_silence_s)
         await self._on_open(port)
         return port
 
     @property
-    def _longest_silence_s(self) -> float:
+    def longest_silence_s(self) -> float:
+        """The silence after which the board counts as lost."""
         return SILENT_PERIODS * self._period_s
 
     async def _on_open(self, port: Port) -> None:

@@ -92,7 +92,7 @@ class EmulatedRig:
                 seed=seed,
             )
         self._played: list[EitKitBoard | Hx711Board | Server] = [*boards.values()]
-        self._commanded: dict[str, Device] = {**boards}
+        self.commanded: dict[str, Device] = {**boards}
         self.ports = {name: board.port.appearances for name, board in boards.items()}
         if gripper_on != "none":
             player = GripperPlayer(
@@ -102,9 +102,9 @@ class EmulatedRig:
                 else SocketServer(UrcapSession(gripper), host, URCAP_PORT),
             )
             self._played.append(player.server)
-            self._commanded["gripper"] = player
+            self.commanded["gripper"] = player
             self.ports["gripper"] = player.server.appearances
-        self._commanded["robot"] = self.controller
+        self.commanded["robot"] = self.controller
 
     async def run(self) -> None:
         """Play all but the robot until cancelled; OSError, in a group, if an address or port is not available."""
@@ -129,23 +129,23 @@ class EmulatedRig:
                 self._device("gripper").command(text)
             case ["normal"]:
                 self.scene.load_nm, self.scene.load_sign = 0.0, 1.0
-                for commanded in self._commanded.values():
+                for commanded in self.commanded.values():
                     commanded.command("normal")
             case ["replug", device]:
                 self._device(device).command("normal")
             case ["silence" | "unplug" as outage, device, *seconds]:
                 self._device(device).command(" ".join([outage, *seconds]))
-            case [device, *words] if device in self._commanded and words:
-                self._commanded[device].command(" ".join(words))
+            case [device, *words] if device in self.commanded and words:
+                self.commanded[device].command(" ".join(words))
             case [name, *_] if name in FAULTS:
                 self.controller.command(text)
             case _:
                 raise ValueError(f"{text!r} is no command; there are {COMMANDS}")
 
     def _device(self, name: str) -> Device:
-        if name not in self._commanded:
-            raise ValueError(f"there is no device {name!r}; there are {', '.join(self._commanded)}")
-        return self._commanded[name]
+        if name not in self.commanded:
+            raise ValueError(f"there is no device {name!r}; there are {', '.join(self.commanded)}")
+        return self.commanded[name]
 
     def _frames(self, synthesiser: FrameSynthesiser, sign: float) -> Iterator[bytes]:
         while True:

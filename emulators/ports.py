@@ -27,10 +27,10 @@ class PtyPort:
         self.received: asyncio.Queue[bytes] = asyncio.Queue()
         self.appearances: asyncio.Queue[str] = asyncio.Queue()
         self._link = link
-        self._master: int | None = None
+        self.master: int | None = None
         # Held open, so that the port outlives the programs that open it.
         self._slave = -1
-        self._terminal = ""
+        self.terminal = ""
         self._room = asyncio.Event()
         # Set while a write waits for the reader.
         self.held_up = asyncio.Event()
@@ -38,7 +38,7 @@ class PtyPort:
     @property
     def path(self) -> str:
         """The path for the other side."""
-        return self._terminal if self._link is None else str(self._link)
+        return self.terminal if self._link is None else str(self._link)
 
     def __enter__(self) -> Self:
         """Plug the port in."""
@@ -51,33 +51,33 @@ class PtyPort:
 
     def plug(self) -> None:
         """Make the port appear, under a new terminal; OSError if the link cannot be made."""
-        if self._master is not None:
+        if self.master is not None:
             return
         if self._link is not None and self._link.exists() and not self._link.is_symlink():
             raise FileExistsError(f"{self._link} is a file")
-        self._master, self._slave = os.openpty()
+        self.master, self._slave = os.openpty()
         tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._terminal = os.ttyname(self._slave)
+        os.set_blocking(self.master, False)
+        self.terminal = os.ttyname(self._slave)
         if self._link is not None:
             fresh = self._link.with_name(f".{self._link.name}.{os.getpid()}")
-            fresh.symlink_to(self._terminal)
+            fresh.symlink_to(self.terminal)
             fresh.replace(self._link)
-        asyncio.get_running_loop().add_reader(self._master, self._receive, self._master)
+        asyncio.get_running_loop().add_reader(self.master, self._receive, self.master)
         self.appearances.put_nowait(self.path)
 
     def unplug(self) -> None:
         """Make the port disappear: its users are hung up on and unread bytes are lost."""
-        if self._master is None:
+        if self.master is None:
             return
         loop = asyncio.get_running_loop()
-        loop.remove_reader(self._master)
-        loop.remove_writer(self._master)
-        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self._terminal:
+        loop.remove_reader(self.master)
+        loop.remove_writer(self.master)
+        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.terminal:
             self._link.unlink()
-        os.close(self._master)
+        os.close(self.master)
         os.close(self._slave)
-        self._master = None
+        self.master = None
         self._room.set()
 
     def _receive(self, master: int) -> None:
@@ -87,13 +87,13 @@ class PtyPort:
     async def write(self, data: bytes) -> None:
         """Write all of `data`, waiting for the reader; ConnectionError if unplugged."""
         while data:
-            if self._master is None:
+            if self.master is None:
                 raise ConnectionError("the port is unplugged")
             try:
-                data = data[os.write(self._master, data) :]
+                data = data[os.write(self.master, data) :]
             except BlockingIOError:
                 self._room.clear()
-                asyncio.get_running_loop().add_writer(self._master, self._on_room, self._master)
+                asyncio.get_running_loop().add_writer(self.master, self._on_room, self.master)
                 self.held_up.set()
                 await self._room.wait()
                 self.held_up.clear()

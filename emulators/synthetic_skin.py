@@ -41,7 +41,7 @@ class SyntheticSkin:
         self.radius_mm = radius_mm
         self.normal_n = normal_n
         self.shear_n = 0.0
-        self._state = UNSTRETCHED
+        self.state = UNSTRETCHED
         self._random = Random(seed)
         self._wander = [self._random.gauss(0.0, DRIFT_STD / math.sqrt(2.0)) for _ in range(2)]
 
@@ -53,7 +53,7 @@ class SyntheticSkin:
     def push(self, shear_n: float) -> None:
         """Set the shear force."""
         self.shear_n = shear_n
-        self._state = self.membrane.step(self._state, shear_n, self.normal_n)
+        self.state = self.membrane.step(self.state, shear_n, self.normal_n)
 
     def turn(self, angle_rad: float) -> float:
         """Turn the tool to an angle, counted from its first contact; return the shear force.
@@ -65,9 +65,9 @@ class SyntheticSkin:
         slipping_mm_per_n = sticking_mm_per_n + math.pi / 2 * outer_mm * self.membrane.sheet_per_n
         shear_n = self.shear_n
         for _ in range(MOST_STEPS):
-            state = self.membrane.step(self._state, shear_n, self.normal_n)
+            state = self.membrane.step(self.state, shear_n, self.normal_n)
             beyond_mm = way_mm - sticking_mm_per_n * shear_n - outer_mm * self.membrane.turned_rad(state)
-            slips = state.net_tension_n != self._state.net_tension_n
+            slips = state.net_tension_n != self.state.net_tension_n
             change_n = beyond_mm / (slipping_mm_per_n if slips else sticking_mm_per_n)
             shear_n += change_n
             if abs(change_n) < TOLERANCE_N:
@@ -83,7 +83,7 @@ class SyntheticSkin:
 
     def resistances_ohm(self) -> tuple[float, float]:
         """Return R₁ and R₂ now, without measurement noise."""
-        response = self.membrane.response(self._state)
+        response = self.membrane.response(self.state)
         stretched = abs(response) / (1.0 - self.slack_ratio)
         slack = self.slack_ratio * stretched
         changes = (stretched, slack) if response >= 0 else (slack, stretched)

@@ -196,7 +196,7 @@ class Arm:
         self.hung_kg = 0.0
         self._framed_q_rad, self._last_frame = self.q_rad, tool_frames(self.q_rad, self._tool)[-1]
         self._plant = plant
-        self._wrench = np.zeros(6)
+        self.load = np.zeros(6)
         self._wrench_zero = np.zeros(6)
         self._noise, self._random = np.zeros(6), np.random.default_rng(0)
 
@@ -227,7 +227,7 @@ class Arm:
         """Force and torque at the tool, relative to the zero."""
         hung_n = np.array([0.0, 0.0, -constants.g * self.hung_kg])
         apart = np.concatenate([self.bias_n + hung_n, np.zeros(3)])
-        return np.asarray(self._wrench + self._noise - self._wrench_zero + apart)
+        return np.asarray(self.load + self._noise - self._wrench_zero + apart)
 
     @property
     def measured_rad_per_s(self) -> Vector:
@@ -278,8 +278,8 @@ class Arm:
         if self._plant is not None:
             torque_nm = self._plant.step(dt_s, float(self.q_rad[5]))
             flange_axis = self._frame[:3, :3] @ self._tool[2, :3]
-            self._wrench = np.concatenate([np.zeros(3), torque_nm * flange_axis])
+            self.load = np.concatenate([np.zeros(3), torque_nm * flange_axis])
 
     def zero_wrench(self) -> None:
         """Make the present wrench zero."""
-        self._wrench_zero = self._wrench.copy()
+        self._wrench_zero = self.load.copy()

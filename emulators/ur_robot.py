@@ -57,7 +57,7 @@ class Robot:
         self.time_s = 0.0
         # The controller's clock, which never stands still.
         self.clock_s = 0.0
-        self._events: list[RobotEvent] = []
+        self.events: list[RobotEvent] = []
         self._program: Program | None = None
         # The last lines of the pendant's log.
         self.log: deque[str] = deque(maxlen=LOG_LINES)
@@ -90,7 +90,7 @@ class Robot:
 
     def take_events(self) -> list[RobotEvent]:
         """Return what has happened since the last call."""
-        events, self._events = self._events, []
+        events, self.events = self.events, []
         return events
 
     def _move(self, dt_s: float) -> None:
@@ -187,4 +187,4 @@ class Robot:
         self._note("faults-cleared")
 
     def _note(self, name: str, detail: str = "") -> None:
-        self._events.append(RobotEvent(self.time_s, name, detail))
+        self.events.append(RobotEvent(self.time_s, name, detail))

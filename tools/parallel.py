@@ -48,12 +48,12 @@ class ProcessExecutor:
     """Runs tasks in spawned processes, which inherit no files, threads or locks."""
 
     def __init__(self, count: int) -> None:
-        self._count = count
+        self.count = count
 
     def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[R]:
         """Yield the results; end the processes at once if they are no longer wanted."""
         others, wanted = active_children(), True
-        count = min(self._count, max(len(items), 1))
+        count = min(self.count, max(len(items), 1))
         pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_ignore_terminal)
         try:
             yield from pool.map(partial(function, shared), items)

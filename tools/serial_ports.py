@@ -57,7 +57,7 @@ def list_serial_ports() -> list[SerialPortInfo]:
             usb="" if port.vid is None else f"{port.vid:04x}:{port.pid:04x}",
             description=port.description if port.description != "n/a" else "",
             likely=BOARDS.get(port.vid or 0, ""),
-            stable_name=_stable_name(port.device, port.serial_number),
+            stable_name=stable_name_of(port.device, port.serial_number),
             error=access_error(port.device),
         )
         for port in ports
@@ -127,7 +127,7 @@ def has_brltty(processes: Path = PROCESSES, rules: Sequence[Path] = UDEV_RULES) 
     return False
 
 
-def _stable_name(device: str, serial_number: str | None) -> str:
+def stable_name_of(device: str, serial_number: str | None) -> str:
     """Return a link that survives swapped cables: ours, or udev's; empty without one.
 
     Two boards without a serial number can have the same name by identity; by socket they differ.

@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     check_calibration_file(args.out)
     check_masses(args.mass_g)
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:
-        levels = asyncio.run(_measure(port, args.mass_g, Operator(stdout_is_for_json=args.json)))
+        levels = asyncio.run(measure(port, args.mass_g, Operator(stdout_is_for_json=args.json)))
     result = fit_levels(levels, args.lever_arm_mm * 1e-3, -1 if args.reverse else 1)
     save_calibration(args.out, result.calibration)
     report = {
@@ -88,7 +88,8 @@ async def _read_samples(port: "SerialPort", samples: "asyncio.Queue[LoadSample]"
     )
 
 
-async def _measure(port: "SerialPort", masses_g: list[float], operator: Operator) -> list["Level"]:
+async def measure(port: "SerialPort", masses_g: list[float], operator: Operator) -> list["Level"]:
+    """Return the levels of the masses, which the operator hangs on one after the other."""
     from shearloop.drivers.errors import DeviceCalibrationError
     from shearloop.drivers.load_cell_calibration import SAMPLES_PER_STEP, SKIP_SAMPLES, check_levels, measure_level
 

@@ -46,7 +46,7 @@ class GripperTask:
         async with contextlib.aclosing(self.gripper.states()) as states:
             async for state in states:
                 self._publish(state)
-                self.control_loop.on_gripper(_status(state))
+                self.control_loop.on_gripper(status_of(state))
 
     async def grip(self, target: GripStep) -> None:
         """Move to a width and wait for the end; raises DriverError and ActionError."""
@@ -55,7 +55,7 @@ class GripperTask:
         state = await self.gripper.finish(sent)
         widest_mm = min(target.width_mm, self.gripper.model.stroke_mm)
         # The loop needs the state before the end of the action.
-        self.control_loop.on_gripper(_status(state))
+        self.control_loop.on_gripper(status_of(state))
         if state.object is ObjectStatus.CONTACT_OPENING and state.width_mm < widest_mm - OPEN_WITHIN_MM:
             stopped = f"the fingers met something as they opened, and stopped at {state.width_mm:.1f} mm"
             raise ActionError(f"{stopped}; clear their way")
@@ -132,7 +132,8 @@ def gripped_diameter(state: GripperState) -> Measured | None:
     return Measured(state.diameter_mm, TWO_SIDED_95 * state.diameter_std_mm)
 
 
-def _status(state: GripperState) -> GripperStatus:
+def status_of(state: GripperState) -> GripperStatus:
+    """Return what the control loop knows of a gripper's state."""
     return GripperStatus(
         state.t_ns,
         state.width_mm,

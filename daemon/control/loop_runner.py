@@ -61,8 +61,8 @@ class ControlLoopRunner:
         self._clock = clock
         self._timeline = StopTimeline()
         self._sender = CommandSender(robot, control_loop, self._timeline, clock)
-        self._actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop)
-        self._states = StatePublisher(publisher, control_loop)
+        self.actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop)
+        self.states = StatePublisher(publisher, control_loop)
         self._running = False
         self._stopped = True
         self._decided_ns = 0
@@ -90,15 +90,15 @@ class ControlLoopRunner:
         except Exception as error:
             self._running = False
             self._control_loop.on_fault(FaultCode.TASK_DIED, f"loop: {error_text(error)}")
-            self._actions.abort()
+            self.actions.abort()
             await self._brake()
             # Without this wait the gripper might not receive its final command.
             await self.halt_and_wait()
             raise
         finally:
             self._running = False
-            self._states.publish_stop(self._timeline.end())
-            await self._actions.close()
+            self.states.publish_stop(self._timeline.end())
+            await self.actions.close()
 
     def stop(self, *, also_idle: bool = False) -> str | None:
         """End the experiment, also during its start, or the unlocking; return its name, or None.
@@ -146,7 +146,7 @@ class ControlLoopRunner:
         """Return why no experiment at all can begin, or None."""
         if self._closed:
             return ENDING
-        if self._actions.unlocking:
+        if self.actions.unlocking:
             return UNLOCKING
         return self._control_loop.start_refusal()
 
@@ -169,7 +169,7 @@ class ControlLoopRunner:
             return STOPPED_AT_START
         if refusal:
             return refusal
-        if self._actions.unlocking:
+        if self.actions.unlocking:
             return UNLOCKING
         return self._control_loop.start(file, self._clock.now_ns())
 
@@ -188,24 +188,24 @@ class ControlLoopRunner:
     async def experiment_ended(self) -> Experiment:
         """Return the present or the next experiment once its end has been published, or another one has begun."""
         while (experiment := self._control_loop.experiment) is None:
-            await self._states.changed.wait()
+            await self.states.changed.wait()
         # An action's failure ends it between two decisions.
         while experiment is self._control_loop.experiment and (
-            experiment is not self._states.ended or self._timeline.pending
+            experiment is not self.states.ended or self._timeline.pending
         ):
-            await self._states.changed.wait()
+            await self.states.changed.wait()
         return experiment
 
     async def halt_and_wait(self) -> None:
         """Halt moving fingers, and wait for the end of the last release or halt, and for the arm's standstill."""
         self.stop_unlocking()
-        if self._actions.fingers_move:
-            self._actions.cancel()
-        await self._actions.wait_for_final_action()
+        if self.actions.fingers_move:
+            self.actions.cancel()
+        await self.actions.wait_for_final_action()
         with suppress(TimeoutError):
             async with asyncio.timeout(BRAKE_S):
                 while self._running and self._timeline.pending:
-                    await self._states.changed.wait()
+                    await self.states.changed.wait()
 
     async def unlock(self) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not."""
@@ -214,7 +214,7 @@ class ControlLoopRunner:
         if (experiment := self._control_loop.running) is not None:
             return f"the experiment {experiment.file.name!r} is running; stop it first"
         try:
-            await self._actions.unlock()
+            await self.actions.unlock()
         except (ActionError, DriverError) as error:
             return str(error)
         self._control_loop.acknowledge()
@@ -227,7 +227,7 @@ class ControlLoopRunner:
         """
         if self._closed:
             return ENDING
-        if self._actions.unlocking:
+        if self.actions.unlocking:
             return UNLOCKING
         state = self._robot.state
         if state is not None and not (state.rests and state.motion == "idle"):
@@ -239,7 +239,7 @@ class ControlLoopRunner:
         if (reason := self.release_refusal()) is not None:
             return reason
         try:
-            await self._actions.open_by_operator()
+            await self.actions.open_by_operator()
         except (ActionError, DriverError) as error:
             return str(error)
         self._control_loop.on_release_ended()
@@ -247,7 +247,7 @@ class ControlLoopRunner:
 
     def stop_unlocking(self) -> bool:
         """End an unlocking or a release, and halt the fingers that it moves; return whether one was under way."""
-        stopped = self._actions.stop_unlocking()
+        stopped = self.actions.stop_unlocking()
         if stopped:
             # The robot's process ends its part.
             self._robot.send(self._sender.stop_command)
@@ -267,7 +267,7 @@ class ControlLoopRunner:
                 enabled_by_start=state.awaits_enable,
             )
         )
-        if self._states.publish_robot(state):
+        if self.states.publish_robot(state):
             # The torque on the tool is opposite to the wrench on the wrist.
             torque = TorqueSample(WRENCH, -state.wrist_torque_nm, "", t_ns, self._clock.now_ns())
             self._control_loop.on_torque(torque)
@@ -284,15 +284,15 @@ class ControlLoopRunner:
         else:
             self._stopped = False
             if not output.interrupts_motion:
-                self._actions.may_move.set()
-            elif self._actions.interrupt():
+                self.actions.may_move.set()
+            elif self.actions.interrupt():
                 self._sender.stop()
             if output.action is not None:
-                self._actions.begin(output.action)
+                self.actions.begin(output.action)
             self._sender.turn(output.wrist_rad_per_s, now_ns)
             self._robot.keep_moving()
-        self._states.publish_loop(self._sender.sent_rad_per_s, now_ns)
-        self._states.publish_stop(self._timeline.update(self._robot.state, now_ns))
+        self.states.publish_loop(self._sender.sent_rad_per_s, now_ns)
+        self.states.publish_stop(self._timeline.update(self._robot.state, now_ns))
 
     def _stop(self, output: ControlOutput, now_ns: int) -> None:
         if not self._stopped:
@@ -300,10 +300,10 @@ class ControlLoopRunner:
             experiment, status = self._control_loop.experiment, self._control_loop.status
             if experiment is not None and experiment.phase is ExperimentPhase.STOPPED:
                 self._timeline.begin(experiment.file.name, status.activity, status.decision, now_ns)
-            self._actions.cancel()
+            self.actions.cancel()
             self._sender.stop()
         if output.release:
-            self._actions.release()
+            self.actions.release()
 
     async def _brake(self) -> None:
         """Stop the arm, including a straight move."""

@@ -64,16 +64,16 @@ class StatePublisher:
         self.publisher.publish(loop_state(self.control_loop, sent_rad_per_s, now_ns))
         if experiment is not None and not experiment.running:
             self.ended = experiment
-        self._notify()
+        self.notify()
 
     def publish_stop(self, stop: LoopStop | None) -> None:
         """Publish the times of a stop, if there is one."""
         if stop is not None:
             self.publisher.publish(stop)
-            self._notify()
+            self.notify()
 
-    def _notify(self) -> None:
-        # Wake the present waiters only.
+    def notify(self) -> None:
+        """Wake those who wait for a change at present."""
         self.changed.set()
         self.changed.clear()
 

@@ -53,6 +53,11 @@ class RateLimit:
         # The number of remembered clients; the oldest are forgotten.
         self._bucket_of = lru_cache(MAX_CLIENTS)(lambda _client: TokenBucket(CLIENT_BURST, CLIENT_PER_S))
 
+    @property
+    def remembered(self) -> int:
+        """How many clients have a limit of their own at present."""
+        return self._bucket_of.cache_info().currsize
+
     def allow(self, client: bytes, t_ns: int) -> bool:
         """Return whether a client may send one more request at monotonic time t_ns.
 

@@ -41,7 +41,7 @@ class Publisher:
         # Each with whether its errors are raised.
         self._listeners: list[tuple[Listener, bool]] = []
         # Topic beginnings that have subscribers.
-        self._prefixes: tuple[bytes, ...] = ()
+        self.prefixes: tuple[bytes, ...] = ()
         self._errors: Counter[str] = Counter()
         # An XPUB socket is a PUB socket that also receives the subscriptions.
         self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
@@ -106,12 +106,17 @@ class Publisher:
         """Return whether there is a subscriber to this topic."""
         if int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             self._read_subscriptions()
-        return topic.encode().startswith(self._prefixes)
+        return topic.encode().startswith(self.prefixes)
 
     def has_subscribers(self) -> bool:
         """Return whether there is a subscriber to any topic."""
         self._read_subscriptions()
-        return bool(self._prefixes)
+        return bool(self.prefixes)
+
+    @property
+    def address(self) -> str:
+        """The bound address, with the port that a `*` stands for."""
+        return str(self._socket.getsockopt_string(zmq.LAST_ENDPOINT))
 
     def close(self) -> None:
         """Close the socket; subscribers have a moment to take the last messages."""
@@ -124,6 +129,6 @@ class Publisher:
             message = self._socket.recv(zmq.NOBLOCK)
             kind, prefix = message[:1], message[1:]
             if kind == b"\x00":
-                self._prefixes = tuple(one for one in self._prefixes if one != prefix)
+                self.prefixes = tuple(one for one in self.prefixes if one != prefix)
             elif kind == b"\x01" and any(topic.encode().startswith(prefix) for topic in TOPICS):
-                self._prefixes = tuple({*self._prefixes, prefix})
+                self.prefixes = tuple({*self.prefixes, prefix})

@@ -102,7 +102,7 @@ class Bridge:
         """Subscribe to the daemon, whether or not it runs; raise UserError for a malformed address."""
         self.latest = latest
         self._context = context
-        self._address = address
+        self.address = address
         self._stopping: asyncio.Future[dict[str, Any]] | None = None
         self._socket = context.socket(zmq.SUB)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -159,7 +159,7 @@ class Bridge:
         return await asyncio.shield(self._stopping)
 
     async def _request_stop(self) -> dict[str, Any]:
-        content, address = {"command": "stop", "by": caller(PROGRAM), "spare_daemon": True}, self._address.commands
+        content, address = {"command": "stop", "by": caller(PROGRAM), "spare_daemon": True}, self.address.commands
         reply = None
         if not needs_keys(address):
             # A local daemon accepts it even without valid keys.
@@ -168,7 +168,7 @@ class Bridge:
         return reply or await self._request(content, COMMAND_TIMEOUT_S)
 
     async def _request(self, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
-        return await ask(self._context, self._address.commands, content, timeout_s, self._address.keys)
+        return await ask(self._context, self.address.commands, content, timeout_s, self.address.keys)
 
     async def close(self) -> None:
         """Close the socket; wait for a stop that is on its way."""

@@ -162,7 +162,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
 
     async def _identify(self, *models: str) -> str:
         """Return the reply to *IDN?; ProtocolError unless it names one of the models."""
-        name = (await self._ask("*IDN?")).text
+        name = (await self.ask("*IDN?")).text
         if models and not any(model in name for model in models):
             raise ProtocolError(
                 f"{self.instrument} says it is {name!r}, and not {' or '.join(models)}; see which instrument is there."
@@ -174,7 +174,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
         for command in commands:
             await self._port.write(f"{command}\n".encode())
 
-    async def _ask(self, query: str) -> Reply:
+    async def ask(self, query: str) -> Reply:
         """Return the answer to a query; DeviceSilentError if none comes, DeviceLostError if the port is gone."""
         self._lines.restart()
         asked_ns = arrival_ns = monotonic_ns()
@@ -207,7 +207,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
 
     async def _check(self) -> None:
         """Raise ProtocolError if the instrument rejected a command."""
-        reply = (await self._ask(":SYST:ERR?")).text
+        reply = (await self.ask(":SYST:ERR?")).text
         if not re.match(r"[+-]?0+(,|$)", reply):
             raise ProtocolError(
                 f"{self.instrument} refused its settings: {reply}; see whether it is the model that is meant."
@@ -308,15 +308,15 @@ class Keithley6430(PolledInstrument[SourceReading]):
         return name
 
     async def _read(self) -> SourceReading:
-        off = read_output(await self._ask(OUTPUT))
+        off = read_output(await self.ask(OUTPUT))
         if off is not None:
             return off
         try:
-            reply = await self._ask(READ)
+            reply = await self.ask(READ)
         except DeviceSilentError:
             # The operator may have switched the output off in between: then READ has no reply. Reopening the
             # connection would switch it on again.
-            off = read_output(await self._ask(OUTPUT))
+            off = read_output(await self.ask(OUTPUT))
             if off is None:
                 raise
             return off
@@ -331,7 +331,7 @@ class Keithley6430(PolledInstrument[SourceReading]):
             await self._send(":OUTP OFF", ":OUTP OFF")
             async with asyncio.timeout(SWITCH_OFF_S):
                 # The first answer can belong to a reading in progress.
-                while (await self._ask(OUTPUT)).text != "0":
+                while (await self.ask(OUTPUT)).text != "0":
                     pass
             self._may_be_on = False
         except (DriverError, TimeoutError) as error:
@@ -395,7 +395,7 @@ class ScpiScanner(PolledInstrument[Voltages]):
         return name
 
     async def _read(self) -> Voltages:
-        return read_scan(await self._ask(SCAN))
+        return read_scan(await self.ask(SCAN))
 
 
 class PairParser(LineParser[Voltages]):

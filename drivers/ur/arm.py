@@ -84,7 +84,7 @@ class UrArm:
         self.wrench_zero: Six = (0.0,) * 6
         # The wrench before the last upload, where something was held.
         self._held: Six | None = None
-        self._script_readiness = ScriptReadiness(self._receiver, settings.command_timeout_s)
+        self.script_readiness = ScriptReadiness(self._receiver, settings.command_timeout_s)
 
     def read(self) -> RtdeSample:
         """Return the controller's latest sample and its age."""
@@ -113,7 +113,7 @@ class UrArm:
         self._may_move_linearly = False
         self._write_deadline(left_s)
         speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
-        return self._script_readiness.wait() and bool(
+        return self.script_readiness.wait() and bool(
             self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0)
         )
 
@@ -123,7 +123,7 @@ class UrArm:
 
     def move(self, command: MoveLinear) -> bool:
         """Begin a linear move; `RtdeSample.moving_linearly` shows its end."""
-        if not self._script_readiness.wait():
+        if not self.script_readiness.wait():
             return False
         self._may_move_linearly = True
         self._write_deadline(self._settings.silence_timeout_s)
@@ -140,7 +140,7 @@ class UrArm:
         """Feed the robot's watchdog; a linear move goes on for `left_s` at most."""
         if left_s is not None:
             self._write_deadline(left_s)
-        return self._script_readiness.wait() and bool(self._control.kickWatchdog())
+        return self.script_readiness.wait() and bool(self._control.kickWatchdog())
 
     def clear_command(self) -> bool:
         """Clear the register with the last command while no program runs; False: try again later.
@@ -177,7 +177,7 @@ class UrArm:
             self._held = self._wrench()
             script = carry_wrench(script, self._held)
         self._script_port.send(script)
-        self._script_readiness.command_sent()
+        self.script_readiness.command_sent()
 
     def arm_watchdog(self) -> bool:
         """Arm the robot's watchdog after an upload; accepted only by a program that answers."""
@@ -189,7 +189,7 @@ class UrArm:
 
     def end_program(self) -> None:
         """End the control script; one that is not ready is left to its watchdog."""
-        if self._script_readiness.wait():
+        if self.script_readiness.wait():
             self._control.stopScript()
 
     def withdraw_deadline(self) -> None:
@@ -210,10 +210,10 @@ class UrArm:
 
     def _send_once(self, call: Callable[..., object], *arguments: object, **options: object) -> bool:
         """Send a command that the script carries out once."""
-        if not self._script_readiness.wait():
+        if not self.script_readiness.wait():
             return False
         done = bool(call(*arguments, **options))
-        self._script_readiness.command_sent()
+        self.script_readiness.command_sent()
         return done
 
     def ask_dashboard(self, *requests: str) -> str:

@@ -447,37 +447,37 @@ class RtdeReceiver:
         self._parser = SampleParser()
         self.connected = True
         with explain_failure(host, timeout_s, "asking for its state"):
-            self._connection = socket.create_connection((host, RTDE_PORT), timeout=timeout_s)
-            lose_dead_peers(self._connection)
+            self.connection = socket.create_connection((host, RTDE_PORT), timeout=timeout_s)
+            lose_dead_peers(self.connection)
             try:
                 self._sample = self._first_sample(rate_hz)
             except BaseException:
                 self.close()
                 raise
-        self._connection.setblocking(False)
+        self.connection.setblocking(False)
 
     def close(self) -> None:
         """Close the connection."""
         self.connected = False
-        self._connection.close()
+        self.connection.close()
 
     def _first_sample(self, rate_hz: float) -> RtdeOutputs:
-        _agree_on_protocol(self._connection)
+        _agree_on_protocol(self.connection)
         registers = self._registers
         known = _TYPES | {registers.state: "INT32", registers.clock: "INT32", registers.step: "DOUBLE"}
         for outputs in (known | _TOOL_TYPES, known):
-            answer = _request(self._connection, _OUTPUTS, struct.pack(">d", rate_hz) + ",".join(outputs).encode())
+            answer = _request(self.connection, _OUTPUTS, struct.pack(">d", rate_hz) + ",".join(outputs).encode())
             types = answer[1:].decode(errors="replace")
             if types == ",".join(outputs.values()):
                 break
         else:
             raise OSError(f"its outputs are of the types {types}")
         if self._writes:
-            answer = _request(self._connection, _INPUTS, self._registers.deadline.encode())
+            answer = _request(self.connection, _INPUTS, self._registers.deadline.encode())
             if b"IN_USE" in answer:
                 raise registers_in_use(self._host)
             self._recipe = answer[0]
-        if _request(self._connection, _START) != b"\x01":
+        if _request(self.connection, _START) != b"\x01":
             raise OSError("it does not send its state")
         while self.connected:
             sample = self._receive()
@@ -494,14 +494,14 @@ class RtdeReceiver:
     def write_deadline(self, script_ticks: int) -> None:
         """Write when the motion has to end, by the script's clock."""
         try:
-            self._connection.send(_DEADLINE.pack(_DEADLINE.size, _DATA, self._recipe, script_ticks))
+            self.connection.send(_DEADLINE.pack(_DEADLINE.size, _DATA, self._recipe, script_ticks))
         except OSError:
             # Also where the socket is full: the controller has read nothing for long.
             self.connected = False
 
     def wait(self, seconds: float) -> bool:
         """Wait for data, at most this long, and return whether there is any."""
-        return self.connected and bool(select.select([self._connection], [], [], max(0.0, seconds))[0])
+        return self.connected and bool(select.select([self.connection], [], [], max(0.0, seconds))[0])
 
     def receive_all(self) -> list[RtdeOutputs]:
         """Return every sample received since the last call, oldest first, without waiting."""
@@ -515,7 +515,7 @@ class RtdeReceiver:
         newest, more = None, True
         while more:
             try:
-                data = self._connection.recv(_READ_BYTES)
+                data = self.connection.recv(_READ_BYTES)
                 if every is None:
                     newest = self._parser.feed(data) or newest
                 else:
@@ -523,7 +523,7 @@ class RtdeReceiver:
             except BlockingIOError:
                 break
             except (OSError, ProtocolError) as error:
-                if isinstance(error, TimeoutError) and self._connection.gettimeout():
+                if isinstance(error, TimeoutError) and self.connection.gettimeout():
                     # Only the first sample has a timeout of ours; a later one is the network's.
                     raise
                 data = b""
@@ -575,15 +575,15 @@ class ScriptReadiness:
         self._samples, self._timeout_s = samples, timeout_s
         # By the controller's clock; only a later sample shows the script after the command.
         self._command_s = -math.inf
-        self._waiting = False
+        self.waiting = False
 
     def command_sent(self) -> None:
         """Note that a one-time command was sent, or a program started."""
-        self._command_s, self._waiting = self._samples.latest().timestamp_s, True
+        self._command_s, self.waiting = self._samples.latest().timestamp_s, True
 
     def wait(self) -> bool:
         """Return whether the script is ready; False after the timeout or when the program does not play."""
-        if not self._waiting:
+        if not self.waiting:
             return True
         until_s = time.monotonic() + self._timeout_s
         while True:
@@ -591,7 +591,7 @@ class ScriptReadiness:
             if not self._samples.connected or sample.runtime_state != RUNTIME_PLAYING:
                 return False
             if sample.timestamp_s > self._command_s and sample.script_state == SCRIPT_READY:
-                self._waiting = False
+                self.waiting = False
                 return True
             if not self._samples.wait(until_s - time.monotonic()):
                 return False

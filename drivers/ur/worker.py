@@ -50,7 +50,8 @@ class Pipe:
     def __init__(self, stdin: int, stdout: int) -> None:
         self._in, self._out = stdin, stdout
         self._decoder = messages.MessageDecoder()
-        self._unsent = b""
+        # Of the messages sent last.
+        self.unsent = b""
         self.open = True
         os.set_blocking(stdin, False)
         os.set_blocking(stdout, False)
@@ -70,25 +71,25 @@ class Pipe:
 
     def send(self, message: messages.Message, number: int = 0) -> None:
         """Send a message that must arrive."""
-        self._unsent += messages.encode(message, number)
+        self.unsent += messages.encode(message, number)
         self._flush()
-        if len(self._unsent) > MOST_UNSENT:
+        if len(self.unsent) > MOST_UNSENT:
             self.open = False
 
     def send_latest(self, message: messages.Message) -> None:
         """Send a message, or drop it while earlier ones are unsent."""
         self._flush()
-        if not self._unsent:
+        if not self.unsent:
             self.send(message)
 
     def _flush(self) -> None:
         try:
-            while self._unsent:
-                self._unsent = self._unsent[os.write(self._out, self._unsent) :]
+            while self.unsent:
+                self.unsent = self.unsent[os.write(self._out, self.unsent) :]
         except BlockingIOError:
             return
         except BrokenPipeError:
-            self._unsent = b""
+            self.unsent = b""
             self.open = False
 
 
@@ -103,10 +104,10 @@ def main() -> NoReturn:
     os.dup2(2, 1)
     pipe = Pipe(0, stdout)
     try:
-        settings = _receive_settings(pipe)
+        settings = receive_settings(pipe)
         if settings is None:
             _exit(EXIT_DONE)
-        _control(pipe, settings, _connect(pipe, settings))
+        control(pipe, settings, connect(pipe, settings))
     except RobotLostError as error:
         pipe.send(messages.Failed(error.kind, str(error)))
         _exit(EXIT_FAILED)
@@ -115,7 +116,8 @@ def main() -> NoReturn:
         _exit(EXIT_FAILED)
 
 
-def _receive_settings(pipe: Pipe) -> UrSettings | None:
+def receive_settings(pipe: Pipe) -> UrSettings | None:
+    """Return the settings that the daemon sends first, None if it is gone."""
     while pipe.open:
         pipe.wait(60.0)
         for _, message in pipe.receive():
@@ -124,7 +126,8 @@ def _receive_settings(pipe: Pipe) -> UrSettings | None:
     return None
 
 
-def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
+def connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
+    """Return the arm behind its connected clients; raises RobotLostError."""
     _set_alarm(settings.connect_timeout_s)
     pipe.send(messages.WorkerPhase("loading ur-rtde"))
     from shearloop.drivers.ur.arm import UrArm
@@ -156,7 +159,8 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
         ) from error
 
 
-def _control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
+def control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
+    """Run cycles until disconnected; raises RobotLostError."""
     handler = CommandHandler(settings, arm, time.monotonic_ns())
     period_s, due_s, cycle = 1.0 / settings.rate_hz, time.monotonic(), 0
     leave_s = math.inf
@@ -167,7 +171,7 @@ def _control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
             pipe.send(error)
         if not sample.connected or sample.age_ns > 3 * settings.state_timeout_s * 1e9:
             raise RobotLostError("lost", why_unfit(sample, settings))
-        _handle_commands(pipe, handler, sample)
+        handle_commands(pipe, handler, sample)
         if not pipe.open and not handler.leaving:
             handler.request(0, messages.Disconnect(), sample, time.monotonic_ns())
         if handler.leaving:
@@ -192,10 +196,10 @@ def _control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
                 time.sleep(left_s)
             elif pipe.wait(left_s):
                 # Carry a command out on arrival: waiting for the next cycle would delay the loop.
-                _handle_commands(pipe, handler, arm.read())
+                handle_commands(pipe, handler, arm.read())
 
 
-def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> None:
+def handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> None:
     """Carry out the daemon's commands."""
     for number, message in pipe.receive():
         if isinstance(message, messages.Held):

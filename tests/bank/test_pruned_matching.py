@@ -285,13 +285,13 @@ def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed):
 def test_few_cells_are_scored_exactly(slow, fast, monkeypatch):
     """What makes it fast: of a frame near to the bank's, most cells are never read."""
     read = []
-    highest_scores = type(fast)._highest_scores
+    highest_scores = type(fast).highest_scores
 
     def counted(self, cells, frames):
         read.append(len(cells))
         return highest_scores(self, cells, frames)
 
-    monkeypatch.setattr(type(fast), "_highest_scores", counted)
+    monkeypatch.setattr(type(fast), "highest_scores", counted)
     frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(6).normal(size=PAPER_TABLE.n_channels))
     assert_same(fast.match(frame), slow.match(frame))
     assert sum(read) < BANK[1].sum() / 4

@@ -23,7 +23,7 @@ import zmq.asyncio
 from shearloop.bank.models import MODELS
 from shearloop.cli import COMMANDS, GROUPS, OTHER_SPELLINGS, command_module, main
 from shearloop.cli.bank import MODEL_NAMES
-from shearloop.cli.completion import full_parser
+from shearloop.cli.completion import arguments_of, full_parser, parts_of
 from shearloop.cli.options import path_of
 from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
 from shearloop.daemon.app import Daemon
@@ -137,7 +137,7 @@ async def test_fingertip_names_do_not_collide_with_task_names(config, tmp_path):
     )
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(whole), context)
-        names = {*daemon.health.tasks(), *daemon._tasks}
+        names = {*daemon.health.tasks(), *daemon.tasks}
         daemon.stop()
         await daemon.run()
     assert {"right", "robot", "gripper", "loop", "load_cell", "recording", "health"} <= names
@@ -353,17 +353,21 @@ def test_an_unknown_command_lists_the_known_ones(capsys):
 
 def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
     """Yield the parsers of a command's parts, or its own where it has none."""
-    parts = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    for below in (below for action in parts for below in action.choices.values()):
+    for below in parts_of(parser).values():
         yield from parsers(below)
-    if not parts:
+    if not parts_of(parser):
         yield parser
 
 
 def test_every_argument_has_a_help_text():
     for parser in parsers(full_parser()):
-        unsaid = [one.dest for one in parser._actions if not one.help or one.help.startswith(("default", "(default"))]
-        assert unsaid == [], parser.prog
+        for argument in arguments_of(parser):
+            assert argument.help, f"{parser.prog} {argument.dest}"
+            assert not argument.help.startswith(("default", "(default")), f"{parser.prog} {argument.dest}"
+
+
+def options_of(parser: argparse.ArgumentParser) -> set[str]:
+    return {option for action in arguments_of(parser) for option in action.option_strings}
 
 
 def path_actions() -> list[tuple[str, argparse.Action]]:
@@ -372,7 +376,7 @@ def path_actions() -> list[tuple[str, argparse.Action]]:
     return [
         (f"{parser.prog} {action.dest}", action)
         for parser in parsers(full_parser())
-        for action in parser._actions
+        for action in arguments_of(parser)
         if action.type in (Path, path_of) or (isinstance(action.metavar, str) and named.fullmatch(action.metavar))
     ]
 
@@ -422,7 +426,7 @@ WITHOUT_JSON = {
 
 def test_every_command_has_a_json_option_or_a_reason_for_none():
     every = {parser.prog.removeprefix("shearloop "): parser for parser in parsers(full_parser())}
-    lacking = {name for name, parser in every.items() if "--json" not in parser._option_string_actions}
+    lacking = {name for name, parser in every.items() if "--json" not in options_of(parser)}
     assert {next((known for known in WITHOUT_JSON if name.startswith(known)), name) for name in lacking} == set(
         WITHOUT_JSON
     )
@@ -513,8 +517,8 @@ def test_the_summary_of_a_run_that_ends_with_its_experiment_comes_last(config, m
     at_once: list[bool] = []
 
     async def run_daemon(_config: object, _listeners: object, _on_ready: object, summary: RunSummary) -> bool:
-        summary._add("What happened: nothing.")
-        at_once.append(summary._out is not None)
+        summary.add("What happened: nothing.")
+        at_once.append(summary.out is not None)
         return True
 
     monkeypatch.setattr("shearloop.daemon.app.run_daemon", run_daemon)
@@ -608,12 +612,12 @@ def test_every_shell_has_its_script(ran):
 
 
 def test_file_arguments_complete_file_names():
-    config = next(action for action in _command("check")._actions if action.dest == "config")
+    config = next(action for action in arguments_of(_command("check")) if action.dest == "config")
     assert getattr(config, "complete", None)
 
 
 def _command(name: str):
-    return next(action for action in full_parser()._actions if action.dest == "command").choices[name]
+    return parts_of(full_parser())[name]
 
 
 # Each costs tens of megabytes and tenths of a second, and none is needed to run.

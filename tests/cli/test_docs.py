@@ -14,7 +14,7 @@ import yaml
 import shearloop
 from shearloop.bank.models import MODELS
 from shearloop.cli import COMMANDS, command_module
-from shearloop.cli.completion import full_parser
+from shearloop.cli.completion import arguments_of, full_parser, parts_of
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import STEP_KINDS
 from shearloop.daemon.control.samples import TorqueSource
@@ -36,7 +36,7 @@ def test_links_lead_somewhere(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_and_options_exist(page):
-    parsers = next(action for action in full_parser()._actions if action.dest == "command").choices
+    parsers = parts_of(full_parser())
     for text in re.findall(r"(?:^ {4}|`)(?:sudo )?(?:[./\w-]*/)?shearloop ([^`\n]*)", page.read_text(), re.MULTILINE):
         words = shlex.split(text.split(" #")[0].split(";")[0], comments=False) if text.count("'") % 2 == 0 else []
         if not words or not re.fullmatch(r"[a-z]+", words[0]):
@@ -184,12 +184,8 @@ def test_every_message_of_the_troubleshooting_page_exists_in_the_code():
 
 
 def _options(parser) -> set[str]:
-    found = set(parser._option_string_actions)
-    for action in parser._actions:
-        if hasattr(action, "_parser_class"):
-            for below in action.choices.values():
-                found |= _options(below)
-    return found
+    found = {option for action in arguments_of(parser) for option in action.option_strings}
+    return found.union(*(_options(below) for below in parts_of(parser).values()))
 
 
 @pytest.mark.parametrize("page", PAGES[1:], ids=lambda page: page.name)

@@ -77,7 +77,7 @@ def test_ctrl_c_reaches_no_device(played, tmp_path):
 def test_the_truth_is_read_up_to_its_last_complete_line(played):
     rows = [{"t_mono_ns": 1, "torque_nm": 0.1}, {"t_mono_ns": 2, "torque_nm": 0.2}]
     with played((emulator(),), "input()") as devices:
-        path = devices._truth
+        path = devices.truth
         assert devices.torques() is None
         path.write_text("\n".join(map(json.dumps, rows)) + '\n{"t_mono_ns": 3, "torq')
         known = devices.torques()

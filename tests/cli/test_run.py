@@ -104,7 +104,7 @@ async def test_tare_status_and_stop_commands(config, tmp_path):
             assert status["tasks"]["right"]["connected"]
             assert status["tasks"]["commands"]["errors"] == {"tare refused": 1}
         assert (await ask(daemon, "stop"))["ok"]
-        await daemon._end.wait()
+        await daemon.ending.wait()
 
 
 async def test_a_heatmap_is_computed_only_with_a_subscriber(config, tmp_path, subscriber):
@@ -252,14 +252,14 @@ async def test_a_configured_experiment_waits_for_the_operator(waiting_config, lo
         return None
 
     async with running_daemon(waiting_config) as daemon:
-        daemon._rig.start = start
-        daemon._rig.runner.experiment_ended = done_experiment
+        daemon.rig.start = start
+        daemon.rig.runner.experiment_ended = done_experiment
         await log.says(LEFT_TO_OPERATOR)
         health = collector(daemon, "health")
         assert (await health.get())["tasks"]["experiment"]["alive"]
         assert begun == []
         assert (await ask(daemon, "start"))["ok"]
-        await daemon._end.wait()
+        await daemon.ending.wait()
     assert [path.name for path in begun] == ["experiment.yaml"]
     assert daemon.finished
 
@@ -276,8 +276,8 @@ async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, wait
         return None
 
     async with running_daemon(waiting_config) as daemon:
-        daemon._rig.start = start
-        daemon._rig.runner.experiment_ended = done_experiment
+        daemon.rig.start = start
+        daemon.rig.runner.experiment_ended = done_experiment
         await log.says("waiting to start")
         ready.set()
         path = tmp_path / ("experiment.yaml" if own else "another.yaml")
@@ -285,7 +285,7 @@ async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, wait
         if not own:
             await log.says(LEFT_TO_OPERATOR)
             daemon.stop()
-        await daemon._end.wait()
+        await daemon.ending.wait()
     assert begun == [path]
     assert daemon.finished is finished
 

@@ -209,7 +209,7 @@ async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_
         daemon.publisher.add_listener(RunSummary(out))
         await watcher.until("robot.state", lambda state: abs(state["wrist_speed_rad_per_s"]) > 0.1)
         daemon.stop()
-        await daemon._end.wait()
+        await daemon.ending.wait()
     why = "the daemon ended: the wrist is stopped, a gripped tool stays gripped"
     assert not daemon.finished
     assert (watcher.seen["loop.state"][-1]["phase"], watcher.seen["loop.state"][-1]["activity"]) == ("stopped", why)
@@ -223,7 +223,7 @@ async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig
     twist = {"do": "twist", "angles_rad": [0.3], "speed_rad_per_s": 0.1, "limits": {"torque_nm": 0.02}}
     path = ending_with(rig_config, {"do": "grip", "width_mm": 5, "force_n": 60}, twist)
     async with running_rig(path, tiny_bank) as (daemon, watcher, _cause, _command):
-        await daemon._end.wait()
+        await daemon.ending.wait()
     assert not daemon.finished
     states = watcher.seen["gripper.state"]
     assert FaultCode.TORQUE_LIMIT.text in watcher.seen["loop.state"][-1]["faults"]
@@ -252,7 +252,7 @@ async def test_nothing_moves_after_a_restart_a_reconnection_and_an_acknowledgeme
         await started(command, path)
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
         first.stop()
-        await first._end.wait()
+        await first.ending.wait()
         # It has the robot to itself until it has ended.
         await log.says_only("stopped")
         async with running_daemon(second_config(rig_config)) as daemon:

@@ -219,4 +219,4 @@ def test_the_mistakes_are_shown_to_the_person_whose_file_it_is(tmp_path, monkeyp
     path = write(tmp_path / "one.yaml", {**VALID, "speed": 3})
     assert main(["command", "start", "--experiment", str(path)]) == 1
     assert "one.yaml:2: speed: is not a known key" in capsys.readouterr().err
-    assert command._mistakes(tmp_path / "elsewhere.yaml").startswith(str(tmp_path))
+    assert command.mistakes_of(tmp_path / "elsewhere.yaml").startswith(str(tmp_path))

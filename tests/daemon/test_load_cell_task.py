@@ -9,6 +9,7 @@ import pytest
 from shearloop.cli.terminal import message_line
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
+from shearloop.daemon.sensing import load_cell_task
 from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, ZERO_TIMEOUT_S, LoadCellTask
 from shearloop.drivers.load_cell import COUNTS_FOR_TORQUES, COUNTS_REASON, TORQUES_FOR_COUNTS, LoadSample
 from tests.running import running
@@ -51,9 +52,9 @@ class Board:
 
 
 @asynccontextmanager
-async def reading(rate_hz: float = 10.9) -> AsyncIterator[tuple[LoadCellTask, Board]]:
+async def reading(rate_hz: float = 10.9, clock: Clock | None = None) -> AsyncIterator[tuple[LoadCellTask, Board]]:
     board = Board()
-    task = LoadCellTask(board, SimpleNamespace(publish=board.published.append), Clock(), None, rate_hz)
+    task = LoadCellTask(board, SimpleNamespace(publish=board.published.append), clock or Clock(), None, rate_hz)
     async with running(task.run()):
         yield task, board
 
@@ -75,9 +76,10 @@ async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile():
         assert board.tares == [7.0], "a zero is of the samples after it was asked for"
 
 
-async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason():
-    async with reading() as (task, board):
-        task._timeout_s = 0.05
+async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason(monkeypatch):
+    monkeypatch.setattr(load_cell_task, "ZERO_TIMEOUT_S", 0.05)
+    # Its readings take less.
+    async with reading(rate_hz=1000.0) as (task, board):
         zero = await asked(task)
         await board.send(8388607.0, saturated=True)
         why = await zero
@@ -103,9 +105,8 @@ async def test_a_slow_board_has_the_time_that_its_readings_take():
 
 async def test_readings_that_know_of_the_load_before_are_not_of_the_zero():
     """An HX711 settles within four conversions: a reading is of the time since three before its own began."""
-    async with reading() as (task, board):
-        now_ns, period_ns = Clock().now_ns(), round(1e9 / 10.9)
-        task._clock = SimpleNamespace(now_ns=lambda: now_ns)
+    now_ns, period_ns = Clock().now_ns(), round(1e9 / 10.9)
+    async with reading(clock=SimpleNamespace(now_ns=lambda: now_ns)) as (task, board):
         task.tare()
         for number in range(6 + ZERO_SAMPLES):
             arrives_ns = now_ns + number * period_ns
@@ -116,16 +117,18 @@ async def test_readings_that_know_of_the_load_before_are_not_of_the_zero():
 
 
 async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_later_hour():
-    async with reading() as (task, board):
+    passed_ns = 0
+    clock = SimpleNamespace(now_ns=lambda: Clock().now_ns() + passed_ns)
+    async with reading(clock=clock) as (task, board):
         task.tare()
         await board.send(8388607.0, saturated=True)
         await board.send(9.0, 2 * ZERO_SAMPLES, from_ns=Clock().now_ns() + round((ZERO_TIMEOUT_S + 1.0) * 1e9))
         assert board.tares == []
         assert "could not be taken within 15 s" in str(task.diagnostics()["error"])
-        task._clock = SimpleNamespace(now_ns=lambda: Clock().now_ns() + 60 * 10**9)
+        passed_ns = 60 * 10**9
         task.tare()
         assert task.diagnostics()["error"] == ""
-        await board.send(3.0, from_ns=task._clock.now_ns() + 10**9)
+        await board.send(3.0, from_ns=clock.now_ns() + 10**9)
         assert board.tares == [3.0]
 
 

@@ -55,10 +55,10 @@ def test_a_stopped_terminal_blocks_nobody_and_says_that_texts_are_missing():
     for number in range(1, 9):
         outlet.write(f"{number}\n")
     outlet.close(timeout_s=0.0)
-    assert outlet._thread.is_alive(), "the end waits no longer than it may"
+    assert outlet.thread.is_alive(), "the end waits no longer than it may"
     terminal.may.release(100)
     outlet.close(10)
-    assert not outlet._thread.is_alive()
+    assert not outlet.thread.is_alive()
     *shown, note = terminal.getvalue().splitlines()
     assert shown == list("012345")
     assert note == "… texts are missing above: the terminal did not read them"

@@ -101,7 +101,7 @@ async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told(
 async def test_a_write_that_nobody_takes_ends(monkeypatch):
     monkeypatch.setattr(connection, "WRITE_TIMEOUT_S", 0.05)
     with PtyPort() as peer, SerialPort(peer.path) as port:
-        asyncio.get_running_loop().remove_reader(peer._master)
+        asyncio.get_running_loop().remove_reader(peer.master)
 
         async def write_for_ever() -> None:
             while True:
@@ -140,7 +140,7 @@ async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp
 async def test_a_link_that_leads_elsewhere_by_now_is_left_alone(tmp_path):
     path = tmp_path / "port"
     with PtyPort(path), PtyPort(path) as second:
-        assert os.readlink(path) == second._terminal
+        assert os.readlink(path) == second.terminal
     assert not path.is_symlink()
 
 

@@ -136,7 +136,7 @@ def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage, times):
     parser = FrameParser(PAPER_TABLE.zero_slots)
     for _ in range(times):
         assert parser.feed(garbage, 0) == []
-        assert len(parser._lines.partial) <= eit_kit.MAX_LINE_BYTES
+        assert len(parser.unfinished) <= eit_kit.MAX_LINE_BYTES
     parser.feed(b"\n", 0)
     assert [format_line(frame.raw) for frame in parser.feed(GOOD, 0)] == [GOOD]
 

@@ -45,7 +45,7 @@ class Answering(Link):
 )
 async def test_an_answer_without_an_end_is_quoted(kind, answers, part):
     with pytest.raises(DeviceSilentError) as silent:
-        await kind(Answering(*answers))._ask("*IDN?")
+        await kind(Answering(*answers)).ask("*IDN?")
     assert part in str(silent.value)
     assert "baud rate" in str(silent.value)
 

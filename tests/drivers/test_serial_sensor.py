@@ -117,7 +117,7 @@ async def test_a_board_that_sends_a_value_now_and_then_among_refused_lines_is_no
 async def test_a_board_that_is_slower_than_configured_is_waited_for_longer_each_time(board):
     link = PlayedLink()
     device = BOARDS[board][0](link)
-    base_s = device._longest_silence_s
+    base_s = device.longest_silence_s
     link.monitor = LinkMonitor(_StopAfter(link, 8), 0.0, 0.0)
     with pytest.raises(_EnoughError):
         await anext(device.batches())
@@ -156,7 +156,7 @@ class _StopAfter:
 async def test_a_board_that_is_in_time_again_is_waited_for_as_at_first():
     link = PlayedLink(reads=[*every(0.09, b"0.01\n", 3.0)])
     device = LoadCell(link, LoadCalibration.of_torque_lines())
-    device._patience = 8
+    device.patience = 8
     await played(device, link, losses=1)
     assert link.waits_s[5] == pytest.approx(8 * SILENT_PERIODS / 10.9)
     assert link.waits_s[-2] == pytest.approx(SILENT_PERIODS / 10.9)

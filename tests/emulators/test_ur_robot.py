@@ -43,7 +43,7 @@ def turning(seconds: float) -> Robot:
 
 
 def happened(robot: Robot, name: str) -> list[float]:
-    return [event.time_s for event in robot._events if event.name == name]
+    return [event.time_s for event in robot.events if event.name == name]
 
 
 def test_watchdog_ends_with_its_program():
@@ -163,7 +163,7 @@ def test_text_that_is_no_program_is_refused():
     robot = Robot()
     robot.upload("def unfinished():\n  while True:\nend\n")
     assert not robot.program_running
-    assert "block" in robot._events[-1].detail
+    assert "block" in robot.events[-1].detail
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ async def test_the_load_cells_calibration_gives_up_with_what_came(tmp_path, monk
     async with running(board.run()):
         await board.port.appearances.get()
         with SerialPort(str(tmp_path / "load")) as port, pytest.raises(DeviceLostError) as gave_up:
-            await load._measure(port, [100.0], Silent())
+            await load.measure(port, [100.0], Silent())
     assert "within 0.3 s" in str(gave_up.value)
     assert all(part in str(gave_up.value) for part in parts), gave_up.value
 

@@ -146,7 +146,7 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
     experiment = recording.metadata.get(schema.EXPERIMENT_METADATA, {}).get("name", "no experiment")
     about = {"recording": path.name, "identity": recording.identity, "configuration": configuration}
     with ExitStack() as files:
-        dataset = _Dataset(out, held, files)
+        dataset = Dataset(out, held, files)
         dataset.write_rows(path, progress)
         return dataset.finish(experiment, about, attachments)
 
@@ -169,7 +169,7 @@ def _check_length(path: Path, first_ns: int, known_ns: int) -> None:
         )
 
 
-class _Dataset:
+class Dataset:
     """The files of a dataset of one episode."""
 
     def __init__(self, out: Path, held: Mapping[str, _Held], replaced: ExitStack) -> None:

@@ -192,7 +192,7 @@ class ReplayComparison:
     # Sources that continue from a state which has not come yet: their messages are sent as they were recorded.
     awaited: set[str] = field(default_factory=set)
     _foreign: int = 0
-    _computed: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
+    waiting: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
 
     def add_computed(self, topic: str, content: Mapping[str, Any]) -> None:
         """Store a message that the replay published."""
@@ -202,16 +202,16 @@ class ReplayComparison:
             self._foreign += 1
         else:
             plain = json.loads(schema.message_json(topic, content, 0))
-            self._computed.setdefault((topic, content["source"]), deque()).append(plain)
+            self.waiting.setdefault((topic, content["source"]), deque()).append(plain)
 
     def restart(self, source: str) -> None:
         """Forget the messages of a source so far: they were forwarded, and it is computed from here on."""
         self.awaited.discard(source)
-        self._computed = {key: waiting for key, waiting in self._computed.items() if key[1] != source}
+        self.waiting = {key: waiting for key, waiting in self.waiting.items() if key[1] != source}
 
     def compare(self, event: RecordedEvent) -> None:
         """Compare a recorded message with the oldest computed one of its topic and source."""
-        waiting = self._computed.get((event.topic, event.source))
+        waiting = self.waiting.get((event.topic, event.source))
         self.compared[event.topic] += 1
         if not waiting:
             self._add_difference(event, "the replay did not compute it")
@@ -225,7 +225,7 @@ class ReplayComparison:
     @property
     def unrecorded(self) -> int:
         """Computed messages that are not in the recording, such as those at the moment of the daemon's stop."""
-        return self._foreign + sum(map(len, self._computed.values()))
+        return self._foreign + sum(map(len, self.waiting.values()))
 
     def _add_difference(self, event: RecordedEvent, text: str) -> None:
         self.different[event.topic] += 1

@@ -56,7 +56,7 @@ class Commanded:
 )
 def test_a_command_reaches_its_device_and_normal_all(line, device, passed, tmp_path):
     rig = EmulatedRig(dict.fromkeys(("right", "left"), Blank()), tmp_path)
-    devices = rig._commanded = {name: Commanded() for name in rig._commanded}
+    devices = rig.commanded = {name: Commanded() for name in rig.commanded}
     rig.command(line)
     assert {name: one.lines for name, one in devices.items() if one.lines} == {device: [passed]}
     rig.command("normal")

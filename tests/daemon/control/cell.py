@@ -22,6 +22,8 @@ from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, Move
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS, FakeArm, HandlerBench
 
 SPEED_M_PER_S = 0.1
+# A state is read, decided on and answered, and an action goes on, within so many turns of the event loop.
+TURNS = 20
 # Steps of experiments.
 MOVE = {"do": "approach", "along_tool_m": 0.1, "speed_m_per_s": SPEED_M_PER_S}
 GRIP = {"do": "grip", "width_mm": 10.0}
@@ -223,9 +225,7 @@ class Cell:
         for _ in range(count):
             self.sense()
             self.robot.cycle()
-            # A state is read, decided on and answered in a few turns of the event loop: until nothing else is ready.
-            await asyncio.sleep(0)
-            while asyncio.get_running_loop()._ready:  # noqa: ASYNC110 - it waits for nothing but the loop itself
+            for _ in range(TURNS):
                 await asyncio.sleep(0)
 
     def exceed_torque(self) -> None:

@@ -59,7 +59,7 @@ class Rig:
         state = self.twin.step(TICK_S, self.wrist_rad, self.force_n)
         self.true_nm.append(state.torque_nm)
         self.window.append(state.shear_torque_nm)
-        self._sense(state.torque_nm)
+        self.sense(state.torque_nm)
         for due, action in list(self.pending):
             if self.tick >= due:
                 self.pending.remove((due, action))
@@ -72,7 +72,7 @@ class Rig:
             self.begun.append(orders.action)
             self.pending.append((self.tick + 100, orders.action))
 
-    def _sense(self, torque_nm: float) -> None:
+    def sense(self, torque_nm: float) -> None:
         now = self.t_ns
         if "arm" not in self.silent:
             self.control_loop.on_arm(replace(self.arm, wrist_rad=self.wrist_rad, t_ns=now))

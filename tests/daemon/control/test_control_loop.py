@@ -363,5 +363,5 @@ def test_a_single_torque_that_disagrees_holds_until_the_next_one_and_stops_nothi
 def test_a_wrist_angle_that_is_not_a_number_turns_nothing():
     rig = twisting()
     rig.wrist_rad = float("nan")
-    rig._sense(0.0)
+    rig.sense(0.0)
     assert rig.control_loop.tick(rig.t_ns).wrist_rad_per_s == 0.0

@@ -151,7 +151,7 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_pat
             await asyncio.sleep(0)
         assert rig.model.width_mm == held_mm
         rig.model.fail(12)
-        assert "internal fault" in gripper_task._status(await rig.driver.read()).fault
+        assert "internal fault" in gripper_task.status_of(await rig.driver.read()).fault
         await task.unlock()
         assert not (await rig.driver.read()).fault.needs_activation
 

@@ -116,7 +116,7 @@ async def test_an_end_between_two_decisions_is_published_before_it_is_reported()
         waiting = asyncio.create_task(cell.runner.experiment_ended())
         await asyncio.sleep(0)
         cell.control_loop.on_action_ended("it met something")
-        cell.runner._states._notify()
+        cell.runner.states.notify()
         await asyncio.sleep(0)
         await asyncio.sleep(0)
         assert not waiting.done()
@@ -259,10 +259,10 @@ async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pau
         arm.be(wrench=(0.0, 0.0, SETTINGS.limits.force_n.inner + 5.0, 0.0, 0.0, 0.0))
         bench.run(1)
         assert "force" in bench.state.end_reason
-        cell.runner._actions.interrupt()
+        cell.runner.actions.interrupt()
         arm.be(wrench=(0.0,) * 6)
         await cell.cycles(1)
-        cell.runner._actions.may_move.set()
+        cell.runner.actions.may_move.set()
         await cell.until_ended()
         assert "the move ended early: force" in cell.why
         assert sum(isinstance(command, MoveLinear) for command in cell.robot.commands) == 1

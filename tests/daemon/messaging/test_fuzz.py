@@ -117,14 +117,14 @@ async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, monke
         assert refused <= FRAMES
         assert published["eit.estimate"] == published["eit.frame"] == 0
         assert not arm.called, "nothing was asked of the robot"
-        assert daemon._rig.control_loop.experiment is None
+        assert daemon.rig.control_loop.experiment is None
         assert not daemon.supervisor.dead
         assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
         assert resident_memory_mb() - before_mb < MOST_GROWTH_MB
         assert len(asyncio.all_tasks()) <= tasks + command_server.MAX_CONCURRENT
         status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
         assert status == {True: 1}, "stop is heard in the middle of it all"
-        await daemon._end.wait()
+        await daemon.ending.wait()
     os.close(port)
     os.close(board)
 
@@ -170,4 +170,4 @@ def test_many_clients_share_the_total_limit():
     limit = RateLimit()
     allowed = sum(limit.allow(b"%d" % number, number * 1000) for number in range(100_000))
     assert allowed <= command_server.TOTAL_BURST + 0.1 * command_server.TOTAL_PER_S + 1
-    assert limit._bucket_of.cache_info().currsize <= 256
+    assert limit.remembered <= 256

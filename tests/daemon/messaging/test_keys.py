@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zmq
@@ -97,15 +96,15 @@ def connect() -> Iterator[Callable[..., "zmq.asyncio.Socket"]]:
             socket.close()
 
 
-def address_of(socket: Any) -> str:
-    return str(socket.getsockopt_string(zmq.LAST_ENDPOINT)).replace("//0.0.0.0:", "//127.0.0.1:")
+def reachable(address: str) -> str:
+    return address.replace("//0.0.0.0:", "//127.0.0.1:")
 
 
 async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, connect):
     path = config(publish=NETWORK, commands=NETWORK, curve=curve(keys))
     async with running_daemon(path) as daemon:
-        commands = daemon._tasks["commands"].address.replace("//0.0.0.0:", "//127.0.0.1:")
-        published = address_of(daemon.publisher._socket)
+        commands = reachable(daemon.tasks["commands"].address)
+        published = reachable(daemon.publisher.address)
         known = ada(keys)
         asking = connect(zmq.DEALER, commands, known)
         await asking.send(encode({"command": "status"}))
@@ -128,7 +127,7 @@ async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, con
         for name in ("start", "resume", "unlock", "tare", "pause"):
             assert "this command needs a key" in (await anyone({"command": name}, DEADLINE_S))["reason"]
         assert (await anyone({"command": "stop"}, DEADLINE_S))["ok"]
-        await daemon._end.wait()
+        await daemon.ending.wait()
 
 
 def test_a_client_needs_keys_for_another_machine(tmp_path, monkeypatch, ran, mistake):

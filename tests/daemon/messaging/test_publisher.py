@@ -77,7 +77,7 @@ def test_subscriptions_to_unknown_topics_are_not_kept(publisher, connect):
         stranger.send(b"no subscription")
         stranger.send(b"\x01health")
         until(lambda: publisher.has_subscriber("health"))
-        assert publisher._prefixes == (b"health",)
+        assert publisher.prefixes == (b"health",)
 
 
 def test_subscribers_come_and_go_while_messages_are_sent(publisher, connect):
@@ -124,7 +124,7 @@ async def test_a_subscriber_is_iterated_with_and_without_asyncio(publisher, tmp_
         Subscriber(address, ["skin."], timeout_s=0.01) as silent,
     ):
         # Only `every` receives frames.
-        until(lambda: publisher.has_subscriber("eit.frame") and publisher._prefixes.count(b"load.") == 1)
+        until(lambda: publisher.has_subscriber("eit.frame") and publisher.prefixes.count(b"load.") == 1)
         for _ in range(2):
             publisher.publish(sample(EitFrame))
             publisher.publish(sample(LoadTorque))

@@ -53,19 +53,19 @@ class Bench:
         self.estimator = SkinEstimator(calibration, normal_n=1.0, zero_samples=20)
         self.spoil: Callable[[float, float, float], tuple[float, float]] = lambda r1, r2, _: (r1, r2)
         self._random = Random(seed)
-        self._number = 0
+        self.number = 0
         self.skin.normal_n = 0.0
 
     @property
     def time_s(self) -> float:
-        return self._number / 10
+        return self.number / 10
 
     def sample(self, **changes: object) -> SkinSample:
-        self._number += 1
+        self.number += 1
         r1, r2 = self.spoil(*self.skin.resistances_ohm(), self.time_s)
         r1, r2 = (r * (1 + self._random.gauss(0, NOISE)) for r in (r1, r2))
-        t_ns = self._number * PERIOD_NS
-        values = {"r1_ohm": r1, "r2_ohm": r2, "t_mid_ns": t_ns, "t_arrival_ns": t_ns, "seq": self._number}
+        t_ns = self.number * PERIOD_NS
+        values = {"r1_ohm": r1, "r2_ohm": r2, "t_mid_ns": t_ns, "t_arrival_ns": t_ns, "seq": self.number}
         return SkinSample(**{**values, **changes})
 
     def at(self, shear_n: float, normal_n: float = 1.0) -> SkinReading:
@@ -269,7 +269,7 @@ def test_the_paper_s_own_drift_stays_within_the_interval_for_an_hour(calibration
     for seed in range(20):
         bench = Bench(calibration, seed).zeroed()
         bench.skin.rest(3600.0)
-        bench._number += 36_000
+        bench.number += 36_000
         bench.push(0.15)
         held += holds(bench.at(0.15), 0.15)
     assert held >= 18
@@ -288,7 +288,7 @@ def test_turning_the_tool_stretches_contact_and_skin_in_series():
     loaded_n = skin.turn(0.05)
     pushed = SyntheticSkin(normal_n=1.0)
     pushed.push(loaded_n)
-    slipped = pushed.membrane.turned_rad(pushed._state)
+    slipped = pushed.membrane.turned_rad(pushed.state)
     outer_mm = skin.membrane.section.outer_radius_mm
     assert loaded_n / CONTACT_N_PER_MM + outer_mm * slipped == pytest.approx(0.05 * skin.radius_mm)
     assert slipped > 0.02

@@ -250,7 +250,7 @@ async def test_many_stops_share_one_request_and_overtake_hanging_commands(tmp_pa
 async def test_a_stop_without_a_daemon_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(server_module, "COMMAND_TIMEOUT_S", 0.05)
     async with served(tmp_path) as page:
-        page.bridge._address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
+        page.bridge.address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
         status, reply = await post(page, "/stop")
         assert (status, reply["ok"]) == (503, False)
         assert "no daemon answered" in reply["reason"]
@@ -468,4 +468,4 @@ async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(conf
                 assert (status, reply["ok"]) == (503, False), who
                 assert await post(page, "/stop") == (200, {"ok": True, "stopped": ""}), who
         assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
-        assert not daemon._end.is_set(), "a stop from a page ends what moves, and not the daemon"
+        assert not daemon.ending.is_set(), "a stop from a page ends what moves, and not the daemon"

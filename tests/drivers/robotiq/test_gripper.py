@@ -75,7 +75,7 @@ async def test_halting_a_gripper_that_is_not_active_moves_nothing(way, requested
         # The status shows a command only after the next step.
         rig.stopped = True
         for request in requested:
-            await rig.driver._write(request)
+            await rig.driver.client.write(request)
         await rig.driver.halt()
         rig.stopped = False
         for _ in range(10):

@@ -77,7 +77,7 @@ class CyclingArm(FakeArm):
 
 def drive(daemon: Daemon, arm: CyclingArm) -> None:
     with pytest.raises(ExitedError):
-        worker._control(daemon.pipe, SETTINGS, arm)  # an arm in all that counts
+        worker.control(daemon.pipe, SETTINGS, arm)  # an arm in all that counts
 
 
 class Time:

@@ -58,7 +58,7 @@ def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) 
         send(robot, written, *numbers, asynchronous=asynchronous)
         while state not in (robot.registers[LOWER.state], robot.registers[UPPER.state]):
             robot.step(STEP_S)
-            assert robot.program_running, robot._events[-1]
+            assert robot.program_running, robot.events[-1]
             assert robot.time_s < begun_s + 20
         took_s = took_s or robot.time_s - begun_s
     return took_s
@@ -100,7 +100,9 @@ async def enable(robot: UrRobot) -> None:
 
 
 def pid_of(robot: UrRobot) -> int:
-    """Return the worker's process id."""
-    pid = robot._connection._process.get_pid()
-    assert pid is not None
+    """Return the process id of the worker that the robot is connected by."""
+    assert robot.state is not None
+    children = " ".join(path.read_text() for path in Path("/proc/self/task").glob("*/children")).split()
+    workers = [pid for pid in children if b"drivers.ur.worker" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    (pid,) = map(int, workers)
     return pid

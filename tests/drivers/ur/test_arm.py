@@ -26,9 +26,13 @@ class Client:
     FLAG_NO_WAIT, FLAG_UPPER_RANGE_REGISTERS = 16, 8
     answers: ClassVar[dict[str, object]] = {}
 
+    # The latest one.
+    made: ClassVar["Client"]
+
     def __init__(self, *arguments: object) -> None:
         self.arguments = arguments
         self.calls: list[str] = []
+        type(self).made = self
 
     def __getattr__(self, name: str) -> Callable[..., object]:
         def call(*_: object, **__: object) -> object:
@@ -38,10 +42,18 @@ class Client:
         return call
 
 
+class Control(Client):
+    """Stands for ur-rtde's control client."""
+
+
 class Receiver:
     """Has the same sample for ever, and notes the deadlines."""
 
+    # The latest one.
+    made: ClassVar["Receiver"]
+
     def __init__(self, *_: object) -> None:
+        type(self).made = self
         self.connected = True
         self.deadlines: list[int] = []
         # Of a program that ended during a command.
@@ -57,9 +69,12 @@ class Receiver:
 @pytest.fixture
 def arm(monkeypatch) -> Iterator[ModuleType]:
     """The module `shearloop.drivers.ur.arm` over fake clients."""
-    for name, kind in (("rtde_control", "RTDEControlInterface"), ("script_client", "ScriptClient")):
+    for name, kind, fake in (
+        ("rtde_control", "RTDEControlInterface", Control),
+        ("script_client", "ScriptClient", Client),
+    ):
         module = ModuleType(name)
-        setattr(module, kind, Client)
+        setattr(module, kind, fake)
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setattr(Client, "answers", {"getScript": SCRIPT})
     # Another test may have imported it over the real clients.
@@ -75,7 +90,7 @@ def test_sample_that_waited_in_the_socket_is_old(arm, monkeypatch):
     reader, now_ns = arm.UrArm(SETTINGS, VERSION), 10**12
     monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
     for number, waited_ns in enumerate([0, 0, 200_000_000]):
-        reader._receiver.sample = received(50.0 + 0.008 * number)
+        Receiver.made.sample = received(50.0 + 0.008 * number)
         now_ns = 10**12 + 8_000_000 * number + waited_ns
         assert reader.read().age_ns == pytest.approx(waited_ns, abs=3_000_000)
 
@@ -109,10 +124,10 @@ def test_progress_is_queried_only_for_a_linear_move(arm):
     assert not one.read().moving_linearly
     one.move(MoveLinear(SIX, 0.1, 0.1))
     assert [one.read().moving_linearly for _ in range(3)] == [True] * 3
-    one._receiver.sample = received(2.0)
+    Receiver.made.sample = received(2.0)
     one.wrist(WristSpeed(0.1, 1.0), 0.1)
     assert not one.read().moving_linearly
-    assert one._control.calls.count("getAsyncOperationProgressEx") == 3
+    assert Control.made.calls.count("getAsyncOperationProgressEx") == 3
 
 
 def test_no_call_blocks_when_no_program_runs(arm):
@@ -127,17 +142,17 @@ def test_no_call_blocks_when_no_program_runs(arm):
     assert not one.zero_wrench()
     assert not one.arm_watchdog()
     one.end_program()
-    assert one._control.calls == ["zeroFtSensor"]
+    assert Control.made.calls == ["zeroFtSensor"]
 
 
 def test_register_is_cleared_once_the_client_knows_that_no_program_runs(arm):
     """Before that, the client would wait for the program."""
     one = arm.UrArm(SETTINGS, VERSION)
     assert not one.clear_command()
-    assert one._control.calls == ["isProgramRunning"]
+    assert Control.made.calls == ["isProgramRunning"]
     Client.answers["isProgramRunning"] = False
     assert one.clear_command()
-    assert one._control.calls[1:] == ["isProgramRunning", "kickWatchdog"]
+    assert Control.made.calls[1:] == ["isProgramRunning", "kickWatchdog"]
 
 
 def test_sent_script_arms_its_watchdog(arm, monkeypatch):
@@ -148,7 +163,7 @@ def test_sent_script_arms_its_watchdog(arm, monkeypatch):
         one.upload()
         armed = f'rtde_set_watchdog("input_int_register_{number}", {SETTINGS.watchdog_hz:g}, "stop")'
         assert armed in sent.pop()
-        assert one._control.arguments[2] == flags
+        assert Control.made.arguments[2] == flags
 
 
 def test_unknown_script_is_refused(arm):
@@ -171,11 +186,11 @@ def test_wrench_of_a_cb3_is_zeroed_without_its_controller(arm):
     """`zero_ftsensor` would end its program."""
     limits = dataclasses.replace(SETTINGS.limits, torque_nm=ur.TorqueBound(8.0, 12.0))
     one = arm.UrArm(dataclasses.replace(SETTINGS, limits=limits, generation="cb3"), "3.15.8.0")
-    one._receiver.sample = dataclasses.replace(received(1.0), wrench=(1.0, 2.0, 3.0, 0.0, 0.0, 1.0))
+    Receiver.made.sample = dataclasses.replace(received(1.0), wrench=(1.0, 2.0, 3.0, 0.0, 0.0, 1.0))
     assert one.zero_wrench()
-    one._receiver.sample = dataclasses.replace(received(1.1), wrench=(1.0, 2.5, 3.0, 0.0, 0.0, 3.0))
+    Receiver.made.sample = dataclasses.replace(received(1.1), wrench=(1.0, 2.5, 3.0, 0.0, 0.0, 3.0))
     assert one.read().wrench == (0.0, 0.5, 0.0, 0.0, 0.0, 2.0)
-    assert "zeroFtSensor" not in one._control.calls
+    assert "zeroFtSensor" not in Control.made.calls
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -185,28 +200,28 @@ def test_wrench_of_what_is_held_outlives_the_zero_of_a_new_program(arm, monkeypa
     monkeypatch.setattr(arm.ScriptPort, "send", lambda _, program: sent.append(program))
     one = arm.UrArm(SETTINGS, VERSION)
     load = (1.0, 0.0, 3.0, 0.0, 0.0, 1.5)
-    one._receiver.sample = dataclasses.replace(received(1.0), wrench=load)
+    Receiver.made.sample = dataclasses.replace(received(1.0), wrench=load)
     one.upload(held=held)
     assert ("1.500000 - started_with[5]" in sent[0]) == held
-    one._receiver.sample = dataclasses.replace(received(2.0), wrench=SIX)
+    Receiver.made.sample = dataclasses.replace(received(2.0), wrench=SIX)
     assert one.arm_watchdog()
     assert one.read().wrench == (load if held else SIX)
     # The next worker goes on with this zero, and a new one ends it.
     another = arm.UrArm(SETTINGS, VERSION)
     another.wrench_zero = one.wrench_zero
-    another._receiver.sample = dataclasses.replace(received(3.0), wrench=SIX)
+    Receiver.made.sample = dataclasses.replace(received(3.0), wrench=SIX)
     assert another.read().wrench == (load if held else SIX)
-    another._script_readiness._waiting = False
+    another.script_readiness.waiting = False
     assert another.zero_wrench()
     assert another.read().wrench == SIX
 
 
 def test_deadline_counts_from_the_latest_sample(arm):
     one = arm.UrArm(SETTINGS, VERSION)
-    one._receiver.sample = received(1.0, script_ticks=10_000)
+    Receiver.made.sample = received(1.0, script_ticks=10_000)
     assert one.wrist(WristSpeed(0.1, 1.0), 0.07)
     one.withdraw_deadline()
-    assert one._receiver.deadlines == [10_035, NO_MOTION_TICKS]
+    assert Receiver.made.deadlines == [10_035, NO_MOTION_TICKS]
 
 
 def test_script_port_is_read_until_the_program_plays(arm, monkeypatch):
@@ -216,6 +231,6 @@ def test_script_port_is_read_until_the_program_plays(arm, monkeypatch):
     one = arm.UrArm(SETTINGS, VERSION)
     one.upload()
     one.read()
-    one._receiver.sample = received(2.0, runtime_state=2)
+    Receiver.made.sample = received(2.0, runtime_state=2)
     one.read()
     assert calls == ["send", "drain", "drain", "close"]

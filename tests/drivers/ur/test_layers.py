@@ -308,7 +308,7 @@ def test_script_keeps_the_wrist_within_its_range(direction):
 )
 def test_script_stops_beyond_the_hard_force_and_torque_until_rest_is_asked_for(part, hard):
     arm, command = guarded_arm(), WristSpeed(FASTEST, 4.0)
-    load = arm.robot.arm._wrench
+    load = arm.robot.arm.load
     load[part] = 0.57 * hard
     assert not turn(arm, command, 0.3)[-1].rests
     # The norm of three such components.

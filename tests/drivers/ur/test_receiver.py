@@ -159,7 +159,7 @@ def test_controller_that_vanishes_is_lost_in_seconds(play):
     """A pulled cable: nothing is acknowledged. Each deadline leaves at once."""
     play()
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
-    connection = receiver._connection
+    connection = receiver.connection
     assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
     assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
     assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 3000
@@ -200,7 +200,7 @@ def test_network_error_is_a_lost_connection(play, number):
     receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     receiver.close()
     receiver.connected = True
-    with mock.patch.object(receiver, "_connection") as connection:
+    with mock.patch.object(receiver, "connection") as connection:
         connection.recv.side_effect = OSError(number, "given up")
         connection.gettimeout.return_value = 0.0
         assert receiver.latest().timestamp_s == 1.0

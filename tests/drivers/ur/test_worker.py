@@ -54,8 +54,8 @@ class Arm(FakeArm):
 
 # As the client's threads may, this one keeps the interpreter from ending.
 threading.Thread(target=threading.Event().wait).start()
-worker._receive_settings = lambda pipe: SETTINGS
-worker._connect = lambda pipe, settings: Arm()
+worker.receive_settings = lambda pipe: SETTINGS
+worker.connect = lambda pipe, settings: Arm()
 worker.main()
 """
 
@@ -69,21 +69,21 @@ def test_exception_ends_the_process_and_is_printed():
 
 def test_state_is_dropped_while_others_are_unsent(daemon):
     state = HandlerBench().state
-    while not daemon.pipe._unsent:
+    while not daemon.pipe.unsent:
         daemon.pipe.send(state)
-    unsent = daemon.pipe._unsent
+    unsent = daemon.pipe.unsent
     daemon.pipe.send_latest(state)
-    assert daemon.pipe._unsent == unsent
+    assert daemon.pipe.unsent == unsent
     daemon.receive()
     daemon.pipe.send_latest(state)
-    assert not daemon.pipe._unsent
+    assert not daemon.pipe.unsent
 
 
 def test_each_command_is_answered_at_once(daemon):
     bench = enabled()
     for acceleration, accepted in ((4.0, True), (-4.0, False)):
         daemon.send(WristSpeed(0.1, acceleration))
-        worker._handle_commands(daemon.pipe, bench.handler, bench.state)
+        worker.handle_commands(daemon.pipe, bench.handler, bench.state)
         assert [message.accepted for _, message in daemon.receive() if isinstance(message, CommandReply)] == [accepted]
 
 

@@ -274,11 +274,11 @@ def test_boards_without_a_serial_number_are_named_by_their_socket(tmp_path, monk
         (tmp_path / name / link).symlink_to(port)
     monkeypatch.setattr(serial_ports, "OWN_LINKS", tmp_path / "own")
     monkeypatch.setattr(serial_ports, "UDEV_LINKS", {"by-id": tmp_path / "by-id", "by-path": tmp_path / "by-path"})
-    assert serial_ports._stable_name(str(port), None).endswith("by-path/pci-0000:00:14.0-usb-0:2:1.0")
-    assert serial_ports._stable_name(str(port), "123").endswith("by-id/usb-1a86_USB_Serial-if00")
+    assert serial_ports.stable_name_of(str(port), None).endswith("by-path/pci-0000:00:14.0-usb-0:2:1.0")
+    assert serial_ports.stable_name_of(str(port), "123").endswith("by-id/usb-1a86_USB_Serial-if00")
     (tmp_path / "own").mkdir()
     (tmp_path / "own/pci-0000:00:14.0-usb-0:2:1.0").symlink_to(port)
-    assert serial_ports._stable_name(str(port), None).startswith(str(tmp_path / "own"))
+    assert serial_ports.stable_name_of(str(port), None).startswith(str(tmp_path / "own"))
 
 
 def test_what_the_robots_settings_still_have_from_init_is_named(tmp_path):

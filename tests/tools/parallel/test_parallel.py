@@ -62,7 +62,7 @@ def test_without_an_address_tasks_run_in_processes_of_this_computer(cluster, job
             assert isinstance(executor, SerialExecutor)
         else:
             assert isinstance(executor, ProcessExecutor)
-            assert executor._count == count
+            assert executor.count == count
 
 
 def waits(shared: tuple[str, str], _: int) -> None:

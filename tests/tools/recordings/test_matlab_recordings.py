@@ -356,7 +356,7 @@ def test_a_recording_longer_than_a_day_is_whole(tmp_path, capsys):
 def test_a_dataset_of_more_than_a_day_is_refused_before_its_first_row(tmp_path, mistake, monkeypatch):
     pytest.importorskip("pyarrow", reason="needs the extra `export`")
     computed: list[int] = []
-    monkeypatch.setattr(lerobot_export._Dataset, "_row", lambda _, now_ns: computed.append(now_ns))
+    monkeypatch.setattr(lerobot_export.Dataset, "_row", lambda _, now_ns: computed.append(now_ns))
     path = tmp_path / "a.mcap"
     with new_recording(path, "a test") as file:
         for minute in (0, 1, 2, 23 * 60, 25 * 60):

@@ -240,7 +240,7 @@ def test_messages_of_unrecorded_topics_are_only_counted():
         comparison.add_computed(TOPIC, estimate(source="left"))
         comparison.add_computed("health", {"source": "daemon"})
     assert comparison.unrecorded == 3
-    assert comparison._computed == {}
+    assert comparison.waiting == {}
 
 
 OTHER_TOOL = Measured(14.0, 0.5)

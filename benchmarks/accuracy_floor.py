@@ -23,7 +23,7 @@ from shearloop.estimation.fingertip_validator import channel_noise, segment_grip
 from shearloop.estimation.gain import find_twists
 from shearloop.estimation.load_delay import find_load_delay
 from shearloop.tools.frame_series import read_series, series_of
-from shearloop.tools.recordings.reader import read_recording
+from shearloop.tools.recordings.frames import read_recording
 
 # Increments, in frames. The least bound over these numbers of directions counts; each direction needs some increments.
 SHORT, LONG = 1, 6

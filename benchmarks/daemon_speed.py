@@ -28,7 +28,7 @@ from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.emulators.boards import format_line
-from shearloop.tools.recordings.reader import read_recording
+from shearloop.tools.recordings.frames import read_recording
 
 REPEATS = 5
 # Timed frames of a latency, at the board's rate.

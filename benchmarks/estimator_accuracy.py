@@ -26,8 +26,8 @@ from shearloop.estimation.estimator_names import DEFAULT, EstimatorName
 from shearloop.studies.emulated_calibration import calibrate, record
 from shearloop.tools.evaluate import EstimateTrack, Figures, estimate_series, figures_by_load, figures_of
 from shearloop.tools.frame_series import part_of, read_series, series_of
+from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import import_mat
-from shearloop.tools.recordings.reader import read_recording
 
 # Columns of the tables: figures of loaded frames, then two of all frames.
 LOADED = {

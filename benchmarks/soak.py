@@ -19,7 +19,7 @@ from typing import Any
 
 from benchmarks.common import parser_of, table_head, table_row, write_figures
 from benchmarks.stop_times import CAUSES, RunningRig
-from shearloop.tools.recordings.reader import read_recording
+from shearloop.tools.recordings.frames import read_recording
 
 FAULTS = [cause for cause in CAUSES if cause.command and not cause.straight]
 

@@ -26,7 +26,7 @@ from shearloop.tools.recordings.time_formats import DATENUM, TIME_FORMATS
 from shearloop.words import counted
 
 if TYPE_CHECKING:
-    from shearloop.tools.recordings.reader import RecordingSummary
+    from shearloop.tools.recordings.summary import RecordingSummary
 
 # Exports in one file, and how it begins.
 _SINGLE_FILES = {"mat": ("a MATLAB file", b"MATLAB"), "rrd": ("a file of Rerun", b"RRF")}
@@ -72,7 +72,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from shearloop.tools.recordings.reader import list_recordings
+    from shearloop.tools.recordings.listing import list_recordings
 
     found = list_recordings(args.folder)
     if args.json:
@@ -98,7 +98,7 @@ def _local_time(unix_ns: int) -> str:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from shearloop.tools.recordings.reader import summarise
+    from shearloop.tools.recordings.summary import summarise
 
     for path in args.recordings:
         with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
@@ -148,7 +148,7 @@ def _summary_text(found: "RecordingSummary") -> str:
 
 
 def _repair(args: argparse.Namespace) -> int:
-    from shearloop.tools.recordings.reader import repair
+    from shearloop.tools.recordings.repair import repair
 
     path = args.recording
     with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:

@@ -31,7 +31,7 @@ from shearloop.tools.evaluate import estimate_series, figures_of
 from shearloop.tools.frame_series import series_of
 from shearloop.tools.outputs import progress_bar, writing
 from shearloop.tools.parallel import processors
-from shearloop.tools.recordings.reader import read_recording
+from shearloop.tools.recordings.frames import read_recording
 
 # Three diameters are enough to interpolate; five halve the interval.
 DIAMETERS_MM = (10.0, 17.5, 25.0, 32.5, 40.0)

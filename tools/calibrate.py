@@ -12,7 +12,7 @@ from shearloop.estimation.gain import GainCorrection
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.values import Measured, distinct
 from shearloop.tools.frame_series import check_no_copies, check_paths_differ, part_of, read_series, series_of
-from shearloop.tools.recordings.reader import read_recording
+from shearloop.tools.recordings.frames import read_recording
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM,
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
 from shearloop.estimation.calibration import LARGEST_TOOL_SHARE
+from shearloop.tools.recordings.frames import Recording, read_recording
 from shearloop.tools.recordings.matlab_import import (
     DIAMETER_FOLDER,
     TORQUE_FOLDER,
@@ -18,7 +19,6 @@ from shearloop.tools.recordings.matlab_import import (
     read_diameter_slices,
     read_torque_slices,
 )
-from shearloop.tools.recordings.reader import Recording, read_recording
 from shearloop.words import counted
 
 # Slices do not name their side.

@@ -16,8 +16,8 @@ from shearloop.estimation.curve import ranked_channels
 from shearloop.estimation.fingertip_validator import segment_grip
 from shearloop.tools.drawing import figure
 from shearloop.tools.frame_series import series_of
+from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import Slices, find_streams, import_mat
-from shearloop.tools.recordings.reader import read_recording
 
 # "Using 272 of the 896 channels achieves 80% accuracy", relative to all channels.
 PAPER_CHANNELS, PAPER_SHARE = 272, 0.8

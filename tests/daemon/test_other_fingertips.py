@@ -16,7 +16,7 @@ from shearloop.estimation.estimator import Physics
 from shearloop.studies.emulated_calibration import write_recordings
 from shearloop.tools.bank_config import load_bank_plan
 from shearloop.tools.frame_series import read_series
-from shearloop.tools.recordings.reader import read_recording
+from shearloop.tools.recordings.frames import read_recording
 from tests.fixtures.daemons import collector, running_daemon
 from tests.running import running
 

@@ -46,6 +46,7 @@ from shearloop.errors import UserError
 from shearloop.files import open_file
 
 Progress = Callable[[int], None]
+NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
 # A recorder makes chunks of 16 MB and attaches files of up to 32 MB.
 LARGEST_RECORD_BYTES = 64 << 20
 

@@ -30,7 +30,9 @@ from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recorder.schema import basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
-from shearloop.tools.recordings.reader import read_recording, repair, summarise
+from shearloop.tools.recordings.frames import read_recording
+from shearloop.tools.recordings.repair import repair
+from shearloop.tools.recordings.summary import summarise
 from shearloop.tools.recordings.tables import RecordedTopics
 from tests.sample_messages import sample
 

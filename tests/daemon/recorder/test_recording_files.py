@@ -20,8 +20,9 @@ from shearloop.daemon.recorder.schema import LOAD_DOUBT_NOTE
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.errors import UserError
 from shearloop.tools.frame_series import part_of, read_series, series_of
+from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import import_mat
-from shearloop.tools.recordings.reader import read_messages, read_recording
+from shearloop.tools.recordings.reader import read_messages
 from shearloop.tools.recordings.replay import RecordedRun
 from shearloop.tools.recordings.tables import RecordedTopics, arrays
 from tests.fixtures.recordings import START_DATENUM

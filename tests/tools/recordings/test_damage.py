@@ -25,8 +25,10 @@ from shearloop.daemon.recorder.schema import basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.tools.recordings.export import export
-from shearloop.tools.recordings.reader import read_recording, repair, summarise
+from shearloop.tools.recordings.frames import read_recording
+from shearloop.tools.recordings.repair import repair
 from shearloop.tools.recordings.replay import RecordedRun
+from shearloop.tools.recordings.summary import summarise
 from shearloop.tools.recordings.tables import RecordedTopics
 from tests.daemon.recorder.test_recorder import frame, torque
 

@@ -20,7 +20,9 @@ from shearloop.daemon.messaging.messages import LoopState, wire_map
 from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recorder.schema import CONFIGURATION, basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
-from shearloop.tools.recordings.reader import read_messages, repair, summarise
+from shearloop.tools.recordings.reader import read_messages
+from shearloop.tools.recordings.repair import repair
+from shearloop.tools.recordings.summary import summarise
 from tests.daemon.recorder.test_recorder import frame, torque
 from tests.sample_messages import sample
 

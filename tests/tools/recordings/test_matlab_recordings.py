@@ -24,7 +24,7 @@ from shearloop.tools.recordings.matlab_import import (
     read_stream,
     read_torque_slices,
 )
-from shearloop.tools.recordings.reader import summarise
+from shearloop.tools.recordings.summary import summarise
 from shearloop.tools.recordings.time_formats import TIME_FORMATS
 
 # 2024-12-03 16:09:38 on MATLAB's count of days.

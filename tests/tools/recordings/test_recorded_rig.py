@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.tools.recordings.reader import summarise
+from shearloop.tools.recordings.summary import summarise
 from tests.daemon.test_closed_loop import experiment, rig_config, running_rig, started
 
 __all__ = ["rig_config"]

@@ -32,7 +32,11 @@ from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recorder.writer import McapFile
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.tools.frame_series import read_series
-from shearloop.tools.recordings.reader import list_recordings, read_messages, read_recording, repair, summarise
+from shearloop.tools.recordings.frames import read_recording
+from shearloop.tools.recordings.listing import list_recordings
+from shearloop.tools.recordings.reader import read_messages
+from shearloop.tools.recordings.repair import repair
+from shearloop.tools.recordings.summary import summarise
 from shearloop.tools.recordings.tables import read
 from tests.running import running
 from tests.sample_messages import sample

@@ -26,8 +26,8 @@ from shearloop.studies.charts.fault_sweeps import balanced, judge_level
 from shearloop.studies.charts.stability import select_rows
 from shearloop.tools.evaluate import estimate_series, figures_by_load, figures_of
 from shearloop.tools.frame_series import part_of, read_series, series_of
+from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import find_streams, import_mat, read_stream
-from shearloop.tools.recordings.reader import read_recording
 
 # Five of the ten twists come before this share of the recording.
 HALF = 0.457

@@ -14,7 +14,8 @@ from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.estimation import Measured
 from shearloop.tools.frame_series import read_series, series_of
-from shearloop.tools.recordings.reader import read_recording, summarise
+from shearloop.tools.recordings.frames import read_recording
+from shearloop.tools.recordings.summary import summarise
 from tests.sample_messages import sample
 
 PERIOD_NS = 540_000_000

@@ -1,0 +1,106 @@
+"""The frames, torques and tools of a recording as arrays, for whoever fits or judges an estimator."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic_core import from_json
+
+from shearloop.bank.channels import PAPER_TABLE, ChannelTable
+from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
+from shearloop.daemon.recorder import schema
+from shearloop.drivers.serial_sensor import InputKind
+from shearloop.estimation import Measured
+from shearloop.tools.recordings.reader import open_recording, reading, unusable
+
+# Metadata of every recording; the other keys are notes of this one.
+_IDENTITY_KEYS = (
+    "format_version",
+    "channel_table_hash",
+    "electrodes",
+    "injection",
+    "software",
+    "code_sha256",
+    schema.CLOCK_OFFSET,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SideFrames:
+    """One side's frames by rising time: t_mid_ns (n,) in Unix nanoseconds, lines (n, v) in volts."""
+
+    t_mid_ns: NDArray[np.int64]
+    lines: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """Frames by side, and torque_nm (p,) in N·m at torque_t_ns (p,) in Unix nanoseconds; each may be empty."""
+
+    path: Path
+    source: str
+    notes: dict[str, str]
+    sides: dict[str, SideFrames]
+    torque_t_ns: NDArray[np.int64]
+    torque_nm: NDArray[np.float64]
+    # The tools that a calibrated gripper held: since when (Unix ns), and the diameter or None for no tool.
+    tools: tuple[tuple[int, Measured | None], ...] = ()
+    table: ChannelTable = PAPER_TABLE
+    # Whether a daemon recorded it: frames and torques are then stamped on arrival by one clock.
+    live: bool = False
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Read the frames, torques and tools of a recording; raises UserError for a file that cannot be used."""
+    path = Path(path)
+    frames: dict[str, list[tuple[int, list[float]]]] = {}
+    torques: list[tuple[int, float]] = []
+    tools: list[tuple[int, Measured | None]] = []
+    with open_recording(path) as recording:
+        identity, table, metadata = recording.identity, recording.table, recording.metadata
+        prefix = f"{schema.FRAME_TOPIC}."
+        sides = {topic: topic.removeprefix(prefix) for topic in recording.counts if topic.startswith(prefix)}
+        inputs = [schema.input_topic(side) for side in sides.values()]
+        live = bool(inputs) and recording.counts.keys() >= {*inputs}
+        for channel, message in recording.messages([schema.LOAD_TOPIC, *sides, *inputs]):
+            topic, t_ns = channel.topic, message.log_time
+            try:
+                content = dict(from_json(message.data))
+                if topic == schema.LOAD_TOPIC:
+                    if "torque_nm" in content and content.get("valid", True):
+                        torques.append((t_ns, float(content["torque_nm"])))
+                elif topic in sides:
+                    line = content["line"]
+                    if len(line) != table.n_line_values:
+                        raise ValueError(f"a line of {len(line)} values")
+                    rows = frames.setdefault(sides[topic], [])
+                    # The board repeated an old frame.
+                    if not rows or rows[-1][1] != line:
+                        rows.append((t_ns, line))
+                elif content["kind"] == InputKind.TOOL.value:
+                    tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
+            except (KeyError, TypeError, ValueError) as error:
+                raise unusable(path, f"a message on {topic} does not match its schema ({error!r})") from error
+    with reading(path):
+        side_frames = {side: _side_frames(rows) for side, rows in frames.items()}
+    notes = {key: value for key, value in identity.items() if key not in _IDENTITY_KEYS}
+    experiment = metadata.get(schema.EXPERIMENT_METADATA, {})
+    if schema.DIAMETER_NOTE in experiment:
+        notes[schema.DIAMETER_NOTE] = experiment[schema.DIAMETER_NOTE]
+    return Recording(
+        path,
+        notes.pop("source", ""),
+        notes,
+        side_frames,
+        np.array([t for t, _ in torques], dtype=np.int64),
+        np.array([torque for _, torque in torques], dtype=np.float64),
+        tuple(tools),
+        table,
+        live,
+    )
+
+
+def _side_frames(rows: list[tuple[int, list[float]]]) -> SideFrames:
+    t_mid_ns, lines = zip(*rows, strict=True)
+    return SideFrames(np.array(t_mid_ns, np.int64), np.array(lines, np.float64))

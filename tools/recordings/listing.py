@@ -1,0 +1,69 @@
+"""The recordings of a folder, by their indices."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+from shearloop.daemon.recorder import schema
+from shearloop.daemon.recorder.writer import PARTIAL
+from shearloop.errors import UserError
+from shearloop.files import open_file
+from shearloop.tools.recordings.monotonic_times import has_one_offset
+from shearloop.tools.recordings.reader import reading
+from shearloop.tools.recordings.summary import summarise
+
+
+@dataclass(frozen=True, slots=True)
+class ListedRecording:
+    """One recording of a folder, times in Unix ns; the keys of `recording list --json`."""
+
+    path: str
+    size_bytes: int
+    closed: bool
+    first_unix_ns: int | None = None
+    duration_s: float | None = None
+    experiments: tuple[str, ...] = ()
+    # Why its index cannot be read; empty where it can, or was never written.
+    unreadable: str = ""
+
+
+def list_recordings(folder: Path) -> list[ListedRecording]:
+    """Return the recordings in a folder and below it, by their beginning; recordings without one come last.
+
+    Reads the indices only, except in recordings with log times of a wall clock: these are read whole. Raises UserError
+    for a path that is no folder.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder} is no folder; `shearloop recording info FILE` shows one recording")
+    paths = [path for path in folder.rglob("*") if path.name.endswith((".mcap", f".mcap{PARTIAL}")) and path.is_file()]
+    return sorted(map(_listed, paths), key=lambda one: (one.first_unix_ns is None, one.first_unix_ns or 0, one.path))
+
+
+def _listed(path: Path) -> ListedRecording:
+    size = path.stat().st_size
+    if path.suffix == PARTIAL:
+        return ListedRecording(str(path), size, closed=False)
+    try:
+        with reading(path), open_file(path) as file:
+            reader = make_reader(file)
+            summary = reader.get_summary()
+            if summary is None or summary.statistics is None:
+                return ListedRecording(str(path), size, closed=False)
+            counts = summary.statistics
+            experiments = [one for one in reader.iter_metadata() if one.name == schema.EXPERIMENT_METADATA]
+            follows_wall_clock = any(
+                channel.topic == schema.CLOCK_TOPIC and not has_one_offset(channel.metadata)
+                for channel in summary.channels.values()
+            )
+            whole = summarise(path) if follows_wall_clock else None
+    except UserError as error:
+        return ListedRecording(str(path), size, closed=True, unreadable=str(error))
+    first_ns = counts.message_start_time if counts.message_count else None
+    duration_s = (counts.message_end_time - counts.message_start_time) / 1e9
+    if whole is not None:
+        first_ns, duration_s = whole.first_unix_ns, whole.duration_s
+    names = tuple(one.metadata.get("name", "") for one in experiments)
+    return ListedRecording(
+        str(path), size, closed=True, first_unix_ns=first_ns, duration_s=duration_s, experiments=names
+    )

@@ -1,0 +1,89 @@
+"""Repairs recordings: copies what is intact into a new file with an index.
+
+A kill or a power loss leaves a file without the index that is written when a file is closed.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.records import Attachment, Channel, Message, Metadata
+from mcap.writer import Writer
+
+from shearloop.daemon.recorder import schema
+from shearloop.daemon.recorder.writer import PARTIAL, new_writer
+from shearloop.errors import UserError
+from shearloop.files import replace_file
+from shearloop.tools.recordings.intact_records import NOTHING_INTACT, IntactRecords, Progress
+
+
+@dataclass(frozen=True, slots=True)
+class RepairResult:
+    """The repaired file, its number of messages, and the losses; the keys of `recording repair --json`."""
+
+    path: Path
+    messages: int
+    torn_bytes: int
+    damaged_chunks: int
+    damaged_attachments: int
+    # Lost messages by topic, as far as the file shows them.
+    lost: dict[str, int]
+
+
+def repair(source: Path, out: Path | None = None, progress: Progress = lambda _: None) -> RepairResult:
+    """Copy the intact records into a new file with an index; the source is not changed.
+
+    The copy is `out`, or the source without `.partial`, or NAME.repaired.mcap. Raises UserError if the copy exists or
+    cannot be written, and if the source has no intact message.
+    """
+    if out is None:
+        name = source.name.removesuffix(PARTIAL)
+        out = source.with_name(name if name != source.name else f"{source.stem}.repaired.mcap")
+    if out.exists():
+        raise UserError(f"{out} exists already; move it away, or name another file with --out")
+    records = IntactRecords(source, progress)
+    schemas: dict[str, int] = {}
+    channels: dict[int, int] = {}
+    identity: dict[str, str] = {}
+    messages = 0
+    try:
+        with replace_file(out) as file:
+            writer = new_writer(file)
+            for record in records:
+                # The copy has its own header and index.
+                match record:
+                    case Message():
+                        channel = records.channels[record.channel_id]
+                        if channel.id not in channels:
+                            channels[channel.id] = _registered(writer, channel, records, schemas)
+                        copied = channels[channel.id], record.log_time, record.data, record.publish_time
+                        writer.add_message(*copied, record.sequence)
+                        messages += 1
+                    case Metadata(name=schema.METADATA):
+                        identity = record.metadata
+                    case Metadata():
+                        writer.add_metadata(record.name, record.metadata)
+                    case Attachment():
+                        writer.add_attachment(
+                            record.create_time, record.log_time, record.name, record.media_type, record.data
+                        )
+            # The record has no checksum; the chunks have one.
+            identity = records.identity or identity
+            if identity:
+                writer.add_metadata(schema.METADATA, identity)
+            writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
+            if not messages:
+                raise UserError(f"{source}: {NOTHING_INTACT}")
+    except OSError as error:
+        raise UserError(f"{out}: the repaired recording cannot be written: {error.strerror}") from error
+    return RepairResult(
+        out, messages, records.torn_bytes, records.damaged_chunks, records.damaged_attachments, records.lost
+    )
+
+
+def _registered(writer: Writer, channel: Channel, records: IntactRecords, schemas: dict[str, int]) -> int:
+    """Register a channel, and its schema once for all channels that have it; return the channel's number."""
+    known = records.schemas.get(channel.schema_id)
+    if known is not None and known.name not in schemas:
+        schemas[known.name] = writer.register_schema(known.name, known.encoding, known.data)
+    schema_id = schemas[known.name] if known is not None else 0
+    return writer.register_channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)

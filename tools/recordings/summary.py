@@ -1,0 +1,128 @@
+"""The content of one recording in numbers, closed or not; damaged parts are counted and left out."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from mcap.records import Attachment, Message, Metadata
+
+from shearloop.daemon.clock import ClockReading, ClockStep
+from shearloop.daemon.recorder import schema
+from shearloop.tools.recordings.intact_records import IntactRecords, Progress
+from shearloop.tools.recordings.message_content import ContentError, read_content
+from shearloop.tools.recordings.monotonic_times import MonotonicTimes
+from shearloop.tools.recordings.reader import reading
+
+
+@dataclass(slots=True)
+class TopicSummary:
+    """One topic; fewer than two messages have no mean rate."""
+
+    messages: int = 0
+    rate_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedStep(ClockStep):
+    """A step of the clock, and how long after the first message the daemon noticed it."""
+
+    after_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileCondition:
+    """Whether a file was closed, its size, and how much of it is damaged."""
+
+    path: str
+    size_bytes: int
+    closed: bool
+    torn_bytes: int
+    damaged_chunks: int
+    damaged_attachments: int
+    # Lost messages by topic, as far as the file shows them.
+    lost: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingSummary(FileCondition):
+    """The content of a recording in numbers, times in Unix ns; the keys of `recording info --json`."""
+
+    dropped: int | None
+    first_unix_ns: int | None
+    duration_s: float
+    # Whether the same code made it, so that a replay must be equal bit for bit.
+    same_code: bool
+    experiments: list[str]
+    # The tool's diameter in mm as the recording names it.
+    tool_mm: str | None
+    metadata: dict[str, str]
+    attachments: list[str]
+    topics: dict[str, TopicSummary]
+    # Where the wall clock was set or the computer was suspended; no time of a recording depends on it.
+    clock_steps: list[RecordedStep]
+
+
+def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSummary:
+    """Return the summary of a recording, closed or not; raises UserError for another file."""
+    records = IntactRecords(path, progress)
+    topics: dict[str, TopicSummary] = {}
+    spans: dict[str, tuple[int, int]] = {}
+    named: dict[str, list[dict[str, str]]] = {}
+    attachments = []
+    clock, readings = MonotonicTimes(), list[tuple[int, ClockReading]]()
+    for record in records:
+        match record:
+            case Message():
+                channel = records.channels[record.channel_id]
+                name, t_ns = channel.topic, clock.time_ns(channel, record)
+                if name == schema.CLOCK_TOPIC and (reading_now := _clock_reading(record)) is not None:
+                    readings.append((t_ns, reading_now))
+                topic = topics.setdefault(name, TopicSummary())
+                topic.messages += 1
+                first_ns, last_ns = spans.get(name, (t_ns, t_ns))
+                spans[name] = min(first_ns, t_ns), max(last_ns, t_ns)
+            case Metadata():
+                named.setdefault(record.name, []).append(dict(record.metadata))
+            case Attachment():
+                attachments.append(record.name)
+    for name, (first_ns, last_ns) in spans.items():
+        if last_ns > first_ns:
+            topics[name].rate_hz = (topics[name].messages - 1) / ((last_ns - first_ns) / 1e9)
+    first_unix_ns = min((first_ns for first_ns, _ in spans.values()), default=None)
+    ends = named.get(schema.END_METADATA, [])
+    with reading(path):
+        dropped = int(ends[-1].get("dropped", "0")) if ends else None
+    metadata = records.identity or named.get(schema.METADATA, [{}])[-1]
+    experiments = named.get(schema.EXPERIMENT_METADATA, [])
+    return RecordingSummary(
+        path=str(path),
+        size_bytes=records.size,
+        closed=records.closed,
+        torn_bytes=records.torn_bytes,
+        damaged_chunks=records.damaged_chunks,
+        damaged_attachments=records.damaged_attachments,
+        lost=records.lost,
+        dropped=dropped,
+        first_unix_ns=first_unix_ns,
+        duration_s=0.0 if first_unix_ns is None else (max(last for _, last in spans.values()) - first_unix_ns) / 1e9,
+        same_code=metadata.get("code_sha256") == schema.code_digest(),
+        experiments=[one.get("name", "") for one in experiments],
+        tool_mm=(experiments or [metadata])[-1].get(schema.DIAMETER_NOTE),
+        metadata=metadata,
+        attachments=attachments,
+        topics=dict(sorted(topics.items())),
+        clock_steps=[
+            RecordedStep(step.set_s, step.suspended_s, (t_ns - (first_unix_ns or 0)) / 1e9)
+            for (_, before), (t_ns, after) in pairwise(readings)
+            if (step := ClockStep.between(before, after)) is not None
+        ],
+    )
+
+
+def _clock_reading(message: Message) -> ClockReading | None:
+    """Return the reading of an entry of `input.clock`, or None for one that another program changed."""
+    try:
+        content = read_content(schema.CLOCK_TOPIC, message.data)
+    except ContentError:
+        return None
+    return ClockReading(content["offset_ns"], content[schema.SUSPENDED] or 0)

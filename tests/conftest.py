@@ -115,7 +115,11 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a coroutine test in an event loop of its own, and fail it for every task that it leaves behind."""
+    """Run a coroutine test in an event loop of its own, and fail it for every task that it leaves behind.
+
+    pytest-asyncio cancels such tasks silently when it closes its loop. No fixture is a coroutine, so that these lines
+    do all that its plugin would.
+    """
     if not inspect.iscoroutinefunction(pyfuncitem.obj):
         return None
     arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}

@@ -257,7 +257,7 @@ def test_a_silent_board_holds_the_wrist_and_then_stops_it():
     rig.silent.add("right")
     rig.run(2.5 * EIT.period_s + 0.7)
     assert (rig.speed, rig.control_loop.status.phase) == (0.0, "held")
-    assert "Check the sensor's cable" in rig.control_loop.status.decision.reasons[0]
+    assert rig.control_loop.status.decision.faults[0].code is FaultCode.ESTIMATE_STALE
     rig.run(6)
     assert phase(rig) is ExperimentPhase.STOPPED
     assert rig.orders.ends_motion
@@ -327,7 +327,9 @@ def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_whic
     rig.control_loop.on_link("load_cell", "/dev/ttyUSB3 was unplugged.", up=False)
     rig.step()
     assert rig.speed == 0.0
-    assert "load_cell is gone: /dev/ttyUSB3 was unplugged." in rig.control_loop.status.decision.reasons[0]
+    (reason,) = rig.control_loop.status.decision.reasons
+    assert "load_cell" in reason
+    assert "/dev/ttyUSB3 was unplugged" in reason
     rig.control_loop.on_link("load_cell", "", up=True)
     rig.run(1)
     assert rig.speed > 0.0, "it goes on by itself"

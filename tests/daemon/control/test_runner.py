@@ -172,7 +172,6 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
         cell.drive()
         await cell.cycles(20)
         assert FaultCode.NOT_RELEASED.text in cell.published.faults
-        assert "it did not open" in cell.published.reasons
 
 
 async def test_a_loop_that_dies_as_a_straight_move_is_to_begin_leaves_the_arm_at_rest(monkeypatch):
@@ -308,8 +307,9 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         # Neither was the stop that comes next, of which there is nobody to hear.
         await asyncio.sleep(0)
         cell.runner.decide_now()
-        assert "not connected" in " ".join(cell.control_loop.status.decision.reasons)
-        assert FaultCode.COMMAND_REFUSED not in {fault.code for fault in cell.control_loop.status.decision.faults}
+        codes = {fault.code for fault in cell.control_loop.status.decision.faults}
+        assert FaultCode.COMMAND_UNANSWERED in codes
+        assert FaultCode.COMMAND_REFUSED not in codes
 
 
 def stops(cell: Cell) -> list[LoopStop]:

@@ -79,3 +79,15 @@ def test_no_room_holds_more_than_three_tenths_of_the_lines():
     for path in modules():
         lines[path.parts[0]] += len(path.read_text().splitlines())
     assert max(lines.values()) <= 0.3 * lines.total(), lines
+
+
+def test_no_test_reads_what_is_private():
+    """Neither of the package nor of a library; pytest has no public name for two things that `conftest.py` needs."""
+    private = []
+    for path in sorted(Path("tests").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Attribute) or not node.attr.startswith("_") or node.attr.startswith("__"):
+                continue
+            if ast.unparse(node.value) not in ("self", "cls", "os", "super()") and path.name != "conftest.py":
+                private.append(f"{path}:{node.lineno} {ast.unparse(node)}")
+    assert private == []

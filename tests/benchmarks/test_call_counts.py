@@ -6,6 +6,8 @@ from benchmarks.call_counts import counts, loaded_by_run
 from benchmarks.call_trace import Trace, WayTrace
 from shearloop import units
 
+# Of the package, in all modules that `shearloop run` loads.
+MOST_LINES = 21_000
 NOT_ON_THE_ROBOTS_PC = ("emulators", "tools", "studies")
 
 
@@ -15,6 +17,10 @@ def test_the_daemon_loads_nothing_but_what_runs_on_the_robots_pc():
     assert strangers == []
     assert "shearloop.daemon.control.control_loop" in loaded.modules
     assert loaded.lines > 1000
+    assert loaded.lines <= MOST_LINES
+    assert not [
+        name for name in loaded.modules if "skin" in name or name.endswith(("control_box", "script", "service"))
+    ]
 
 
 @pytest.fixture

@@ -18,9 +18,8 @@ def test_the_daemon_loads_nothing_but_what_runs_on_the_robots_pc():
     assert "shearloop.daemon.control.control_loop" in loaded.modules
     assert loaded.lines > 1000
     assert loaded.lines <= MOST_LINES
-    assert not [
-        name for name in loaded.modules if "skin" in name or name.endswith(("control_box", "script", "service"))
-    ]
+    assert [name for name in loaded.modules if "skin" in name] == [], "only a rig with a skin loads its modules"
+    assert "shearloop.drivers.ur.control_box" not in loaded.modules, "the robot's process talks to the control box"
 
 
 @pytest.fixture

@@ -64,16 +64,16 @@ class ScriptedArm(FakeArm):
     def end_speed(self, deceleration_rad_per_s2: float) -> bool:
         return self._write(robots.SPEED_STOP, deceleration_rad_per_s2)
 
-    def _run_once(self, command: int, *values: float) -> bool:
+    def run_once(self, command: int, *values: float) -> bool:
         do(self.robot, command, *values, asynchronous=True)
         return True
 
     def move(self, command: MoveLinear) -> bool:
         self._write_deadline(self._settings.silence_timeout_s)
-        return self._run_once(robots.MOVE_L, *command.pose, command.speed_m_per_s, command.acceleration_m_per_s2)
+        return self.run_once(robots.MOVE_L, *command.pose, command.speed_m_per_s, command.acceleration_m_per_s2)
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
-        return self._run_once(robots.STOP_J, deceleration_rad_per_s2)
+        return self.run_once(robots.STOP_J, deceleration_rad_per_s2)
 
     def send_heartbeat(self, left_s: float | None = None) -> bool:
         if left_s is not None:
@@ -329,7 +329,7 @@ def test_a_straight_move_may_begin_before_its_deadline_arrives(comes):
         arm.send_heartbeat()
         arm.cycle()
     x, y, z, *turned = arm.robot.arm.pose
-    arm._run_once(robots.MOVE_L, x, y, z - 0.2, *turned, 0.05, 0.5)
+    arm.run_once(robots.MOVE_L, x, y, z - 0.2, *turned, 0.05, 0.5)
     for _ in range(2):
         arm.cycle()
     for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
@@ -353,7 +353,7 @@ def test_a_worker_that_is_late_for_less_than_the_silence_costs_no_straight_move(
 def test_a_program_that_starts_while_something_is_held_keeps_its_limits(held):
     """An e-Series zeroes its wrench then: with 0.7 of the largest torque held, and with 0.4 that come later."""
     arm, command = guarded_arm(), WristSpeed(FASTEST, 4.0)
-    load = arm.robot.arm._wrench
+    load = arm.robot.arm.load
     load[5] = 0.7 * LIMITS.torque_nm.hard
     assert not turn(arm, command, 0.3)[-1].rests
     turn(arm, WristSpeed(0.0, 8.0), 0.3)

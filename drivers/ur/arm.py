@@ -113,9 +113,7 @@ class UrArm:
         self._may_move_linearly = False
         self._write_deadline(left_s)
         speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
-        return self.script_readiness.wait() and bool(
-            self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0)
-        )
+        return self.script_readiness.wait() and bool(self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0))
 
     def end_speed(self, deceleration_rad_per_s2: float) -> bool:
         """End the script's speed thread. It blocks until the arm rests, so call it at rest."""

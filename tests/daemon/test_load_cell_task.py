@@ -79,7 +79,7 @@ async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile():
 async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason(monkeypatch):
     monkeypatch.setattr(load_cell_task, "ZERO_TIMEOUT_S", 0.05)
     # Its readings take less.
-    async with reading(rate_hz=1000.0) as (task, board):
+    async with reading(rate_hz=2000.0) as (task, board):
         zero = await asked(task)
         await board.send(8388607.0, saturated=True)
         why = await zero

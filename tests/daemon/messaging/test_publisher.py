@@ -11,7 +11,7 @@ import zmq.asyncio
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.client import Subscriber, receive_messages
 from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, decode, encode
-from shearloop.daemon.messaging.publisher import MAX_UNKNOWN_TOPICS, Publisher
+from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.errors import UserError
 from tests.fixtures.daemons import DEADLINE_S
 from tests.sample_messages import sample
@@ -72,7 +72,7 @@ def test_an_unsendable_message_does_not_affect_the_next(publisher, connect):
 
 def test_subscriptions_to_unknown_topics_are_not_kept(publisher, connect):
     with connect(kind=zmq.XSUB) as stranger:
-        for number in range(MAX_UNKNOWN_TOPICS - 2):
+        for number in range(100):
             stranger.send(b"\x01eit.%d" % number)
         stranger.send(b"no subscription")
         stranger.send(b"\x01health")

@@ -9,6 +9,7 @@ from typing import Final
 from shearloop.daemon.commissioning import Report, StageResult, identity_of
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.rig import open_settings
+from shearloop.daemon.rig_memory import lock_robot
 from shearloop.drivers.ur.control_box import query_controller
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
@@ -47,36 +48,46 @@ def commission(
     settings = real_settings(config)
     if settings is None:
         raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
+    with ExitStack() as opened:
+        # A daemon would drive the robot at the same time.
+        opened.enter_context(lock_robot(settings.host))
+        return _run(config, settings, out, operator, counts, only, opened)
+
+
+def _run(
+    config: DaemonConfig,
+    settings: UrSettings,
+    out: Path,
+    operator: Operator,
+    counts: Counts,
+    only: Sequence[str],
+    opened: ExitStack,
+) -> tuple[Report, Path]:
     controller = query_controller(settings.host, settings.connect_timeout_s)
     report = open_report(out, identity_of(config, controller.version, controller.serial_number))
     if config.emulated:
         operator.say("EMULATED: the report will say so.")
     name = operator.ask("Your name:")
-    with ExitStack() as opened:
-        context = Context(config, settings, controller, operator, report, counts, opened)
-        for stage, measure in STAGES.items():
-            done = context.report.stage(stage[0])
-            if (done is not None and done.passed and stage[0] not in only) or (only and stage[0] not in only):
-                continue
-            if failed := [one.stage for one in context.report.stages if not one.passed and one.stage < stage]:
-                raise UserError(f"stage {failed[0]} failed: mend it and run it again before stage {stage}")
-            operator.say(f"Stage {stage}")
-            measured = measure(context)
-            result = StageResult(
-                stage=stage,
-                operator=name,
-                date=datetime.now(UTC),
-                lines=tuple(measured.lines),
-                supplies=measured.supplies,
-            )
-            context.report = context.report.with_stage(result)
-            page = save_report(out, context.report, not_measured(context.report))
-            for line in result.lines:
-                limit = f" (limit: {line.limit})" if line.limit else ""
-                operator.say(f"{line.verdict:<6} {line.what}: {line.value}{limit}")
-            if not result.passed:
-                operator.say(f"Stage {stage} failed: mend the cause, and run the commissioning again.")
-                break
+    context = Context(config, settings, controller, operator, report, counts, opened)
+    for stage, measure in STAGES.items():
+        done = context.report.stage(stage[0])
+        if (done is not None and done.passed and stage[0] not in only) or (only and stage[0] not in only):
+            continue
+        if failed := [one.stage for one in context.report.stages if not one.passed and one.stage < stage]:
+            raise UserError(f"stage {failed[0]} failed: mend it and run it again before stage {stage}")
+        operator.say(f"Stage {stage}")
+        measured = measure(context)
+        result = StageResult(
+            stage=stage, operator=name, date=datetime.now(UTC), lines=tuple(measured.lines), supplies=measured.supplies
+        )
+        context.report = context.report.with_stage(result)
+        save_report(out, context.report, not_measured(context.report))
+        for line in result.lines:
+            limit = f" (limit: {line.limit})" if line.limit else ""
+            operator.say(f"{line.verdict:<6} {line.what}: {line.value}{limit}")
+        if not result.passed:
+            operator.say(f"Stage {stage} failed: mend the cause, and run the commissioning again.")
+            break
     page = save_report(out, context.report, not_measured(context.report))
     return context.report, page
 

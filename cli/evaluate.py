@@ -51,6 +51,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--leave-out", choices=("grips", "twists", "levels", "tools"), help=text)
     text = "with --leave-out: each fit chooses its settings too, so that no choice has seen the block that judges it"
     parser.add_argument("--nested", action="store_true", help=text)
+    text = "with --leave-out: adapt the gain to the first N twists of the judged recording, and judge the later ones"
+    add_option(parser, "--adapt-twists", number(1, 100, int), "N", text)
     add_recipe(parser)
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     text = "share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
@@ -133,6 +135,7 @@ def _refuse_recipe(args: argparse.Namespace) -> None:
         ("--tool-mm", args.tool_mm is not None),
         ("--assume-full-range", args.assume_full_range),
         ("--nested", args.nested),
+        ("--adapt-twists", args.adapt_twists is not None),
     ):
         if given:
             raise UserError(f"{option} is for --leave-out: the calibration is made already; leave it out")
@@ -154,6 +157,8 @@ def _leave_out(args: argparse.Namespace) -> int:
         raise UserError(
             f"--nested is for recordings and the estimator {DEFAULT}: only its fit has settings; leave it out"
         )
+    if args.adapt_twists is not None and args.leave_out == "levels":
+        raise UserError("--adapt-twists is for recordings: slices have no gain to adapt; leave it out")
     if args.estimates is not None:
         check_overwrite(args.estimates, "a table")
     read = read_parts(
@@ -165,7 +170,10 @@ def _leave_out(args: argparse.Namespace) -> int:
         args.estimator, bank, mesh, read.timing.uncertainty_s, full_range=args.assume_full_range, nested=args.nested
     )
     with open_executor(args.cluster) as pool:
-        found = judge_left_out(args.leave_out, recipe, read.parts, [path.name for path in read.paths], pool)
+        found = judge_left_out(
+            args.leave_out, recipe, read.parts, [path.name for path in read.paths], pool,
+            adapt_twists=args.adapt_twists or 0,
+        )  # fmt: skip
     if args.estimates is not None:
         names = [name for name, tracks in zip(found.names, found.tracks, strict=True) for _ in tracks]
         with writing(args.estimates, "the estimates"):

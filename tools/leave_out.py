@@ -4,33 +4,22 @@ A recipe is fitted to the rest, and judged on the block that it has not seen. Ne
 take part in its fit. Only the load cell's timing is measured on everything: it belongs to the load cell.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
 
-import numpy as np
-
-from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.mesh import load_mesh
-from shearloop.errors import UserError
-from shearloop.estimation import Calibration, FrameSeries, LoadTiming, Physics, fit
+from shearloop.estimation import Calibration, FrameSeries, LoadTiming, Physics, adapt, fit
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.estimation.fingertip_validator import segment_grip
-from shearloop.estimation.gain import find_twists
-from shearloop.estimation.left_out import NEAR_LEVEL, later_levels
 from shearloop.estimation.torque_profile import TorqueProfile
-from shearloop.estimation.values import Measured, distinct
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
+from shearloop.tools.left_out_blocks import Block, Kind, after_twists, find_blocks, kept
 from shearloop.tools.parallel import Executor
 from shearloop.words import counted
 
-Kind: TypeAlias = Literal["grips", "twists", "levels", "tools"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 # Recordings, and so grips, that show how the gain changes from one to the next.
 _ENOUGH_GRIPS = 3
 # A tool that is left out needs three others, which determine the gain over the diameter.
@@ -67,36 +56,18 @@ class Recipe:
         return Bank.open(self.bank) if self.bank else None
 
 
-@dataclass(frozen=True, slots=True)
-class Span:
-    """Rows `first` to `stop` of the recording with this number."""
-
-    recording: int
-    first: int
-    stop: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """One block left out: its name, the rows (n,) of each recording that are fitted, and the judged spans.
-
-    `timed` are the rows that the stopwatch knows, where these are others.
-    """
-
-    name: str
-    fitted: tuple[BoolArray, ...]
-    judged: tuple[Span, ...]
-    timed: tuple[BoolArray, ...] = ()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class LeftOut:
-    """The names of the blocks, the tracks of each, and a sentence of advice."""
+    """The names of the blocks, the tracks of each, and a sentence of advice.
+
+    Where the gain was adapted to twists, `before` are the tracks of the same frames without it.
+    """
 
     kind: Kind
     names: tuple[str, ...]
     tracks: tuple[tuple[EstimateTrack, ...], ...]
     advice: str
+    before: tuple[EstimateTrack, ...] = ()
 
     @property
     def all_tracks(self) -> list[EstimateTrack]:
@@ -111,33 +82,65 @@ class LeftOut:
         ]
         tracks = self.all_tracks
         named = {"left_out": self.kind, "blocks": blocks, "advice": self.advice}
+        if self.before:
+            named["before_adapting"] = figures_by_load(self.before, loaded_nm)["loaded"]
         return {**figures_by_load(tracks, loaded_nm), **figures_of(tracks), **named}
 
 
 def judge_left_out(
-    kind: Kind, recipe: Recipe, recordings: Sequence[FrameSeries], names: Sequence[str], pool: Executor
+    kind: Kind,
+    recipe: Recipe,
+    recordings: Sequence[FrameSeries],
+    names: Sequence[str],
+    pool: Executor,
+    *,
+    adapt_twists: int = 0,
 ) -> LeftOut:
     """Fit a recipe without each block of named recordings, and judge it there.
 
-    Raises UserError for recordings without two such blocks, and CalibrationError where the rest determines no
-    calibration.
+    With `adapt_twists` the gain is adapted to as many twists at the beginning of each judged recording, which are
+    neither fitted nor judged. Raises UserError for recordings without two such blocks, and CalibrationError where the
+    rest determines no calibration.
     """
     sides = [side for side in recordings[0].sides if all(side in one.sides for one in recordings)]
     chosen = tuple(one.select_sides(tuple(sides)) for one in recordings) if sides else tuple(recordings)
     blocks = find_blocks(kind, chosen, names)
-    tracks = tuple(pool.map(judge_block, (recipe, chosen), blocks))
-    return LeftOut(kind, tuple(one.name for one in blocks), tracks, _advice(kind, chosen, tracks))
+    before: list[EstimateTrack] = []
+    if adapt_twists:
+        blocks = after_twists(blocks, chosen, adapt_twists)
+        pairs = list(pool.map(judge_before_and_after, (recipe, chosen), blocks))
+        before = [track for tracks, _ in pairs for track in tracks]
+        tracks = tuple(tracks for _, tracks in pairs)
+    else:
+        tracks = tuple(pool.map(judge_block, (recipe, chosen), blocks))
+    return LeftOut(kind, tuple(one.name for one in blocks), tracks, _advice(kind, chosen, tracks), tuple(before))
 
 
 def judge_block(shared: tuple[Recipe, Sequence[FrameSeries]], block: Block) -> tuple[EstimateTrack, ...]:
     """Return the tracks of a block's spans by a calibration on the other rows; raises CalibrationError naming it."""
     recipe, recordings = shared
+    return _tracks(recipe, recordings, block, fit_without(recipe, recordings, block))
+
+
+def judge_before_and_after(
+    shared: tuple[Recipe, Sequence[FrameSeries]], block: Block
+) -> tuple[tuple[EstimateTrack, ...], tuple[EstimateTrack, ...]]:
+    """Return `judge_block`, and the same after the gain is adapted to the block's first twists."""
+    recipe, recordings = shared
     calibration = fit_without(recipe, recordings, block)
+    adapted = _adapted(recipe, recordings, block, calibration)
+    before, after = (_tracks(recipe, recordings, block, one) for one in (calibration, adapted))
+    return before, after
+
+
+def _tracks(
+    recipe: Recipe, recordings: Sequence[FrameSeries], block: Block, calibration: Calibration
+) -> tuple[EstimateTrack, ...]:
     bank, estimated = recipe.open_bank(), dict[int, EstimateTrack]()
     for number in sorted({span.recording for span in block.judged}):
         track = estimate_series(calibration, recordings[number], bank)
         if block.timed:
-            profile = TorqueProfile.fit(_kept(recordings, block.timed))
+            profile = TorqueProfile.fit(kept(recordings, block.timed))
             track = replace(track, profile_nm=None if profile is None else profile.predict(recordings[number]))
         estimated[number] = track
     return tuple(estimated[span.recording].between(span.first, span.stop) for span in block.judged)
@@ -146,154 +149,24 @@ def judge_block(shared: tuple[Recipe, Sequence[FrameSeries]], block: Block) -> t
 def fit_without(recipe: Recipe, recordings: Sequence[FrameSeries], block: Block) -> Calibration:
     """Return the calibration on all but a block; raises CalibrationError, naming the block, where that fails."""
     try:
-        return recipe.fit(_kept(recordings, block.fitted))
+        return recipe.fit(kept(recordings, block.fitted))
     except CalibrationError as error:
         raise CalibrationError(f"without {block.name} the rest gives no calibration: {error}") from error
 
 
-def find_blocks(kind: Kind, recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
-    """Return the blocks of a kind; raises UserError for recordings that have fewer than two."""
-    is_raw = all(one.kind == "raw" for one in recordings)
-    if kind == "levels":
-        if is_raw:
-            raise UserError("twists of a recording have no levels; leave out grips, twists or tools")
-        return _levels(recordings)
-    if not is_raw:
-        raise UserError(f"slices show no {kind}; use --leave-out levels")
-    if kind == "twists":
-        return _twists(recordings, names)
-    return _grips(recordings, names) if kind == "grips" else _tools(recordings, names)
+def _adapted(recipe: Recipe, recordings: Sequence[FrameSeries], block: Block, calibration: Calibration) -> Calibration:
+    """Return a calibration with its gain adapted to the block's first twists.
 
-
-def usual_kind(recordings: Sequence[FrameSeries]) -> Kind:
-    """Return the widest kind that recordings allow: tools, else grips, else twists; of slices, levels."""
-    if recordings[0].kind != "raw":
-        return "levels"
-    tools = [one.tool_mm for one in recordings]
-    if len(_known_tools(tools)) > 1 and None not in tools:
-        return "tools"
-    return "grips" if len(recordings) > 1 else "twists"
-
-
-def _grips(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
-    """Return a block for each recording: one grip."""
-    if len(recordings) < 2:
-        raise UserError(
-            "there is one recording, and so one grip, which leaves nothing to fit; record three, or use --leave-out "
-            "twists"
-        )
-    return [_without_recordings(recordings, [number], name) for number, name in enumerate(names)]
-
-
-def _tools(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
-    """Return a block for each diameter, with all of its recordings."""
-    unnamed = [name for name, one in zip(names, recordings, strict=True) if one.tool_mm is None]
-    if unnamed:
-        raise UserError(f"{unnamed[0]} does not name its tool's diameter; name it with --tool-mm")
-    sizes = [one.tool_mm.value for one in recordings if one.tool_mm is not None]
-    tools = [one.value for one in _known_tools([one.tool_mm for one in recordings])]
-    if len(tools) < 2:
-        raise UserError(
-            f"there is one tool, of {tools[0]:.3g} mm, which leaves nothing to fit; record four tools, or use "
-            "--leave-out grips or twists"
-        )
-    of = [min(tools, key=lambda tool: abs(tool - size)) for size in sizes]
-    return [
-        _without_recordings(
-            recordings, [number for number, own in enumerate(of) if own == tool], f"the tool of {tool:.3g} mm"
-        )
-        for tool in tools
-    ]
-
-
-def _known_tools(tools: Sequence[Measured | None]) -> list[Measured]:
-    return distinct([one for one in tools if one is not None])
-
-
-def _without_recordings(recordings: Sequence[FrameSeries], left_out: Sequence[int], name: str) -> Block:
-    fitted = tuple(np.full(len(one.t_s), number not in left_out) for number, one in enumerate(recordings))
-    return Block(name, fitted, tuple(Span(number, 0, len(recordings[number].t_s)) for number in left_out))
-
-
-def _twists(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
-    """Return a block for each twist, from the middle between it and the one before to that between it and the next.
-
-    The first begins with the grip, the last ends with it. A recording of one twist is left out whole.
+    Raises CalibrationError, naming the block, where that fails.
     """
-    blocks: list[Block] = []
-    for number, (series, name) in enumerate(zip(recordings, names, strict=True)):
-        grip = segment_grip(series)[1]
-        twists = find_twists(np.nan_to_num(series.torque_at_frames()))
-        middles = [(int(before[-1]) + int(after[0]) + 1) // 2 for before, after in itertools.pairwise(twists)]
-        edges = [grip.start, *middles, grip.stop]
-        for nth, (first, stop) in enumerate(itertools.pairwise(edges), 1):
-            fitted = [np.ones(len(one.t_s), dtype=np.bool_) for one in recordings]
-            if len(twists) > 1:
-                fitted[number][first:stop] = False
-            else:
-                fitted[number][:] = False
-            blocks.append(Block(f"twist {nth} of {name}", tuple(fitted), (Span(number, first, stop),)))
-    if len(blocks) < 2:
-        raise UserError("there is one twist, which leaves nothing to fit; record ten")
-    return blocks
-
-
-def _levels(recordings: Sequence[FrameSeries]) -> list[Block]:
-    """Return a block for each level of later slices: fitted to earlier slices of other levels.
-
-    The stopwatch knows the earlier slices of all levels: it reads the place in the sequence, and no sensor.
-    """
-    torque = np.concatenate([_torque_of_slices(one) for one in recordings])
-    places = [(number, row) for number, one in enumerate(recordings) for row in range(len(one.t_s))]
-    known = np.flatnonzero(np.isfinite(torque))
-    parts = later_levels(torque[known]) if len(known) else []
-    if not parts:
-        raise UserError(f"{counted(len(known), 'slice')} with a torque cannot be split; record 20 or more")
-    blocks: list[Block] = []
-    near_nm = NEAR_LEVEL * float(np.ptp(torque[known]))
-    for kept, later in parts:
-        own = torque[known[later]]
-        if np.abs(torque[known[kept], None] - own).min() <= near_nm:
-            raise UserError("too few slices remain without those of one level; record ten levels, three times or more")
-        level = f"slices of {1e3 * float(own.mean()):.3g} mN·m after the first {int(kept[-1]) + 1}"
-        earlier = known[: int(kept[-1]) + 1]
-        fitted = _rows_of(recordings, np.isin(np.arange(len(torque)), known[kept]))
-        timed = _rows_of(recordings, np.isin(np.arange(len(torque)), earlier))
-        spans = tuple(Span(number, row, row + 1) for number, row in (places[one] for one in known[later].tolist()))
-        blocks.append(Block(level, fitted, spans, timed))
-    return blocks
-
-
-def _torque_of_slices(series: FrameSeries) -> FloatArray:
-    """Return the (n,) torques of slices, NaN where a slice is of a cylinder: these are not fitted to a torque."""
-    return np.where(np.isfinite(series.diameter_mm), np.nan, series.torque_at_frames())
-
-
-def _rows_of(recordings: Sequence[FrameSeries], rows: BoolArray) -> tuple[BoolArray, ...]:
-    """Return rows of all recordings together as rows (n,) of each."""
-    ends = np.cumsum([len(one.t_s) for one in recordings])
-    return tuple(np.split(rows, ends[:-1]))
-
-
-def _kept(recordings: Sequence[FrameSeries], rows: Sequence[BoolArray]) -> list[FrameSeries]:
-    """Return the recordings with only these rows and the torques nearest to them; drop recordings without rows."""
-    found: list[FrameSeries] = []
-    for one, own in zip(recordings, rows, strict=True):
-        if not own.any():
-            continue
-        middles = one.t_s[:-1] + np.diff(one.t_s) / 2
-        near = own[np.searchsorted(middles, one.torque_t_s)]
-        found.append(
-            replace(
-                one,
-                t_s=one.t_s[own],
-                channels=one.channels[own],
-                diameter_mm=one.diameter_mm[own],
-                torque_t_s=one.torque_t_s[near],
-                torque_nm=one.torque_nm[near],
-            )
-        )
-    return found
+    to = block.adapted
+    if to is None:
+        return calibration
+    twists = recordings[to.recording].between(to.first, to.stop)
+    try:
+        return adapt(calibration, [twists], "left out", Physics(bank=recipe.open_bank()))[0]
+    except CalibrationError as error:
+        raise CalibrationError(f"{block.name} is not judged after its first twists: {error}") from error
 
 
 def _advice(kind: Kind, recordings: Sequence[FrameSeries], tracks: Sequence[Sequence[EstimateTrack]]) -> str:
@@ -332,8 +205,16 @@ def sentences_of(result: LeftOut, loaded_nm: float = LOADED_NM) -> list[str]:
         f"Without a sensor: {_milli(loaded['baseline_zero_rmse_nm'])} mN·m for always 0, "
         f"{_milli(loaded['baseline_profile_rmse_nm'])} mN·m for {clock}. Ratio to the better: "
         f"{'unknown' if ratio is None else f'{ratio:.2f}'}.",
+        *_before_adapting(result, loaded_nm),
         result.advice,
     ]
+
+
+def _before_adapting(result: LeftOut, loaded_nm: float) -> list[str]:
+    if not result.before:
+        return []
+    before = figures_by_load(result.before, loaded_nm)["loaded"]
+    return [f"Before adapting: {_milli(before['rmse_nm'])} mN·m, a score of {_milli(before['winkler_nm'])} mN·m."]
 
 
 def _milli(value_nm: float | None) -> str:

@@ -67,18 +67,18 @@ def _judge_left_out(args: argparse.Namespace, result: "CalibrationResult") -> tu
     Where the refits would take longer than some seconds, that is the command; without two blocks, it is why.
     """
     from shearloop.bank.errors import CalibrationError
-    from shearloop.tools import leave_out
+    from shearloop.tools import leave_out, left_out_blocks
     from shearloop.tools.parallel import SerialExecutor
 
     if result.calibration.torque is None:
         return {"left_out": None}, []
-    kind = leave_out.usual_kind(result.parts)
+    kind = left_out_blocks.usual_kind(result.parts)
     recipe = leave_out.Recipe(
         args.estimator, args.bank, args.mesh, result.timing.uncertainty_s, full_range=args.assume_full_range
     )
     names = [path.name for path in args.recordings]
     try:
-        blocks = leave_out.find_blocks(kind, result.parts, names if result.calibration.kind == "raw" else [])
+        blocks = left_out_blocks.find_blocks(kind, result.parts, names if result.calibration.kind == "raw" else [])
         if len(blocks) * result.fit_s > LEFT_OUT_WITHIN_S:
             command = shlex.join(_evaluate_command(args, kind))
             return {"left_out": None, "left_out_command": command}, [f"Judge it by {kind} left out: {command}"]

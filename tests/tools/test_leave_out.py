@@ -9,16 +9,8 @@ import pytest
 from shearloop.errors import UserError
 from shearloop.estimation.values import Estimate, FrameSeries
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
-from shearloop.tools.leave_out import (
-    KINDS,
-    Recipe,
-    find_blocks,
-    fit_without,
-    judge_block,
-    judge_left_out,
-    sentences_of,
-    usual_kind,
-)
+from shearloop.tools.leave_out import Recipe, fit_without, judge_block, judge_left_out, sentences_of
+from shearloop.tools.left_out_blocks import KINDS, after_twists, find_blocks, usual_kind
 from shearloop.tools.parallel import SerialExecutor
 from tests.estimation.conftest import sliced, twisting
 
@@ -116,6 +108,35 @@ def test_what_no_sensor_is_needed_for_is_said(sides, kind, said):
     track = EstimateTrack(played, off, np.zeros(len(truth)), truth + 0.01)
     assert re.search(said, no_better_than_clock([track]))
     assert no_better_than_clock([replace(track, profile_nm=truth + 0.03)]) == ""
+
+
+@pytest.mark.parametrize(("kind", "n_blocks"), [("twists", 3), ("grips", 2)])
+def test_the_first_twist_adapts_and_is_neither_fitted_nor_judged(kind, n_blocks):
+    recordings = MATERIAL[kind]()
+    # The judged recording's grip has another gain than the fit expects.
+    if kind == "grips":
+        recordings[0] = replace(recordings[0], torque_nm=1.3 * recordings[0].torque_nm)
+    blocks = after_twists(find_blocks(kind, recordings, ["a", "b"]), recordings, 1)
+    assert len(blocks) == n_blocks
+    for block in blocks:
+        adapted = block.adapted
+        torque_nm = recordings[adapted.recording].torque_at_frames()
+        assert torque_nm[: adapted.stop].max() > 0.04
+        fitted = block.fitted[adapted.recording][: adapted.stop]
+        assert not fitted[torque_nm[: adapted.stop] > 0.0].any()
+        assert all(span.first >= adapted.stop for span in block.judged)
+    result = judge_left_out(kind, RECIPE, recordings, ["a", "b"], SerialExecutor(), adapt_twists=1)
+    figures = result.figures()
+    assert figures["before_adapting"]["n"] == figures["loaded"]["n"] > 0
+    assert "Before adapting" in sentences_of(result)[-2]
+    if kind == "grips":
+        assert figures["loaded"]["rmse_nm"] < 0.8 * figures["before_adapting"]["rmse_nm"]
+
+
+def test_nothing_remains_after_as_many_twists_as_there_are():
+    recordings = MATERIAL["grips"]()
+    with pytest.raises(UserError, match="no recording has more than 3 twists"):
+        after_twists(find_blocks("grips", recordings, ["a", "b"]), recordings, 3)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,220 @@
+"""What is left out of a fit: each grip, twist, tool or level of torque in turn, as rows of the recordings."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.errors import UserError
+from shearloop.estimation import FrameSeries
+from shearloop.estimation.fingertip_validator import segment_grip
+from shearloop.estimation.gain import find_twists
+from shearloop.estimation.left_out import NEAR_LEVEL, later_levels
+from shearloop.estimation.values import Measured, distinct
+from shearloop.words import counted
+
+Kind: TypeAlias = Literal["grips", "twists", "levels", "tools"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Rows `first` to `stop` of the recording with this number."""
+
+    recording: int
+    first: int
+    stop: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """One block left out: its name, the rows (n,) of each recording that are fitted, and the judged spans.
+
+    `timed` are the rows that the stopwatch knows, where these are others. The gain is adapted to the span `adapted`,
+    which is neither fitted nor judged.
+    """
+
+    name: str
+    fitted: tuple[BoolArray, ...]
+    judged: tuple[Span, ...]
+    timed: tuple[BoolArray, ...] = ()
+    adapted: Span | None = None
+
+
+def find_blocks(kind: Kind, recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
+    """Return the blocks of a kind; raises UserError for recordings that have fewer than two."""
+    is_raw = all(one.kind == "raw" for one in recordings)
+    if kind == "levels":
+        if is_raw:
+            raise UserError("twists of a recording have no levels; leave out grips, twists or tools")
+        return _levels(recordings)
+    if not is_raw:
+        raise UserError(f"slices show no {kind}; use --leave-out levels")
+    if kind == "twists":
+        return _twists(recordings, names)
+    return _grips(recordings, names) if kind == "grips" else _tools(recordings, names)
+
+
+def usual_kind(recordings: Sequence[FrameSeries]) -> Kind:
+    """Return the widest kind that recordings allow: tools, else grips, else twists; of slices, levels."""
+    if recordings[0].kind != "raw":
+        return "levels"
+    tools = [one.tool_mm for one in recordings]
+    if len(_known_tools(tools)) > 1 and None not in tools:
+        return "tools"
+    return "grips" if len(recordings) > 1 else "twists"
+
+
+def _grips(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
+    """Return a block for each recording: one grip."""
+    if len(recordings) < 2:
+        raise UserError(
+            "there is one recording, and so one grip, which leaves nothing to fit; record three, or use --leave-out "
+            "twists"
+        )
+    return [_without_recordings(recordings, [number], name) for number, name in enumerate(names)]
+
+
+def _tools(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
+    """Return a block for each diameter, with all of its recordings."""
+    unnamed = [name for name, one in zip(names, recordings, strict=True) if one.tool_mm is None]
+    if unnamed:
+        raise UserError(f"{unnamed[0]} does not name its tool's diameter; name it with --tool-mm")
+    sizes = [one.tool_mm.value for one in recordings if one.tool_mm is not None]
+    tools = [one.value for one in _known_tools([one.tool_mm for one in recordings])]
+    if len(tools) < 2:
+        raise UserError(
+            f"there is one tool, of {tools[0]:.3g} mm, which leaves nothing to fit; record four tools, or use "
+            "--leave-out grips or twists"
+        )
+    of = [min(tools, key=lambda tool: abs(tool - size)) for size in sizes]
+    return [
+        _without_recordings(
+            recordings, [number for number, own in enumerate(of) if own == tool], f"the tool of {tool:.3g} mm"
+        )
+        for tool in tools
+    ]
+
+
+def _known_tools(tools: Sequence[Measured | None]) -> list[Measured]:
+    return distinct([one for one in tools if one is not None])
+
+
+def _without_recordings(recordings: Sequence[FrameSeries], left_out: Sequence[int], name: str) -> Block:
+    fitted = tuple(np.full(len(one.t_s), number not in left_out) for number, one in enumerate(recordings))
+    return Block(name, fitted, tuple(Span(number, 0, len(recordings[number].t_s)) for number in left_out))
+
+
+def _twists(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
+    """Return a block for each twist, from the middle between it and the one before to that between it and the next.
+
+    The first begins with the grip, the last ends with it. A recording of one twist is left out whole.
+    """
+    blocks: list[Block] = []
+    for number, (series, name) in enumerate(zip(recordings, names, strict=True)):
+        edges = _twist_edges(series)
+        for nth, (first, stop) in enumerate(itertools.pairwise(edges), 1):
+            fitted = [np.ones(len(one.t_s), dtype=np.bool_) for one in recordings]
+            if len(edges) > 2:
+                fitted[number][first:stop] = False
+            else:
+                fitted[number][:] = False
+            blocks.append(Block(f"twist {nth} of {name}", tuple(fitted), (Span(number, first, stop),)))
+    if len(blocks) < 2:
+        raise UserError("there is one twist, which leaves nothing to fit; record ten")
+    return blocks
+
+
+def _twist_edges(series: FrameSeries) -> list[int]:
+    """Return the rows between which the twists of a recording lie: the grip, the middles of the pauses, its end."""
+    grip = segment_grip(series)[1]
+    twists = find_twists(np.nan_to_num(series.torque_at_frames()))
+    middles = [(int(before[-1]) + int(after[0]) + 1) // 2 for before, after in itertools.pairwise(twists)]
+    return [grip.start, *middles, grip.stop]
+
+
+def _levels(recordings: Sequence[FrameSeries]) -> list[Block]:
+    """Return a block for each level of later slices: fitted to earlier slices of other levels.
+
+    The stopwatch knows the earlier slices of all levels: it reads the place in the sequence, and no sensor.
+    """
+    torque = np.concatenate([_torque_of_slices(one) for one in recordings])
+    places = [(number, row) for number, one in enumerate(recordings) for row in range(len(one.t_s))]
+    known = np.flatnonzero(np.isfinite(torque))
+    parts = later_levels(torque[known]) if len(known) else []
+    if not parts:
+        raise UserError(f"{counted(len(known), 'slice')} with a torque cannot be split; record 20 or more")
+    blocks: list[Block] = []
+    near_nm = NEAR_LEVEL * float(np.ptp(torque[known]))
+    for kept, later in parts:
+        own = torque[known[later]]
+        if np.abs(torque[known[kept], None] - own).min() <= near_nm:
+            raise UserError("too few slices remain without those of one level; record ten levels, three times or more")
+        level = f"slices of {1e3 * float(own.mean()):.3g} mN·m after the first {int(kept[-1]) + 1}"
+        earlier = known[: int(kept[-1]) + 1]
+        fitted = _rows_of(recordings, np.isin(np.arange(len(torque)), known[kept]))
+        timed = _rows_of(recordings, np.isin(np.arange(len(torque)), earlier))
+        spans = tuple(Span(number, row, row + 1) for number, row in (places[one] for one in known[later].tolist()))
+        blocks.append(Block(level, fitted, spans, timed))
+    return blocks
+
+
+def _torque_of_slices(series: FrameSeries) -> FloatArray:
+    """Return the (n,) torques of slices, NaN where a slice is of a cylinder: these are not fitted to a torque."""
+    return np.where(np.isfinite(series.diameter_mm), np.nan, series.torque_at_frames())
+
+
+def _rows_of(recordings: Sequence[FrameSeries], rows: BoolArray) -> tuple[BoolArray, ...]:
+    """Return rows of all recordings together as rows (n,) of each."""
+    ends = np.cumsum([len(one.t_s) for one in recordings])
+    return tuple(np.split(rows, ends[:-1]))
+
+
+def kept(recordings: Sequence[FrameSeries], rows: Sequence[BoolArray]) -> list[FrameSeries]:
+    """Return the recordings with only these rows and the torques nearest to them; drop recordings without rows."""
+    found: list[FrameSeries] = []
+    for one, own in zip(recordings, rows, strict=True):
+        if not own.any():
+            continue
+        middles = one.t_s[:-1] + np.diff(one.t_s) / 2
+        near = own[np.searchsorted(middles, one.torque_t_s)]
+        found.append(
+            replace(
+                one,
+                t_s=one.t_s[own],
+                channels=one.channels[own],
+                diameter_mm=one.diameter_mm[own],
+                torque_t_s=one.torque_t_s[near],
+                torque_nm=one.torque_nm[near],
+            )
+        )
+    return found
+
+
+def after_twists(blocks: Sequence[Block], recordings: Sequence[FrameSeries], n_twists: int) -> list[Block]:
+    """Return blocks that are judged after the gain is adapted to the first twists of their recording.
+
+    These twists are neither fitted nor judged. Raises UserError where nothing remains to be judged.
+    """
+    edges = [_twist_edges(one) for one in recordings]
+    ends = [own[n_twists] if len(own) > n_twists + 1 else 0 for own in edges]
+    found: list[Block] = []
+    for block in blocks:
+        numbers = {span.recording for span in block.judged}
+        spans = [replace(span, first=max(span.first, ends[span.recording])) for span in block.judged]
+        for number in sorted(numbers):
+            judged = tuple(one for one in spans if one.recording == number and one.first < one.stop)
+            if not judged or not ends[number]:
+                continue
+            fitted = [rows.copy() for rows in block.fitted]
+            # The idle frames before the grip hold no twist.
+            fitted[number][edges[number][0] : ends[number]] = False
+            found.append(replace(block, fitted=tuple(fitted), judged=judged, adapted=Span(number, 0, ends[number])))
+    if not found:
+        raise UserError(
+            f"no recording has more than {counted(n_twists, 'twist')}: none remains to be judged; record ten"
+        )
+    return found

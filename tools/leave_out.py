@@ -16,7 +16,7 @@ from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
-from shearloop.tools.left_out_blocks import Block, Kind, after_twists, find_blocks, kept
+from shearloop.tools.left_out_blocks import Block, Kind, after_twists, find_blocks, kept, tools_of
 from shearloop.tools.parallel import Executor
 from shearloop.words import counted
 
@@ -113,7 +113,8 @@ def judge_left_out(
         tracks = tuple(tracks for _, tracks in pairs)
     else:
         tracks = tuple(pool.map(judge_block, (recipe, chosen), blocks))
-    return LeftOut(kind, tuple(one.name for one in blocks), tracks, _advice(kind, chosen, tracks), tuple(before))
+    advice = advice_on(kind, chosen, tracks, adapted=bool(adapt_twists))
+    return LeftOut(kind, tuple(one.name for one in blocks), tracks, advice, tuple(before))
 
 
 def judge_block(shared: tuple[Recipe, Sequence[FrameSeries]], block: Block) -> tuple[EstimateTrack, ...]:
@@ -169,16 +170,17 @@ def _adapted(recipe: Recipe, recordings: Sequence[FrameSeries], block: Block, ca
         raise CalibrationError(f"{block.name} is not judged after its first twists: {error}") from error
 
 
-def _advice(kind: Kind, recordings: Sequence[FrameSeries], tracks: Sequence[Sequence[EstimateTrack]]) -> str:
-    """Return one sentence: what to do first for a better calibration."""
+def advice_on(
+    kind: Kind, recordings: Sequence[FrameSeries], tracks: Sequence[Sequence[EstimateTrack]], *, adapted: bool
+) -> str:
+    """Return one sentence: what to do first for a better calibration, whose gain may be `adapted` to twists."""
     judged = [one for each in tracks for one in each]
     loaded = figures_by_load(judged)["loaded"]
     if loaded["baseline_ratio"] is None:
         return "No loaded frame has an estimate: see why with `shearloop evaluate CAL REC`."
-    if kind == "tools":
-        if len(tracks) < _ENOUGH_TOOLS:
-            tools = counted(len(tracks), "tool")
-            return f"{tools} only: record four, because three others tell the gain of one left out."
+    if kind == "tools" and (n_tools := len(tools_of(recordings))) < _ENOUGH_TOOLS:
+        return f"{counted(n_tools, 'tool')} only: record four, because three others tell the gain of one left out."
+    if kind == "tools" and not adapted:
         return "Another tool has a gain of its own: correct it with `shearloop adapt` on two twists of known torque."
     if against := no_better_than_clock(judged):
         return against

@@ -62,8 +62,7 @@ def usual_kind(recordings: Sequence[FrameSeries]) -> Kind:
     """Return the widest kind that recordings allow: tools, else grips, else twists; of slices, levels."""
     if recordings[0].kind != "raw":
         return "levels"
-    tools = [one.tool_mm for one in recordings]
-    if len(_known_tools(tools)) > 1 and None not in tools:
+    if len(tools_of(recordings)) > 1 and all(one.tool_mm is not None for one in recordings):
         return "tools"
     return "grips" if len(recordings) > 1 else "twists"
 
@@ -84,7 +83,7 @@ def _tools(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Bloc
     if unnamed:
         raise UserError(f"{unnamed[0]} does not name its tool's diameter; name it with --tool-mm")
     sizes = [one.tool_mm.value for one in recordings if one.tool_mm is not None]
-    tools = [one.value for one in _known_tools([one.tool_mm for one in recordings])]
+    tools = [one.value for one in tools_of(recordings)]
     if len(tools) < 2:
         raise UserError(
             f"there is one tool, of {tools[0]:.3g} mm, which leaves nothing to fit; record four tools, or use "
@@ -99,8 +98,9 @@ def _tools(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Bloc
     ]
 
 
-def _known_tools(tools: Sequence[Measured | None]) -> list[Measured]:
-    return distinct([one for one in tools if one is not None])
+def tools_of(recordings: Sequence[FrameSeries]) -> list[Measured]:
+    """Return the known diameters in mm of the recordings' different tools."""
+    return distinct([tool for one in recordings if (tool := one.tool_mm) is not None])
 
 
 def _without_recordings(recordings: Sequence[FrameSeries], left_out: Sequence[int], name: str) -> Block:

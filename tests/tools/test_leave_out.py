@@ -9,7 +9,7 @@ import pytest
 from shearloop.errors import UserError
 from shearloop.estimation.values import Estimate, FrameSeries
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
-from shearloop.tools.leave_out import Recipe, fit_without, judge_block, judge_left_out, sentences_of
+from shearloop.tools.leave_out import Recipe, advice_on, fit_without, judge_block, judge_left_out, sentences_of
 from shearloop.tools.left_out_blocks import KINDS, after_twists, find_blocks, usual_kind
 from shearloop.tools.parallel import SerialExecutor
 from tests.estimation.conftest import sliced, twisting
@@ -103,11 +103,9 @@ def test_the_stopwatch_knows_the_level_that_the_fit_does_not():
 )
 def test_what_no_sensor_is_needed_for_is_said(sides, kind, said):
     played = twisting(cycles=2, tips=(1, 2)[:sides]) if kind == "raw" else sliced(2)
-    truth = played.torque_at_frames()
-    off = tuple(Estimate(True, (), value, value - 0.1, value + 0.1) for value in (truth + 0.02).tolist())
-    track = EstimateTrack(played, off, np.zeros(len(truth)), truth + 0.01)
+    track = off_by(played, 0.02)
     assert re.search(said, no_better_than_clock([track]))
-    assert no_better_than_clock([replace(track, profile_nm=truth + 0.03)]) == ""
+    assert no_better_than_clock([off_by(played, 0.002)]) == ""
 
 
 @pytest.mark.parametrize(("kind", "n_blocks"), [("twists", 3), ("grips", 2)])
@@ -116,7 +114,8 @@ def test_the_first_twist_adapts_and_is_neither_fitted_nor_judged(kind, n_blocks)
     # The judged recording's grip has another gain than the fit expects.
     if kind == "grips":
         recordings[0] = replace(recordings[0], torque_nm=1.3 * recordings[0].torque_nm)
-    blocks = after_twists(find_blocks(kind, recordings, ["a", "b"]), recordings, 1)
+    names = ["a", "b"][: len(recordings)]
+    blocks = after_twists(find_blocks(kind, recordings, names), recordings, 1)
     assert len(blocks) == n_blocks
     for block in blocks:
         adapted = block.adapted
@@ -125,12 +124,29 @@ def test_the_first_twist_adapts_and_is_neither_fitted_nor_judged(kind, n_blocks)
         fitted = block.fitted[adapted.recording][: adapted.stop]
         assert not fitted[torque_nm[: adapted.stop] > 0.0].any()
         assert all(span.first >= adapted.stop for span in block.judged)
-    result = judge_left_out(kind, RECIPE, recordings, ["a", "b"], SerialExecutor(), adapt_twists=1)
+    result = judge_left_out(kind, RECIPE, recordings, names, SerialExecutor(), adapt_twists=1)
     figures = result.figures()
     assert figures["before_adapting"]["n"] == figures["loaded"]["n"] > 0
     assert "Before adapting" in sentences_of(result)[-2]
     if kind == "grips":
         assert figures["loaded"]["rmse_nm"] < 0.8 * figures["before_adapting"]["rmse_nm"]
+
+
+def off_by(played, error_nm: float) -> EstimateTrack:
+    """Return estimates of a series that are off, where a stopwatch is off by 10 mN·m."""
+    truth = played.torque_at_frames()
+    estimates = tuple(Estimate(True, (), value, value - 0.1, value + 0.1) for value in (truth + error_nm).tolist())
+    return EstimateTrack(played, estimates, np.zeros(len(truth)), truth + 0.01)
+
+
+def test_tools_are_advised_to_adapt_and_counted_by_the_recordings():
+    recordings = [of_tool(size_mm, 1) for size_mm in (10.0, 14.0, 20.0, 28.0)]
+    tracks = [[off_by(one, 0.02)] for one in recordings]
+    assert "shearloop adapt" in advice_on("tools", recordings, tracks, adapted=False)
+    assert "does not beat the stopwatch" in advice_on("tools", recordings, tracks, adapted=True)
+    # A tool with nothing left to judge was recorded all the same.
+    assert "record four" not in advice_on("tools", recordings, tracks[1:], adapted=True)
+    assert "3 tools only: record four" in advice_on("tools", recordings[1:], tracks[1:], adapted=True)
 
 
 def test_nothing_remains_after_as_many_twists_as_there_are():

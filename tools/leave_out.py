@@ -81,7 +81,7 @@ class LeftOut:
             for name, tracks in zip(self.names, self.tracks, strict=True)
         ]
         tracks = self.all_tracks
-        named = {"left_out": self.kind, "blocks": blocks, "advice": self.advice}
+        named: dict[str, object] = {"left_out": self.kind, "blocks": blocks, "advice": self.advice}
         if self.before:
             named["before_adapting"] = figures_by_load(self.before, loaded_nm)["loaded"]
         return {**figures_by_load(tracks, loaded_nm), **figures_of(tracks), **named}

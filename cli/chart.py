@@ -46,6 +46,8 @@ def run(args: argparse.Namespace) -> int:
 
     with chart_folder(args.out), TemporaryFile(dir=args.out):
         pass
+    # A mistake in its name is said before anything is computed.
+    given = Bank.open(args.bank) if args.bank else None
     if args.name == "loop":
         print(*simulated_loop.chart(args.out), sep="\n")
         return 0
@@ -57,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
             paths = scene.chart(parts if args.recordings else parts[:1], args.out, executor)
         else:
             mesh = load_geometry(args.mesh).mesh if args.mesh else own_fingertip(MESH_SIZE_CM).mesh()
-            bank = Bank.open(args.bank) if args.bank else cached_bank("chart", GRID, mesh, scratch)
+            bank = given or cached_bank("chart", GRID, mesh, scratch)
             if args.name == "stability":
                 paths = stability.chart(parts, bank, mesh, scratch, args.out, executor)
             else:

@@ -65,6 +65,10 @@ def run(args: argparse.Namespace) -> int:
     played = [] if args.play is None else ["--play", str(args.play)]
     config = load_daemon_config(folder / name)
     # Mistakes, and another daemon, are found before anything is built and served.
+    if args.play is not None:
+        from shearloop.tools.recordings.matlab_import import read_lines
+
+        read_lines(args.play)
     settings = open_settings(config)
     check_ports(config, settings.host if settings is not None else None)
     port = args.port
@@ -77,10 +81,6 @@ def run(args: argparse.Namespace) -> int:
             f"{folder / name} starts nothing by itself: it needs `emulated: true` and `autostart: true`; remove it, "
             "and `shearloop demo` writes it again"
         )
-    if args.play is not None:
-        from shearloop.tools.recordings.matlab_import import read_lines
-
-        read_lines(args.play)
     print("The demo starts …", flush=True)
     # In a process of its own: the daemon would keep the memory of the fits.
     with running([*SHEARLOOP, "demo", "--prepare", "--folder", str(args.folder), *played]) as process:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from shearloop.errors import UserError
+from shearloop.files import open_file
 from shearloop.printable import own_stream, printable
 
 # Longer than the 124 characters of text at the start of a MATLAB file.
@@ -33,7 +34,7 @@ def check_overwrite(out: Path, kind: str, begins: bytes | None = None) -> None:
     if not out.is_file():
         return
     try:
-        with out.open("rb") as file:
+        with open_file(out) as file:
             head = file.read(_HEAD_BYTES)
     except OSError:
         return

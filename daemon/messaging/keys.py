@@ -234,8 +234,9 @@ class ClientAuthenticator:
 
 def _load(path: Path) -> tuple[bytes, bytes | None]:
     try:
-        # A key file is small, and no device.
-        read_file(path, _LARGEST_KEY_BYTES)
+        # A key file is small, no device, and not empty as files of the kernel are, which may have no end.
+        if not read_file(path, _LARGEST_KEY_BYTES):
+            raise ValueError
         public, secret = load_certificate(path)
     except PermissionError as error:
         raise UserError(f"{path}: this user may not read the key; run as its owner, or with sudo") from error

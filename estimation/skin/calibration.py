@@ -190,7 +190,9 @@ def read_table(path: Path) -> CalibrationTable:
         with open_file(path) as raw, io.TextIOWrapper(raw, newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file, restkey="a value without a column")
             rows = [validated(row, _Row, f"{path}, line {reader.line_num}", CalibrationError) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except OSError as error:
+        raise CalibrationError(f"{path}: the table cannot be read: {error.strerror}.") from error
+    except (UnicodeDecodeError, csv.Error) as error:
         raise CalibrationError(f"{path}: the table cannot be read: {error}.") from error
     if not rows:
         raise CalibrationError(f"{path}: the table has no rows; its columns are {', '.join(_Row.model_fields)}.")

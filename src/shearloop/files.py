@@ -94,13 +94,20 @@ def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str,
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a file to read; raises OSError, also for a device or a pipe, which may have no end."""
+    """Open a file to read; raises OSError, also for a device or a pipe, which may have no end.
+
+    A file without a size is read as an empty one: so are files of the kernel, some of which, as /proc/kmsg, never end.
+    """
     # Opening a device can already change something.
     _refuse_device(path.stat())
     # It may be another file by now, and the opening of a pipe waits for a writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _refuse_device(os.fstat(handle))
+        status = os.fstat(handle)
+        _refuse_device(status)
+        if stat.S_ISREG(status.st_mode) and not status.st_size:
+            os.close(handle)
+            handle = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
         return os.fdopen(handle, "rb")
     except OSError:
         os.close(handle)
@@ -113,10 +120,7 @@ def _refuse_device(status: os.stat_result) -> None:
 
 
 def read_file(path: Path, most_bytes: int) -> bytes:
-    """Return a whole file that is expected to be small; raises OSError, also for a larger one or a device.
-
-    A file of the kernel, such as /proc/kmsg, is empty: it has no size, and some have no end.
-    """
+    """Return a whole file that is expected to be small; raises OSError, also for a larger one or a device."""
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most_bytes:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
+from typing import NamedTuple, Self
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
@@ -23,6 +24,7 @@ from shearloop.tools.check import CheckEmulators, check_parts
 from shearloop.tools.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
 from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, split_cure, trouble
 from shearloop.tools.serial_ports import HiddenBoard, has_brltty, list_hidden_boards, list_serial_ports
+from shearloop.yaml_files import read_yaml
 
 __all__ = ["Finding", "examine"]
 
@@ -34,10 +36,30 @@ FIRST_SANE_UNIX_S = 1_704_067_200
 _TIME_ERROR = 5
 
 
+class GivenGeometry(NamedTuple):
+    """The file of a geometry, and the digest of its mesh."""
+
+    path: Path
+    digest: str
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read the file; raises UserError or BankError for one that is no geometry."""
+        from shearloop.tools.bank_config import load_geometry
+
+        return cls(path, load_geometry(path).mesh.digest)
+
+
 def examine(
     config_path: Path | None, seconds: float, check_emulators: CheckEmulators, geometry: Path | None = None
 ) -> Iterator[Finding]:
-    """Yield one finding after another; listen to all devices at once for `seconds`."""
+    """Yield one finding after another; listen to all devices at once for `seconds`.
+
+    Raises UserError or BankError, before the first one, for a given file that is not YAML or no geometry.
+    """
+    if config_path is not None:
+        read_yaml(config_path, UserError)
+    own = None if geometry is None else GivenGeometry.read(geometry)
     yield from check_computer()
     yield from check_ports()
     if config_path is None:
@@ -51,7 +73,7 @@ def examine(
         return
     yield good("configuration", f"{config_path} is in order")
     yield check_disk(Path() if config.recording is None else config.recording.folder)
-    yield from check_files(config, config_path, check_emulators, geometry)
+    yield from check_files(config, config_path, check_emulators, own)
     if config.robot is not None and not config.emulated:
         yield from check_robot_values(config.robot)
         yield from check_cap(config)
@@ -147,7 +169,7 @@ def _explain_hidden(board: HiddenBoard) -> Finding:
 
 
 def check_files(
-    config: DaemonConfig, path: Path, check_emulators: CheckEmulators, geometry: Path | None
+    config: DaemonConfig, path: Path, check_emulators: CheckEmulators, geometry: GivenGeometry | None
 ) -> Iterator[Finding]:
     """Check every file of the configuration in `path`; `geometry` is the fingertip that its bank must match."""
     banks = [check_bank(name, fingertip, geometry) for name, fingertip in config.fingertips.items()]
@@ -206,7 +228,7 @@ def check_cap(config: DaemonConfig) -> Iterator[Finding]:
         yield note("commissioning", what, "an experiment that asks for more is refused", cure)
 
 
-def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = None) -> Finding:
+def check_bank(name: str, fingertip: FingertipConfig, geometry: GivenGeometry | None = None) -> Finding:
     """Check a bank's checksums and channel table, and its geometry if one is given."""
     subject = f"bank of {name}"
     if fingertip.bank is None:
@@ -221,17 +243,11 @@ def check_bank(name: str, fingertip: FingertipConfig, geometry: Path | None = No
     )
     if geometry is None:
         return good(subject, found)
-    from shearloop.tools.bank_config import load_geometry
-
-    try:
-        digest = load_geometry(geometry).mesh.digest
-    except (UserError, BankError) as error:
-        return from_error(subject, error, "the bank cannot be compared with it")
-    if digest != bank.geometry_hash:
+    if geometry.digest != bank.geometry_hash:
         means = "the bank belongs to another fingertip or another mesh; estimates are wrong"
         cure = "build it again with `shearloop bank build`, or give the geometry it was built from"
-        return trouble(subject, f"{found}; {geometry} is {digest[:12]}", means, cure)
-    return good(subject, f"{found}, which is {geometry}")
+        return trouble(subject, f"{found}; {geometry.path} is {geometry.digest[:12]}", means, cure)
+    return good(subject, f"{found}, which is {geometry.path}")
 
 
 def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:

@@ -14,7 +14,6 @@ from shearloop.daemon.config import DaemonConfig, GripperConfig, SerialDevice
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
-from shearloop.daemon.sensing.sessions import fingertip_table
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.ur.control_box import REMOTE_CURE, check_ports, query_controller, untested_sentence
@@ -30,6 +29,7 @@ from shearloop.tools.doctor.boards import (
     check_load_cell,
     check_port,
     check_rate,
+    table_of,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
 from shearloop.tools.task_row import task_row
@@ -163,7 +163,7 @@ def check_daemon(
                 yield check_rate(f"rate of {name}", measured_hz, 1.0 / own.frame_period_s, key, as_period=True)
             saturated = max(int(frame.get("saturated") or 0) for frame in frames)
             channels = np.array([frame["channels"] for frame in frames], dtype=np.float64)
-            yield check_channels(name, channels, saturated, fingertip_table(own))
+            yield check_channels(name, channels, saturated, table_of(own))
 
 
 def _usual_period_s(frames: Sequence[Mapping[str, Any]]) -> float:

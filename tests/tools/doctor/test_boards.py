@@ -102,6 +102,12 @@ async def test_boards_in_order_are_good(rig, tmp_path):
     assert found["channels of right"].found.startswith("0 saturated and 0 dead of the channels in ")
 
 
+async def test_a_board_is_heard_before_its_bank_is_built(rig, config, tmp_path):
+    device = {"path": str(tmp_path / "eit-right")}
+    path = config(right={"device": device, "frame_period_s": PERIOD_S, "bank": str(tmp_path / "no.bank")})
+    assert (await rig(frames(), path=path))["channels of right"].state == "good"
+
+
 @pytest.mark.parametrize("how", ["still", "silent"])
 async def test_an_electrode_whose_channels_stand_still_or_read_0_is_dead_and_named(rig, how):
     found = (await rig(frames(**{how: ELECTRODE})))["channels of right"]

@@ -84,11 +84,15 @@ async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config, tiny_
             assert f" Hz measured, {SPEED / 0.5412:.3g} Hz configured" in found["rate of right"].found
 
 
-def test_doctor_stops_at_an_invalid_configuration(tmp_path, ran, result_of):
-    said = ran("doctor", tmp_path / "no.yaml", status=1).out
+def test_doctor_stops_at_an_invalid_configuration(tmp_path, ran, result_of, mistake):
+    path = tmp_path / "a.yaml"
+    path.write_text("other: 1\n")
+    said = ran("doctor", path, status=1).out
     assert "WRONG configuration" in said
     assert "next: " in said
-    assert result_of("doctor", tmp_path / "no.yaml", status=1)[-1]["subject"] == "configuration"
+    assert result_of("doctor", path, status=1)[-1]["subject"] == "configuration"
+    assert "the configuration cannot be read: No such file" in mistake("doctor", tmp_path / "no.yaml")
+    assert "the mesh cannot be read: No such file" in mistake("doctor", path, "--geometry", tmp_path / "no.npz")
     assert main(["doctor", "--seconds", "nan"]) == 2
 
 
@@ -124,9 +128,9 @@ def test_tasks_are_judged_by_their_counters(facts, state, part):
 def test_a_bank_of_another_geometry_is_reported(config):
     fingertip = load_daemon_config(config()).fingertips["right"]
     assert doctor.check_bank("right", fingertip).state == "good"
-    other = doctor.check_bank("right", fingertip, Path("config/fingertips/paper.yaml"))
+    geometry = doctor.GivenGeometry.read(Path("config/fingertips/paper.yaml"))
+    other = doctor.check_bank("right", fingertip, geometry)
     assert (other.state, "another fingertip" in other.means) == ("trouble", True)
-    assert doctor.check_bank("right", fingertip, Path("no.yaml")).state == "trouble"
 
 
 def test_a_missing_bank_is_reported_once_for_each_fingertip(config, tmp_path):

@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,7 +15,7 @@ from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
 from shearloop.tools.recordings.intact_records import Progress
-from shearloop.tools.recordings.message_content import columns
+from shearloop.tools.recordings.message_content import column_units, columns
 from shearloop.tools.recordings.reader import read_messages
 from shearloop.tools.recordings.tables import Rows, arrays, columns_of, read_rows, row_of
 
@@ -26,6 +26,8 @@ _BATCH = 200_000
 _MAT_SIZE, _KEY_SIZE = 12_000_000, 10
 # MATLAB takes 63 characters.
 _LONGEST_NAME = 59
+# The variable of a MATLAB file, and the table beside CSV files, with the units of all columns.
+_UNITS = "units"
 # A cell with one of these stands in quotes.
 _QUOTED = re.compile(r'[",\r\n]')
 
@@ -33,6 +35,7 @@ _QUOTED = re.compile(r'[",\r\n]')
 def export(path: Path, form: str, out: Path, topics: list[str], progress: Progress = lambda _: None) -> list[Path]:
     """Write topics as `form` (csv, parquet or mat) and return the files.
 
+    Columns have their messages' units: in the fields' metadata of Parquet, a struct `units` of MATLAB, and `units.csv`.
     For csv and parquet `out` is a folder. For mat it is a file; a large recording continues in NAME_2.mat, NAME_3.mat,
     and so on, which must not exist. `progress` receives the number of messages so far. Raises UserError for a recording
     that cannot be read, and OSError for files that cannot be written; then no file is new or changed.
@@ -61,7 +64,10 @@ def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) ->
     with ExitStack() as files:
 
         def write() -> None:
-            structs = {name: arrays(waiting[topic]) for topic, name in names.items() if waiting[topic]}
+            used = {name: topic for topic, name in names.items() if waiting[topic]}
+            structs: dict[str, Mapping[str, Any]] = {name: arrays(waiting[topic]) for name, topic in used.items()}
+            if used:
+                structs[_UNITS] = {name: column_units(topic) for name, topic in used.items()}
             target = part(len(written) + 1)
             if written:
                 check_new(target)
@@ -86,6 +92,7 @@ def _struct_names(topics: Iterable[str]) -> dict[str, str]:
     """Return a name of MATLAB for each topic, and number those that would be alike: `eit.frame.a-b` and `….a_b`."""
     names: dict[str, str] = {}
     for topic in topics:
+        # Each has a dot, or is `health`: none is the variable of the units.
         plain = re.sub(r"\W", "_", topic, flags=re.ASCII)[:_LONGEST_NAME]
         number, name = 1, plain
         while name in names.values():
@@ -111,6 +118,11 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
                 ends.callback(made.close)
                 tables[topic] = made
             tables[topic].add(row)
+        if form == "csv":
+            rows = [(topic, *unit) for topic in tables for unit in column_units(topic).items()]
+            lines = [",".join(map(_csv_cell, row)) for row in (("topic", "column", "unit"), *rows)]
+            paths[_UNITS] = out / f"{_UNITS}.csv"
+            files.enter_context(replace_file(paths[_UNITS])).write("".join(f"{line}\r\n" for line in lines).encode())
     return list(paths.values())
 
 
@@ -165,7 +177,8 @@ class _ParquetTable:
         types["array"] = pa.list_(types["number"])
         known = columns(schema.schema_name(topic))
         kinds = {key: known[key].kind if key in known else "integer" for key in first}
-        self._schema = pa.schema([(key, types[kind]) for key, kind in kinds.items()])
+        units = {key: {"unit": unit} for key, unit in column_units(topic).items()}
+        self._schema = pa.schema([pa.field(key, types[kind], metadata=units.get(key)) for key, kind in kinds.items()])
         self._arrays = [field.name for field in self._schema if field.type == pa.list_(pa.float64())]
         scalars = [field.name for field in self._schema if not pa.types.is_list(field.type)]
         # Measured values seldom repeat: a dictionary of them would only cost time, and so would limits of arrays.

@@ -27,7 +27,7 @@ from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
 from shearloop.tools.recordings.intact_records import Progress
-from shearloop.tools.recordings.message_content import ContentError, check_length
+from shearloop.tools.recordings.message_content import ContentError, check_length, column_units
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
 
 ROWS_PER_S = 25
@@ -73,6 +73,9 @@ class _Held:
         self.names = [f"channel_{i}" for i in range(table.n_channels)] if self._table else []
         for key in self._keys:
             self.names += [f"{key}_{i}" for i in range(_VECTOR)] if key in _VECTORS else [key]
+        # By the keys of the message.
+        known = column_units(topic)
+        self.units = {key: known[key] for key in (self._keys or ["channels"]) if key in known}
         values = [0.0 if name == "valid" else np.nan for name in self.names]
         self.vector: NDArray[np.float32] = np.array(values, dtype=np.float32)
         self.measured_ns: int | None = None
@@ -144,7 +147,8 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
         raise UserError(f"{path}: nothing to export; a dataset needs one of the topics {', '.join(_FEATURES)}")
     _check_span(path, held)
     experiment = recording.metadata.get(schema.EXPERIMENT_METADATA, {}).get("name", "no experiment")
-    about = {"recording": path.name, "identity": recording.identity, "configuration": configuration}
+    units = {one.feature: one.units for one in held.values()}
+    about = {"recording": path.name, "identity": recording.identity, "configuration": configuration, "units": units}
     with ExitStack() as files:
         dataset = Dataset(out, held, files)
         dataset.write_rows(path, progress)

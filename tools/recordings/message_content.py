@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from pydantic_core import from_json
 
-from shearloop.daemon.messaging.messages import EitHeatmap
+from shearloop.daemon.messaging.messages import EitHeatmap, units
 from shearloop.daemon.recorder import schema
 from shearloop.drivers.serial_sensor import InputKind
 
@@ -43,6 +43,15 @@ def columns(name: str) -> Mapping[str, Column]:
     optional = schema.optional_keys(name)
     described = schema.schemas()[name]["properties"].items()
     return {key: Column(key, one["type"], key in optional) for key, one in described}
+
+
+@cache
+def column_units(topic: str) -> Mapping[str, str]:
+    """Return the unit of each column of a recorded topic's table that has one, as its message names it."""
+    name = schema.schema_name(topic)
+    times = dict.fromkeys(("log_time_ns", "t_mono_ns", "offset_ns", schema.ARRIVAL, schema.SUSPENDED), "ns")
+    known = {**times, **units(name)}
+    return {key: known[key] for key in ("log_time_ns", *columns(name)) if key in known}
 
 
 def read_content(topic: str, data: bytes) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from shearloop.errors import missing
 from shearloop.tools.recordings.intact_records import Progress
+from shearloop.tools.recordings.message_content import column_units
 from shearloop.tools.recordings.reader import open_recording, read_messages
 
 if TYPE_CHECKING:
@@ -22,7 +23,8 @@ class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
     """The topics of a recording; each is a map of arrays, which is read when it is first used.
 
     `log_time_ns` is the Unix time of each message. Numbers have the shape (n,), arrays (n, m), NaN where a value is
-    missing; texts are objects, "" where one is missing. `docs/messages.md` lists the keys and their units.
+    missing; texts are objects, "" where one is missing. `units` gives their units,
+    `docs/messages.md` their meaning.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -49,6 +51,10 @@ class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
     def __len__(self) -> int:
         """Return the number of topics."""
         return len(self.counts)
+
+    def units(self, topic: str) -> Mapping[str, str]:
+        """Return the unit of each key of a topic that has one."""
+        return column_units(topic)
 
     def frame(self, topic: str) -> "DataFrame":
         """Return a topic as a pandas frame by UTC time, a column per element of an array: `line_0`, `line_1`, …

@@ -1,0 +1,63 @@
+"""Each column of an export names the unit that its message declares."""
+
+import csv
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+from scipy.io import loadmat
+
+import shearloop
+from shearloop.daemon.messaging.messages import TOPICS
+from tests.tools.recordings.every_message import live_topic, made
+
+# Of keys that the recorder adds, and of the envelope.
+TIMES = {"log_time_ns": "ns", "t_mono_ns": "ns", "arrival_unix_ns": "ns", "offset_ns": "ns", "suspended_ns": "ns"}
+# The topics of a LeRobot dataset.
+FEATURED = ("robot.state", "eit.estimate", "eit.frame", "load.torque", "skin.shear", "gripper.state")
+Units = dict[str, dict[str, str]]
+
+
+def declared(columns: Units) -> Units:
+    """Return the units of each topic's columns, from the messages' declarations."""
+    found: Units = {}
+    for topic, keys in columns.items():
+        kind = TOPICS.get(live_topic(topic))
+        own = {one.name: one.metadata.get("unit", "") for one in dataclasses.fields(kind)} if kind else {}
+        every = {**own, **TIMES, "timestamp": "s"}
+        found[topic] = {key: every[key] for key in ("log_time_ns", *keys) if every.get(key)}
+    return found
+
+
+def csv_units(path: Path) -> Units:
+    found: Units = {}
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file, strict=True):
+            found.setdefault(row["topic"], {})[row["column"]] = row["unit"]
+    return found
+
+
+def test_each_way_out_has_the_messages_units(tmp_path, ran):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    one = made(tmp_path)
+    expected = declared(one.columns())
+    assert expected["eit.frame.right"]["channels"] == "V"
+    assert expected["robot.state"]["wrench"] == "N, N·m"
+    for form in ("csv", "parquet", "mat", "lerobot"):
+        ran("recording", "export", one.path, "--format", form, "--out", tmp_path / form)
+    assert csv_units(tmp_path / "csv" / "units.csv") == expected
+    read = shearloop.read(one.path)
+    (structs,) = loadmat(tmp_path / "mat", squeeze_me=True)["units"].reshape(1)
+    assert len(structs.dtype.names) == len(expected)
+    for topic, units in expected.items():
+        fields = parquet.read_schema(tmp_path / "parquet" / f"{topic}.parquet")
+        assert {field.name: field.metadata[b"unit"].decode() for field in fields if field.metadata} == units
+        struct = structs[topic.replace(".", "_").replace("-", "_")]
+        assert {key: str(struct[key]) for key in struct.dtype.names} == units
+        assert read.units(topic) == units
+    features = json.loads((tmp_path / "lerobot/meta/shearloop.json").read_text())["units"]
+    assert features["observation.channels.right"] == {"channels": "V"}
+    assert features["observation.load"] == {"torque_nm": "N·m"}
+    assert features["observation.state"].items() <= expected["robot.state"].items()
+    assert len(features) == sum(live_topic(topic) in FEATURED for topic in expected)

@@ -211,16 +211,19 @@ def _loop(_topic: str, content: Mapping[str, Any]) -> str:
 
 
 def loop_line(content: Mapping[str, Any]) -> str:
-    """Return phase, progress, the reasons for holding or the stop, step, and activity."""
+    """Return phase, progress, the cause of the hold or the stop, step, and activity."""
+    from shearloop.daemon.messaging.messages import cause_of
+
+    cause = cause_of(content)
     if not content["experiment"]:
-        return f"{content['phase']}: {content['reasons']}" if content["reasons"] else str(content["phase"])
+        return f"{content['phase']}: {cause}" if cause else str(content["phase"])
     step = f"step {content['step']} of {content['steps']} {content['step_name']}"
     activity, stopped = content["activity"] or content["experiment"], content["phase"] == "stopped"
     percent = "" if stopped else f" {100 * content['progress']:.0f} %"
-    # A narrow terminal cuts the end.
-    reasons = activity if stopped else content["reasons"]
-    parts = (f"{content['phase']}{percent}{f': {reasons}' if reasons else ''}", step, activity)
-    return "  ".join(parts[:2] if activity == reasons else parts)
+    # After a stop the activity is its reasons. A narrow terminal cuts the end.
+    cause = cause or (activity if stopped else "")
+    parts = (f"{content['phase']}{percent}{f': {cause}' if cause else ''}", step, activity)
+    return "  ".join(parts[:2] if stopped else parts)
 
 
 def _health(topic: str, content: Mapping[str, Any]) -> str:

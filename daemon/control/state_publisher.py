@@ -8,7 +8,7 @@ import structlog
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import Experiment
-from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage
+from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage, cause_of
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.ur.messages import RobotState
 
@@ -56,12 +56,11 @@ class StatePublisher:
         unchanged = (key, hold) == (self._key, self._hold)
         if unchanged and now_ns - self._published_ns < LOOP_STATE_PERIOD_S * 1e9:
             return
+        message = loop_state(self.control_loop, sent_rad_per_s, now_ns)
         if key != self._key:
-            structlog.get_logger().info(
-                "loop", phase=status.phase, activity=status.activity, reasons=" ".join(status.decision.reasons)
-            )
+            _log(message)
         self._key, self._hold, self._published_ns = key, hold, now_ns
-        self.publisher.publish(loop_state(self.control_loop, sent_rad_per_s, now_ns))
+        self.publisher.publish(message)
         if experiment is not None and not experiment.running:
             self.ended = experiment
         self.notify()
@@ -76,6 +75,15 @@ class StatePublisher:
         """Wake those who wait for a change at present."""
         self.changed.set()
         self.changed.clear()
+
+
+def _log(message: LoopState) -> None:
+    """Log a change of the loop: the cause of a hold or a stop comes first, and once."""
+    cause = cause_of({"cause": message.cause, "faults": message.faults})
+    # After a stop the activity is its reasons.
+    activity = "" if message.phase == "stopped" and cause else message.activity
+    said = {"cause": cause, "activity": activity}
+    structlog.get_logger().info("loop", phase=message.phase, **{key: text for key, text in said.items() if text})
 
 
 def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) -> LoopState:

@@ -296,6 +296,17 @@ def with_unit(topic: str, key: str, value: float, form: str) -> str:
     return f"{value:{form}} {units(topic).get(key, '')}".rstrip()
 
 
+def cause_of(loop_state: Mapping[str, Any]) -> str:
+    """Return why the loop of a `loop.state` holds or stopped: the cause, then the codes of all further faults.
+
+    Empty without a reason.
+    """
+    cause = str(loop_state.get("cause") or loop_state.get("reasons") or "")
+    first, *others = str(loop_state.get("faults") or "").split(", ")
+    further = ", ".join(dict.fromkeys(code for code in others if code != first))
+    return f"{cause} Also: {further}." if further else cause
+
+
 def stale_after_s(topic: str) -> float:
     """Return the age in seconds that makes a topic's latest message stale.
 

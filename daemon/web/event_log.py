@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from shearloop.daemon.messaging.messages import DaemonEnd, LoopStop, with_unit
+from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.messaging.messages import DaemonEnd, LoopStop, cause_of, with_unit
 
 # The page shows at most this many.
 MAX_EVENTS = 200
@@ -42,7 +43,7 @@ Events = Iterator[tuple[str, str]]
 
 def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
     phase, was = now.get("phase"), before.get("phase")
-    experiment, reasons = now.get("experiment", ""), str(now.get("reasons") or "")
+    experiment, cause = now.get("experiment", ""), cause_of(now)
     begun = phase in ACTIVE and (was not in ACTIVE or before.get("run") != now.get("run"))
     if begun:
         yield "step", f"{experiment} runs"
@@ -51,13 +52,17 @@ def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
     if phase == was:
         return
     if phase == "held":
-        yield "hold", f"holding: {reasons}"
+        yield "hold", f"holding: {cause}"
     elif phase == "paused":
         yield "hold", "paused"
     elif phase == "running" and was in ("held", "paused"):
         yield "step", "continues"
     elif phase == "stopped":
-        yield "stop", f"STOPPED, {now.get('response')}: {reasons or now.get('activity')}"
+        why = cause or now.get("activity")
+        if str(now.get("faults")).split(", ")[0] == FaultCode.OPERATOR_STOP.text:
+            yield "step", f"stopped as asked: {why}"
+        else:
+            yield "stop", f"STOPPED, {now.get('response')}: {why}"
     elif phase == "done":
         yield "step", f"{experiment} is done"
     elif phase == "idle" and was == "stopped":

@@ -25,6 +25,7 @@ import zmq.asyncio
 from aiohttp import WSCloseCode, web
 
 from shearloop.bank.fingertip import Fingertip
+from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.callers import caller
@@ -274,6 +275,7 @@ class _Page:
             "publish": publish,
             "dead_after_s": DEAD_AFTER_S,
             "stale_after_periods": messages.STALE_AFTER_PERIODS,
+            "operator_stop": FaultCode.OPERATOR_STOP.text,
             "units": {topic: dict(messages.units(topic)) for topic in messages.TOPICS},
             "stale_after_s": {topic: max(messages.stale_after_s(topic), MIN_STALE_S) for topic in regular},
         }

@@ -287,7 +287,7 @@ export function eventsPanel(link, drawn) {
   }));
 }
 
-// The loop's phase, and every reason for a hold.
+// The loop's phase, the cause of a hold or a stop, and the codes of further faults, whose sentences open by a click.
 export function loopPanel(link) {
   const message = link.get("loop.state");
   // The last state of an ended daemon is struck out.
@@ -307,16 +307,17 @@ export function loopPanel(link) {
   show(byId("holding"), reasons !== "");
   if (reasons === "") return;
   const stop = current.response.startsWith("stop");
-  byId("holding").dataset.kind = stop ? "stop" : "hold";
-  put(byId("holding-title"), { note: "Note", "refuse start": "No start" }[current.response] ?? (stop ? `Stopped: ${current.response}` : "Holding, because"));
-  const list = byId("reasons");
-  if (list.dataset.shown === reasons) return;
-  list.dataset.shown = reasons;
-  list.replaceChildren(...causeFirst(current).map((sentences) => {
-    const item = document.createElement("li");
-    put(item, sentences);
-    return item;
-  }));
+  const codes = current.faults.split(", ");
+  // A person's own stop is no error.
+  const asked = stop && codes[0] === link.settings.operator_stop;
+  byId("holding").dataset.kind = stop && !asked ? "stop" : "hold";
+  put(byId("holding-title"), { note: "Note", "refuse start": "No start" }[current.response] ?? (asked ? "Stopped as asked" : stop ? `Stopped: ${current.response}` : "Holding, because"));
+  put(byId("cause"), current.cause || reasons);
+  // `reasons` begins with the cause.
+  const others = current.cause ? reasons.slice(current.cause.length).trim() : "";
+  show(byId("others"), others !== "");
+  put(byId("other-codes"), [...new Set(codes.slice(1))].join(", ") || "more");
+  put(byId("other-reasons"), others);
 }
 
 // The times of the stop of this experiment, from its cause.
@@ -326,6 +327,3 @@ function stopTimes(link, current) {
   const after = (key) => (stop.content[key] === null ? "unknown" : link.number(stop, key, 3));
   return `After its cause: decided ${after("decided_after_s")}, confirmed by the robot's process ${after("sent_after_s")}, arm at rest ${after("stands_after_s")}.`;
 }
-
-// The cause with its cure, then all other reasons: `reasons` begins with the cause.
-const causeFirst = ({ cause, reasons }) => [cause, reasons.slice(cause.length).trim()].filter(Boolean);

@@ -182,6 +182,19 @@ def test_lines_break_at_invalid_values_and_continue_past_other_sources(browsed):
     assert b == ["", 1, "", 2, "", 3, None, None, 4], "a pause breaks the line as well"
 
 
+def test_a_persons_own_stop_is_no_error(browsed):
+    cause = "the operator stopped it: `shearloop command`. `shearloop command unlock` allows the next start."
+    stopped = {"phase": "stopped", "response": "stop and keep grip", "cause": cause, "reasons": cause}
+    browsed.daemon.say(loop={**stopped, "faults": "operator stop"})
+    browsed.open()
+    browsed.until_shown({"#holding-title": "Stopped as asked", "#cause": cause})
+    assert browsed.page.get_attribute("#holding", "data-kind") == "hold"
+    browsed.daemon.say(loop={**stopped, "faults": "estimate stale"})
+    browsed.until("#holding-title", "Stopped: stop and keep grip")
+    assert browsed.page.get_attribute("#holding", "data-kind") == "stop"
+    browsed.daemon.say()
+
+
 def test_a_replay_is_drawn_at_its_own_times(browsed):
     browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES if name != "end"})
     browsed.open()
@@ -189,13 +202,17 @@ def test_a_replay_is_drawn_at_its_own_times(browsed):
         browsed.page.wait_for_function(COLOURED, arg=chart)
 
 
-def test_the_cause_of_a_hold_comes_first_and_every_other_reason_after_it(browsed):
-    browsed.daemon.say(loop={"phase": "held", "response": "hold", "cause": CAUSE, "reasons": REASONS})
+def test_a_hold_shows_its_cause_then_the_codes_of_others_and_their_sentences_on_request(browsed):
+    codes = {"faults": "estimate invalid, estimate stale, estimate stale"}
+    browsed.daemon.say(loop={"phase": "held", "response": "hold", "cause": CAUSE, "reasons": REASONS, **codes})
     browsed.open()
-    browsed.until("#holding-title", "Holding, because")
-    first, others = browsed.page.locator("#reasons li").all_inner_texts()
-    assert first == CAUSE
-    assert f"{first} {others}" == REASONS
+    browsed.until_shown({"#holding-title": "Holding, because", "#cause": CAUSE, "#other-codes": "estimate stale"})
+    others = browsed.page.locator("#other-reasons")
+    assert not others.is_visible()
+    browsed.page.click("#others summary")
+    assert f"{CAUSE} {others.inner_text()}" == REASONS
+    browsed.daemon.say(loop={"phase": "held", "response": "hold", "cause": CAUSE, "reasons": CAUSE, "faults": "x"})
+    browsed.page.wait_for_selector("#others", state="hidden")
     browsed.daemon.say()
     browsed.page.wait_for_selector("#holding", state="hidden")
 

@@ -114,6 +114,8 @@ def run(args: argparse.Namespace) -> int:
     for (path, _), part in zip(named, parts, strict=True):
         if warning := load_delay_warning(part):
             print(f"Warning: {path.name}: {warning}.", file=sys.stderr)
+        if part.left_out:
+            print(f"Left out: {path.name}: {'; '.join(part.left_out)}.", file=sys.stderr)
     if args.plot or args.out:
         _draw(tracks, [path for path, _ in named], calibration, args.out or args.calibration.with_suffix(".png"))
     by_load, figures = figures_by_load(tracks, args.loaded_nm), figures_of(tracks)
@@ -180,6 +182,8 @@ def _leave_out(args: argparse.Namespace) -> int:
             write_estimates(found.all_tracks, names, args.estimates)
     for doubt in read.doubts:
         print(f"Warning: {doubt}.", file=sys.stderr)
+    for one in read.left_out:
+        print(f"Left out: {one}.", file=sys.stderr)
     figures = found.figures(args.loaded_nm)
     by_load = figures_by_load(found.all_tracks, args.loaded_nm)
     sentences = _lines({**by_load, "all": figures_of(found.all_tracks)})

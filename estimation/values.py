@@ -39,7 +39,8 @@ class FrameSeries:
     t_s (n,) is the middle of each acquisition in seconds; channels (n, m, c) in volts for m sides. torque_nm (p,)
     was measured at torque_t_s (p,) on the same clock. diameter_mm (n,) is NaN where unknown; gripper_mm is then the
     gripper's width, if there was a gripper. Diameters are not fitted to gripper_mm. first_frame is the first frame's
-    number in the whole recording, load_doubt why the torque's times may be wrong.
+    number in the whole recording, load_doubt why the torque's times may be wrong, left_out what is not among the frames
+    and torques, with its number.
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 
@@ -54,6 +55,7 @@ class FrameSeries:
     table: ChannelTable = PAPER_TABLE
     first_frame: int = 0
     load_doubt: str = ""
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check shapes and times."""

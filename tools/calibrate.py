@@ -27,6 +27,8 @@ class CalibrationResult:
     # The parts of recordings that it was fitted to, and the time in s that the fit took.
     parts: Sequence[FrameSeries] = ()
     fit_s: float = 0.0
+    # What of the recordings was not used, by their names.
+    left_out: Sequence[str] = ()
 
     @property
     def regressor(self) -> IntervalRegressor | None:
@@ -71,6 +73,8 @@ class CalibrationResult:
             found["load_cell_delay_s"] = [one and round(one.delay_s, 3) for one in timing.delays]
             found["load_cell_warnings"] = list(self.doubts)
             found["timing_uncertainty_s"] = round(timing.uncertainty_s, 3)
+        if self.left_out:
+            found["readings_left_out"] = list(self.left_out)
         if self.widening is not None:
             found["widening"] = self.widening
         return found | ({"tool_mm": self.tool_mm} if calibration.kind == "raw" else {})
@@ -100,7 +104,7 @@ def calibrate(
     fit_s = time.perf_counter() - begun
     frames = sum(len(one.t_s) for one in read.parts)
     tools = distinct([one.tool_mm for one in read.parts if one.tool_mm is not None])
-    return CalibrationResult(calibration, frames, read.timing, read.doubts, tools, read.parts, fit_s)
+    return CalibrationResult(calibration, frames, read.timing, read.doubts, tools, read.parts, fit_s, read.left_out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +115,7 @@ class ReadParts:
     paths: Sequence[Path]
     timing: LoadTiming
     doubts: Sequence[str]
+    left_out: Sequence[str] = ()
 
 
 def read_parts(
@@ -152,7 +157,8 @@ def read_parts(
     named = [*((path.name, one) for path, one in chosen), *others]
     warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]
     doubts = [f"{name}: {why}" for name, one in named for reference, why in warned if one is reference]
-    return ReadParts(parts, [path for path, _ in chosen], timing, doubts)
+    left_out = [f"{path.name}: {'; '.join(one.left_out)}" for path, one in chosen if one.left_out]
+    return ReadParts(parts, [path for path, _ in chosen], timing, doubts, left_out)
 
 
 def adapt_to_recordings(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT_NOTE, SIDES
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
@@ -90,7 +90,12 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
         gripper_mm,
         recording.table,
         load_doubt=recording.notes.get(LOAD_DOUBT_NOTE, ""),
+        left_out=recording.left_out + (() if paired.all() else (_unpaired(wanted[0], ~paired),)),
     )
+
+
+def _unpaired(side: str, apart: BoolArray) -> str:
+    return f"{counted(int(apart.sum()), 'frame')} of the {side} side, without one of the others at that time"
 
 
 def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:

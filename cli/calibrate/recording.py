@@ -119,6 +119,7 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
         probably = "probably " if timing.uncertainty_s else ""
         sentences.append(f"The load is {probably}stamped {', '.join(known)} the frames move.")
     sentences += [f"Warning: {doubt}." for doubt in result.doubts]
+    sentences += [f"Left out: {one}." for one in result.left_out]
     if result.widening is not None:
         sentences.append(
             "Could not verify the load cell's timestamps: the load changed too few times. They may be "

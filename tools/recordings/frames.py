@@ -1,5 +1,7 @@
 """The frames, torques and tools of a recording as arrays, for whoever fits or judges an estimator."""
 
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from shearloop.daemon.recorder import schema
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import Measured
 from shearloop.tools.recordings.reader import open_recording, reading, unusable
+from shearloop.words import counted
 
 # Metadata of every recording; the other keys are notes of this one.
 _IDENTITY_KEYS = (
@@ -49,6 +52,8 @@ class Recording:
     table: ChannelTable = PAPER_TABLE
     # Whether a daemon recorded it: frames and torques are then stamped on arrival by one clock.
     live: bool = False
+    # What is not in `sides` and `torque_nm`, with its number.
+    left_out: tuple[str, ...] = ()
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -57,6 +62,7 @@ def read_recording(path: str | Path) -> Recording:
     frames: dict[str, list[tuple[int, list[float]]]] = {}
     torques: list[tuple[int, float]] = []
     tools: list[tuple[int, Measured | None]] = []
+    repeated, distrusted, why = Counter[str](), 0, ""
     with open_recording(path) as recording:
         identity, table, metadata = recording.identity, recording.table, recording.metadata
         prefix = f"{schema.FRAME_TOPIC}."
@@ -70,6 +76,8 @@ def read_recording(path: str | Path) -> Recording:
                 if topic == schema.LOAD_TOPIC:
                     if "torque_nm" in content and content.get("valid", True):
                         torques.append((t_ns, float(content["torque_nm"])))
+                    else:
+                        distrusted, why = distrusted + 1, str(content.get("reason") or why)
                 elif topic in sides:
                     line = content["line"]
                     if len(line) != table.n_line_values:
@@ -78,6 +86,8 @@ def read_recording(path: str | Path) -> Recording:
                     # The board repeated an old frame.
                     if not rows or rows[-1][1] != line:
                         rows.append((t_ns, line))
+                    else:
+                        repeated[sides[topic]] += 1
                 elif content["kind"] == InputKind.TOOL.value:
                     tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
             except (KeyError, TypeError, ValueError) as error:
@@ -98,7 +108,17 @@ def read_recording(path: str | Path) -> Recording:
         tuple(tools),
         table,
         live,
+        tuple(_left_out(distrusted, len(torques) + distrusted, why, repeated)),
     )
+
+
+def _left_out(distrusted: int, torques: int, why: str, repeated: Counter[str]) -> Iterator[str]:
+    """Yield how many readings of the load cell, and frames of each side, were not read, and why."""
+    if distrusted:
+        example = f", e.g. {why}" if why else ""
+        yield f"{distrusted} of {counted(torques, 'reading')} of the load cell, not valid{example}"
+    for side, number in repeated.items():
+        yield f"{counted(number, 'frame')} of the {side} side, repeated by the board"
 
 
 def _side_frames(rows: list[tuple[int, list[float]]]) -> SideFrames:

@@ -42,8 +42,10 @@ ACCELERATION_S = 0.04
 PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
 # A motion has ended after this number of successive samples at rest.
 REST_SAMPLES = 3
-# The time allowed for a motion to end: nominal time × factor + constant.
+# The time allowed for a motion to end: nominal time × factor + constant. The constant is at least so many silences: an
+# emulated robot's time stands still while its computer is busy.
 MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
+MOVE_SILENCES, STOP_SILENCES = 6.0, 3.0
 # The controller rounds its factors on speeds; the slider's steps are 1 %.
 SCALING_TOLERANCE = 0.005
 # A slider that is moved slows a motion that is ending; below this it would have no end.
@@ -147,7 +149,8 @@ class MotionExecutor:
             self._end_speed_thread()
             sent, self.clipped = clip_linear(asked, self._settings.limits)
             self.sent = sent
-            deadline_ns = _deadline_ns(now_ns, _nominal_move_s(sent, sample), MOVE_SLACK_S, sample)
+            slack_s = max(MOVE_SLACK_S, MOVE_SILENCES * self._settings.silence_timeout_s)
+            deadline_ns = _deadline_ns(now_ns, _nominal_move_s(sent, sample), slack_s, sample)
             self._motion = _Move(sent.pose, now_ns, deadline_ns)
             if not self._arm.move(sent):
                 self._reject("linear move")
@@ -179,7 +182,8 @@ class MotionExecutor:
             case WristSpeed() | _Move():
                 self.end_reason = reason
         nominal_s = sample.fastest_rad_per_s / deceleration
-        self._motion = _Braking(deceleration, _deadline_ns(now_ns, nominal_s, STOP_SLACK_S, sample))
+        slack_s = max(STOP_SLACK_S, STOP_SILENCES * self._settings.silence_timeout_s)
+        self._motion = _Braking(deceleration, _deadline_ns(now_ns, nominal_s, slack_s, sample))
         if not self._speed_thread and not self._arm.stop_move(deceleration):
             self._reject("stop")
 

@@ -32,13 +32,16 @@ _STREAMS = {
 TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
 RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 _LINES = ("clipped_data", "clipped_data_hom")
-# Recordings are of this century.
-_EARLIEST_S, _LATEST_S = 946_684_800.0, 4_102_444_800.0
+# Recordings are of 2000 to 2060: seconds since 1900, as NTP counts them, would be later.
+_EARLIEST_S, _LATEST_S = 946_684_800.0, 2_840_140_800.0
 # A line that is stamped late may seem to come after the next one.
 _LARGEST_DELAY_S = 2.0
 _LONGEST_ELAPSED_S = 31 * 86_400.0
 # Boards send a line every 0.02 to 5 s: the load cell's every 0.09 s, fingertips' every 0.54 s.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
+_SHORTEST_FRAME_S = 0.05
+# Lines that were stamped late are fewer than this fraction.
+_MOST_LATE = 0.1
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 # Among this many frames on either side, at least one should have been read without delay.
@@ -98,7 +101,7 @@ def read_stream(path: Path, name: str | None = None, time_format: str = DATENUM)
     for times that are not of this format.
     """
     table = _table(path, name)
-    _check_times(path, table[:, 0], time_format)
+    _check_times(path, table[:, 0], time_format, _SHORTEST_STEP_S if name == "load" else _SHORTEST_FRAME_S)
     return Stream(_unix_s(table[:, 0], time_format), np.ascontiguousarray(table[:, 1:]))
 
 
@@ -123,20 +126,26 @@ def _unix_s(times: FloatArray, time_format: str) -> FloatArray:
     return (times - form.epoch) * form.unit_s
 
 
-def _fits(times: FloatArray, time_format: str) -> bool:
+def _fits(times: FloatArray, time_format: str, shortest_s: float) -> bool:
     """Return whether times (n,) in a format are plausible: of this century, or near 0, and about a line apart."""
     form, t_s = TIME_FORMATS[time_format], _unix_s(times, time_format)
     earliest_s, latest_s = (_EARLIEST_S, _LATEST_S) if form.has_date else (0.0, _LONGEST_ELAPSED_S)
     if not (t_s.min() >= earliest_s and t_s.max() <= latest_s):
         return False
-    return len(t_s) == 1 or _SHORTEST_STEP_S <= float(np.median(np.diff(t_s))) <= _LONGEST_STEP_S
+    return len(t_s) == 1 or shortest_s <= float(np.median(np.diff(t_s))) <= _LONGEST_STEP_S
 
 
-def _check_times(path: Path, times: FloatArray, time_format: str) -> None:
+def _check_times(path: Path, times: FloatArray, time_format: str, shortest_s: float) -> None:
     """Raise UserError, with the finding and the cure, unless times (n,) are of the format and do not fall."""
     steps = np.diff(times)
-    if _fits(times, time_format):
+    if _fits(times, time_format, shortest_s):
         steps_s = steps * TIME_FORMATS[time_format].unit_s
+        fallen = int((steps_s < 0).sum())
+        if fallen > max(1, _MOST_LATE * len(steps_s)):
+            first = int(np.argmax(steps_s < 0)) + 2
+            raise UserError(
+                f"{path}: {fallen} rows are before the row above them, row {first} first: sort the rows by their times"
+            )
         if len(steps_s) and steps_s.min() < -_LARGEST_DELAY_S:
             row = int(np.argmin(steps_s)) + 2
             raise UserError(
@@ -149,18 +158,21 @@ def _check_times(path: Path, times: FloatArray, time_format: str) -> None:
         found += f" and rise by {float(np.median(steps)):.3g} from row to row"
     wrong = f"{path}: {found}, which is not {time_format}, {TIME_FORMATS[time_format].words}"
     distinct = len(np.unique(times))
+    is_single = bool(times[0]) and np.array_equal(times, times.astype(np.float32))
+    if len(times) > 1 and distinct == 1 and not is_single:
+        raise UserError(
+            f"{path}: every row has the time {times[0]:.10g}: write the time of each row into the first column"
+        )
     if len(steps) and np.median(steps) == 0:
-        single = ": they were saved in single precision" if np.array_equal(times, times.astype(np.float32)) else ""
+        single = ": they were saved in single precision" if is_single else ""
         raise UserError(
             f"{path}: {counted(len(times), 'row')} have {counted(distinct, 'different time')}{single}; "
             "save the times again as doubles"
         )
-    fitting = [name for name in TIME_FORMATS if _fits(times, name)]
+    fitting = [name for name in TIME_FORMATS if _fits(times, name, shortest_s)]
     if fitting:
         raise UserError(f"{wrong}; give --time-format {' or '.join(fitting)}")
-    raise UserError(
-        f"{wrong}, with a row every {_SHORTEST_STEP_S:g} to {_LONGEST_STEP_S:g} s; correct the first column"
-    )
+    raise UserError(f"{wrong}, with a row every {shortest_s:g} to {_LONGEST_STEP_S:g} s; correct the first column")
 
 
 def read_line(path: Path) -> FloatArray:

@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
+from shearloop.drivers.ur.messages import ARRIVED, MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, carry_wrench
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.emulators.ur_robot import PLAYING, Robot
@@ -347,6 +347,21 @@ def test_a_worker_that_is_late_for_less_than_the_silence_costs_no_straight_move(
     for _ in range(round(late_s * 1e9) // CYCLE_NS):
         bench.run_without_handler()
     assert bench.arm.reading.program_running == goes_on
+
+
+@pytest.mark.parametrize(("silence_s", "arrives"), [(0.1, False), (1.0, True)])
+def test_an_emulated_robot_whose_time_stands_still_has_longer_for_a_straight_move(silence_s, arrives):
+    """The controller is on a busy computer: five of six cycles pass without it."""
+    settings = dataclasses.replace(DELIVERED, command_timeout_s=silence_s, silence_timeout_s=silence_s)
+    flight = flying(settings, ScriptedArm(control_script(settings), settings))
+    flight.fly(1)
+    x, y, z, *turned = flight.arm.robot.arm.pose
+    cycle = flight.arm.cycle
+    numbers = itertools.count()
+    flight.arm.cycle = lambda: cycle() if next(numbers) % 6 == 0 else None
+    assert flight.ask(MoveLinear((x, y, z - 0.03, *turned), 0.05, 0.5)).accepted
+    state = flight.fly_until(lambda state: state.motion == "idle" or "within its time" in state.end_reason)
+    assert (state.end_reason == ARRIVED) == arrives
 
 
 @pytest.mark.parametrize("held", [True, False])

@@ -314,13 +314,28 @@ def test_times_in_single_precision_are_refused(tmp_path, form):
             WRITTEN["datenum"](np.array([0, 0.5, 1.0, -4.0, -3.5])),
             "the time in row 4 is 5.0 s before that of row 3: the clock was set back",
         ),
-        (np.full(9, WRITTEN["unix"](0.3)), "9 rows have 1 different time; save the times again as doubles"),
+        (np.full(9, WRITTEN["unix"](0.3)), "every row has the time .*: write the time of each row"),
+        (np.zeros(9), "every row has the time 0: write the time of each row"),
+        (np.repeat(WRITTEN["unix"](np.arange(3.0)), 4), "12 rows have 3 different times; save the times again"),
+        (WRITTEN["datenum"](np.r_[0:9, 8:4:-1, 9:20] * 0.54), "3 rows are before the row above them, row 11 first"),
+        # Seconds since 1900, as NTP counts them, and microseconds.
+        (WRITTEN["unix"](0.54 * np.arange(9)) + 2_208_988_800, "correct the first column"),
+        (WRITTEN["unix"](0.54 * np.arange(9)) * 1e6, "correct the first column"),
     ],
 )
 def test_other_times_are_refused(tmp_path, times, says):
     save_times(tmp_path / "a.mat", times)
     with pytest.raises(UserError, match=says):
         read_load_stream(tmp_path / "a.mat")
+
+
+def test_frames_are_at_least_a_twentieth_of_a_second_apart(tmp_path):
+    """Minutes since the start look like a fast load cell, and like no fingertip."""
+    rows = np.column_stack([0.54 / 60 * np.arange(1, 31), np.ones((30, 1024))])
+    savemat(tmp_path / "right.mat", {"Right_Data": rows})
+    for form in TIME_FORMATS:
+        with pytest.raises(UserError, match="correct the first column"):
+            read_stream(tmp_path / "right.mat", "right", form)
 
 
 @pytest.mark.parametrize("form", TIME_FORMATS)

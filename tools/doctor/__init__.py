@@ -78,7 +78,15 @@ def examine(
         yield from check_robot_values(config.robot)
         yield from check_cap(config)
     tasks = daemon_tasks(config.commands)
-    if tasks is not None:
+    if tasks and (missing := _device_names(config) - tasks.keys()):
+        found = (
+            f"another configuration's daemon answers at {config.commands}: it has no {' and '.join(sorted(missing))}"
+        )
+        cure = "stop that daemon, or give one of the two other values of `publish` and `commands`"
+        yield trouble(
+            "daemon", found, "this configuration's devices were not examined, and its daemon cannot start", cure
+        )
+    elif tasks is not None:
         yield good("daemon", f"answers at {config.commands}; it holds the devices and reports on them")
         received = {} if "publish" in config.network_addresses else listen_for_frames(config.publish, seconds)
         yield from check_daemon(config, tasks, received)
@@ -89,6 +97,12 @@ def examine(
     else:
         yield good("daemon", "not running with this configuration: the devices are free")
         yield from asyncio.run(check_devices(config, seconds))
+
+
+def _device_names(config: DaemonConfig) -> set[str]:
+    """Return the names in `health` of the devices of a configuration."""
+    single = ("skin", "load_cell", "robot", "gripper")
+    return {*config.fingertips, *(name for name in single if getattr(config, name) is not None)}
 
 
 def check_computer() -> Iterator[Finding]:

@@ -46,6 +46,15 @@ async def examined(path: Path, seconds: float) -> dict[str, doctor.Finding]:
     return {finding.subject: finding for finding in findings}
 
 
+async def test_a_daemon_of_another_configuration_at_the_same_address_is_named(rig_config, monkeypatch):
+    others = {"left": {}, "robot": {}, "loop": {}}
+    monkeypatch.setattr(doctor, "daemon_tasks", lambda _: others)
+    found = await examined(rig_config, 0.1)
+    assert found["daemon"].state == "trouble"
+    assert found["daemon"].found.endswith("it has no gripper and load_cell and right")
+    assert "task robot" not in found
+
+
 @pytest.mark.real_time
 async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config, tiny_bank):
     found = await examined(rig_config, 0.1)

@@ -1,20 +1,24 @@
 """The emulated CB3 differs from an e-Series as a real one does."""
 
+import asyncio
 import dataclasses
 
 import numpy as np
 import pytest
 
 from shearloop.drivers.ur import settings as ur
+from shearloop.drivers.ur.control_box import ask_dashboard
 from shearloop.emulators.ur_arm import CURRENTS_ERROR
 from shearloop.emulators.ur_controller import Controller
 from shearloop.emulators.ur_robot import ControllerSpec, Robot
 from tests.drivers.ur.robots import DELIVERED, control_script, send
+from tests.emulator_process import own_address
 
 CB3 = ControllerSpec(version=(3, 15, 8, 0))
 LIMITS = dataclasses.replace(DELIVERED.limits, force_n=ur.ForceBound(40.0, 60.0), torque_nm=ur.TorqueBound(8.0, 12.0))
 SETTINGS = dataclasses.replace(DELIVERED, limits=LIMITS, generation="cb3")
 STEP_S, SPEED_J = 0.008, 9
+HOST = own_address(7)
 
 
 def steps(robot: Robot, number: int) -> Robot:
@@ -47,7 +51,7 @@ def test_functions_of_the_e_series_end_a_program(function):
 
 def test_a_program_that_starts_changes_no_zero_and_the_wrench_has_the_errors_of_currents():
     robot = Robot(CB3)
-    robot.arm._wrench[:] = 3.0
+    robot.arm.load[:] = 3.0
     robot.upload("def a():\n  while (True):\n    sync()\n  end\nend\n")
     found = []
     for _ in range(500):
@@ -59,6 +63,8 @@ def test_a_program_that_starts_changes_no_zero_and_the_wrench_has_the_errors_of_
     assert np.linalg.norm(np.array(found)[:, 3:], axis=1).max() <= 5.0
 
 
-def test_its_dashboard_knows_no_remote_control():
-    for spec, answer in ((ControllerSpec(), "true"), (CB3, "could not understand: 'is in remote control'")):
-        assert Controller(Robot(spec))._answer_dashboard("is in remote control") == answer
+async def test_its_dashboard_knows_no_remote_control():
+    request = "is in remote control"
+    for spec, answer in ((ControllerSpec(), "true"), (CB3, f"could not understand: '{request}'")):
+        async with Controller(Robot(spec), host=HOST).open():
+            assert await asyncio.to_thread(ask_dashboard, HOST, 5.0, (request,)) == [answer]

@@ -353,14 +353,13 @@ def test_a_worker_that_is_late_for_less_than_the_silence_costs_no_straight_move(
 def test_an_emulated_robot_whose_time_stands_still_has_longer_for_a_straight_move(silence_s, arrives):
     """The controller is on a busy computer: five of six cycles pass without it."""
     settings = dataclasses.replace(DELIVERED, command_timeout_s=silence_s, silence_timeout_s=silence_s)
-    flight = flying(settings, ScriptedArm(control_script(settings), settings))
-    flight.fly(1)
-    x, y, z, *turned = flight.arm.robot.arm.pose
-    cycle = flight.arm.cycle
-    numbers = itertools.count()
-    flight.arm.cycle = lambda: cycle() if next(numbers) % 6 == 0 else None
-    assert flight.ask(MoveLinear((x, y, z - 0.03, *turned), 0.05, 0.5)).accepted
-    state = flight.fly_until(lambda state: state.motion == "idle" or "within its time" in state.end_reason)
+    bench = enabled(settings, ScriptedArm(control_script(settings), settings))
+    bench.run(1)
+    x, y, z, *turned = bench.arm.robot.arm.pose
+    cycle, numbers = bench.arm.cycle, itertools.count()
+    bench.arm.cycle = lambda: cycle() if next(numbers) % 6 == 0 else None
+    assert bench.ask(MoveLinear((x, y, z - 0.03, *turned), 0.05, 0.5)).accepted
+    state = bench.run_until(lambda state: state.motion == "idle" or "within its time" in state.end_reason)
     assert (state.end_reason == ARRIVED) == arrives
 
 

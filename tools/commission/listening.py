@@ -69,6 +69,11 @@ class LoadCellListener:
                     raise UserError("the load cell is silent: `shearloop doctor CONFIG` examines it")
             return found[:count]
 
+    def since(self, t_ns: int) -> list[LoadSample]:
+        """Return the samples whose conversions were after a moment."""
+        with self._changed:
+            return [sample for sample in self.samples if sample.t_mid_ns >= t_ns]
+
     def mean_nm(self, seconds: float) -> float:
         """Return the mean torque of the next seconds."""
         count = max(3, round(seconds * self._config.rate_hz))

@@ -2,8 +2,10 @@
 
 import asyncio
 import statistics
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 from shearloop.daemon.commissioning import Line, Supplied
@@ -28,6 +30,7 @@ _GRIP_N: Final = 60.0
 _FINGERS_MM_PER_S: Final = 60.0
 _SLOWLY_RAD_PER_S: Final = 0.1
 _HELD_S: Final = 1.0
+_SETTLES_S: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +55,10 @@ def measure(context: Context) -> Measured:
     with LoadCellListener(cell) as load:
         context.ready()
         turned = _signs(context, load)
-        held = _twists(context, load)
+        held, delays_s = _twists(context, load)
     lines += [*turned, *judge_twists(held, spring)]
+    delay_s = statistics.median(delays_s)
+    lines.append(Line(what="torque behind the angle", value=f"{1e3 * delay_s:.0f} ms (median)", count=len(delays_s)))
     largest_nm = max(abs(one.load_nm - held[0].load_nm) for one in held)
     passed = all(line.verdict != "failed" for line in lines)
     return Measured(lines, Supplied(torque_nm=round(largest_nm, 4)) if passed else Supplied())
@@ -151,19 +156,37 @@ def _sign(change: float) -> str:
     return "positive" if change > 0 else "negative"
 
 
-def _twists(context: Context, load: LoadCellListener) -> list[Held]:
-    """Return what is held at the pose, at each twist's end and at the pose again."""
+def _twists(context: Context, load: LoadCellListener) -> tuple[list[Held], list[float]]:
+    """Return what is held at the pose, at each twist's end and at the pose again, and each twist's delay in s."""
     count = context.counts.twists
     context.operator.allow(
         f"wrist 3 turns the tool {count} times by {TURN_RAD:g} rad either way at {_SLOWLY_RAD_PER_S:g} rad/s"
     )
-    held = [_hold(context, load)]
+    held, delays_s = [_hold(context, load)], []
     for number in range(count):
+        begun_ns = time.monotonic_ns()
         _turn(context, TURN_RAD if number % 2 == 0 else -TURN_RAD)
+        context.observer.listen(_SETTLES_S)
+        angles = [(seen.made_ns, seen.wrist_rad) for seen in context.observer.since(begun_ns)]
+        torques = [(sample.t_mid_ns, sample.torque_nm) for sample in load.since(begun_ns)]
+        delays_s.append(middle_s(torques) - middle_s(angles))
         held.append(_hold(context, load))
     _turn(context, 0.0)
     held.append(_hold(context, load))
-    return held
+    return held, delays_s
+
+
+def middle_s(curve: Sequence[tuple[int, float]]) -> float:
+    """Return the middle of a rise in s: where a step of the same area would be. `curve` has times in ns and values.
+
+    A mean over each conversion does not move it, so that curves of different rates can be compared.
+    """
+    first, last = curve[0][1], curve[-1][1]
+    area_s = sum(
+        (after_ns - before_ns) / 1e9 * (0.5 * (before + after) - first) / (last - first)
+        for (before_ns, before), (after_ns, after) in pairwise(curve)
+    )
+    return curve[-1][0] / 1e9 - area_s
 
 
 def judge_twists(held: Sequence[Held], spring: float) -> list[Line]:

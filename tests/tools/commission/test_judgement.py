@@ -17,7 +17,7 @@ from shearloop.tools.commission.motion import SIGMAS, Turn, judge_noise
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.rtde import judge_clock, judge_samples
 from shearloop.tools.commission.stops import Stop, judge_stops
-from shearloop.tools.commission.tool import Held, judge_signs, judge_twists
+from shearloop.tools.commission.tool import Held, judge_signs, judge_twists, middle_s
 from shearloop.tools.commission.wrench import Reading, judge_mass, judge_rest
 from tests.drivers.ur.robots import DELIVERED
 
@@ -208,6 +208,17 @@ def held(stiffness: float, left_nm: float = 0.0) -> list[Held]:
 )
 def test_a_wrong_spring_and_a_slipping_grip_fail_their_lines(turned, lines):
     assert failed(judge_twists(turned, 0.8)) == lines
+
+
+@pytest.mark.parametrize("period_s", [0.008, 0.09, 0.3])
+def test_the_middle_of_a_rise_does_not_depend_on_the_rate(period_s):
+    """A ramp from 0.5 to 1.3 s, as a board sees it that averages over each of its periods."""
+    fine_s = np.arange(0.0, 3.0, 1e-3)
+    ramp = np.clip((fine_s - 0.5) / 0.8, 0.0, 1.0)
+    middles_s = np.arange(0.5 * period_s, 2.9, period_s)
+    means = [ramp[np.abs(fine_s - middle) <= 0.5 * period_s].mean() for middle in middles_s]
+    curve = [(round(middle * 1e9), 0.05 * mean) for middle, mean in zip(middles_s, means, strict=True)]
+    assert middle_s(curve) == pytest.approx(0.9, abs=0.01)
 
 
 def test_five_gauges_make_a_table_of_widths():

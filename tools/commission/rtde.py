@@ -92,7 +92,8 @@ def _uploads(context: Context) -> list[Line]:
     started = 0
     reasons: list[str] = []
     begun_s = time.monotonic()
-    if refusal := mover.unlock(_STARTS_WITHIN_S):
+    # Two processes start first.
+    if refusal := mover.unlock():
         return [_uploaded(0, context, refusal)]
     for after_s in context.counts.uploads_after_s:
         operator.say(

@@ -209,6 +209,8 @@ class Calibration:
         whole = self.estimator.scale.shape == (m, c) and all(row.shape == (c,) for row in rows)
         if not whole or len(self.validators) not in (0, len(self.sides)):
             raise ValueError(f"it is of {len(self.sides)} sides of {c} channels, and its arrays have other shapes")
+        if self.estimator.imputer is not None:
+            self.estimator.imputer.check_shapes(m, c)
         for quantity, model in self.outputs.items():
             width, found = self.estimator.feature_width(quantity), len(model.regressor.mean_feature)
             if width not in (None, found):

@@ -25,6 +25,12 @@ class ChannelImputer:
     modes: FloatArray
     precision: FloatArray
 
+    def check_shapes(self, sides: int, channels: int) -> None:
+        """Raise ValueError where its arrays are not of these sides and channels."""
+        one = (sides, channels)
+        if self.mean.shape != one or self.precision.shape != one or self.modes.ndim != 3 or self.modes.shape[1:] != one:
+            raise ValueError(f"the arrays for dead channels are not of {sides} sides of {channels} channels")
+
     @classmethod
     def fit(cls, positions: FloatArray, validators: tuple[FingertipValidator, ...]) -> Self:
         """Fit to the (n, m·c) differences of gripped frames in units of the validators' noises."""

@@ -269,6 +269,10 @@ class Regression(Estimator):
         """Return the channels' differences."""
         return (reading.frame.difference / self.scale).ravel()
 
+    def feature_width(self, _quantity: Quantity) -> int:
+        """Return the number of channels of all sides."""
+        return int(self.scale.size)
+
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction(Estimator):
@@ -289,6 +293,13 @@ class Reconstruction(Estimator):
     def features(self, reading: Reading) -> FloatArray:
         """Return the pixels of each side."""
         return (reading.frame.difference @ self.image.T).ravel()
+
+    def feature_width(self, _quantity: Quantity) -> int:
+        """Return the number of pixels of all sides; raises ValueError for an image of other channels."""
+        sides, channels = self.scale.shape
+        if self.image.ndim != 2 or self.image.shape[1] != channels:
+            raise ValueError(f"the image has the shape {self.image.shape}, expected pixels of {channels} channels")
+        return int(sides * len(self.image))
 
 
 class _OnBank(Estimator):
@@ -328,6 +339,10 @@ class BankEstimator(_OnBank):
         """Return the features of each side's match."""
         return np.concatenate([one.features for one in reading.matches])
 
+    def feature_width(self, _quantity: Quantity) -> int:
+        """Return the number of features of all sides: k, σ, σ² and the logarithm of the amplitude of each."""
+        return 4 * len(self.scale)
+
 
 class PaperEstimator(_OnBank):
     """The paper's curves on one fingertip: torque over σ and σ², diameter over k; the amplitude is ignored."""
@@ -344,3 +359,7 @@ class PaperEstimator(_OnBank):
     def features(self, reading: Reading) -> FloatArray:
         """Return k, σ and σ² of the first side."""
         return reading.matches[0].features[:3]
+
+    def feature_width(self, quantity: Quantity) -> int:
+        """Return 2 for the torque, σ and σ², and 1 for the diameter, k."""
+        return {"torque": 2, "diameter": 1}[quantity]

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import BankError, CalibrationError
 from shearloop.estimation import TRUSTED, Calibration, fit
+from shearloop.estimation.channel_imputer import ChannelImputer
+from shearloop.estimation.estimator import BankEstimator, PaperEstimator, Reconstruction, Regression
 from tests.estimation.conftest import follow, sliced
 from tests.paper_curve import paper_curve
 
@@ -221,6 +223,29 @@ def test_arrays_that_fit_each_other_and_not_the_channel_table_are_refused(motion
         changed = replace(temporal, directions=temporal.directions[:, :, :-1].copy())
     replace(motion_calibration, estimator=replace(estimator, temporal=changed)).save(tmp_path / "x.cal")
     with pytest.raises(CalibrationError, match="does not describe a calibration of this version"):
+        Calibration.load(tmp_path / "x.cal")
+
+
+def imputer(channels: int) -> ChannelImputer:
+    return ChannelImputer(np.zeros((1, channels)), np.zeros((2, 1, channels)), np.ones((1, channels)))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (Regression, "inputs, expected 1792"),
+        (lambda scale: Regression(scale, imputer=imputer(895)), "for dead channels are not of 2 sides of 896"),
+        (lambda scale: Reconstruction(scale, image=np.ones((50, 895))), "expected pixels of 896 channels"),
+        (lambda scale: Reconstruction(scale, image=np.ones((50, 896))), "inputs, expected 100"),
+        (BankEstimator, "inputs, expected 8"),
+        (PaperEstimator, "inputs, expected 2"),
+    ],
+    ids=["regression", "imputer", "image", "pixels", "bank", "paper"],
+)
+def test_each_estimator_refuses_arrays_of_other_channels(motion_calibration, make, said, tmp_path):
+    estimator = make(motion_calibration.estimator.scale)
+    replace(motion_calibration, estimator=estimator).save(tmp_path / "x.cal")
+    with pytest.raises(CalibrationError, match=said):
         Calibration.load(tmp_path / "x.cal")
 
 

@@ -14,6 +14,7 @@ import asyncio
 import contextlib
 import json
 import multiprocessing
+import signal
 import subprocess
 import sys
 import tempfile
@@ -44,7 +45,8 @@ from shearloop.tools.calibrate import calibrate
 SIDE = "right"
 TRACED = 5
 # Each stage ends after this time, whatever happens.
-LONGEST_S = 120.0
+LONGEST_S = 120
+LONGEST_FRAME_S = 5.0
 CALIBRATED_ON = ("rig-17.5mm.mcap", "rig-25mm.mcap", "rig-40mm.mcap")
 EXPERIMENT = {
     "name": "hold 0.05 N·m",
@@ -120,12 +122,15 @@ async def trace_frame(rig: Path, folder: Path) -> Way:
                     trace.calls, trace.recording = {}, number >= common.FIRST_VALID_FRAME
                     await asyncio.to_thread(board.send, line)
                     received: dict[str, Any] = {}
-                    while len(received) < 2:
-                        topic, payload = await subscriber.recv_multipart()
-                        received[topic.decode()] = payload
+                    # A board that is opened again on a busy computer loses a line.
+                    with contextlib.suppress(TimeoutError):
+                        async with asyncio.timeout(LONGEST_FRAME_S):
+                            while len(received) < 2:
+                                topic, payload = await subscriber.recv_multipart()
+                                received[topic.decode()] = payload
                     trace.recording = False
                     way = trace.take()
-                    if way and msgpack.unpackb(received["eit.estimate"])["valid"]:
+                    if way and len(received) == 2 and msgpack.unpackb(received["eit.estimate"])["valid"]:
                         ways.append(way)
         finally:
             trace.remove()
@@ -228,6 +233,8 @@ def trace(kind: str, rig: Path) -> Way:
         async with asyncio.timeout(LONGEST_S):
             return await STAGES[kind](rig, Path(folder))
 
+    # It also ends a calculation, which the event loop cannot.
+    signal.alarm(LONGEST_S + 10)
     with tempfile.TemporaryDirectory() as folder:
         return asyncio.run(within())
 

@@ -7,7 +7,7 @@ from benchmarks.call_trace import Trace, WayTrace
 from shearloop import units
 
 # Of the package, in all modules that `shearloop run` loads.
-MOST_LINES = 21_000
+MOST_LINES = 22_000
 NOT_ON_THE_ROBOTS_PC = ("emulators", "tools", "studies")
 
 

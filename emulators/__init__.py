@@ -1,12 +1,5 @@
-"""The devices of `drivers`, played byte for byte over real pseudo-terminals and sockets."""
+"""The devices of `drivers`, played byte for byte over real pseudo-terminals and sockets.
 
-
-def number_between(text: str, low: float, high: float, otherwise: str) -> float:
-    """Return a command's number; ValueError, `text` and `otherwise`, unless it lies from low to high."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise ValueError(f"{text!r} is {otherwise}")
-    return value
+`boards`, `skin`, `gripper` and `ur_robot` play one device each, over `ports`. `scene` has
+the physics that they share; `emulated_rig` plays them all together.
+"""

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.emulators import number_between
+from shearloop.emulators.numbers import number_between
 from shearloop.emulators.ports import PtyPort
 
 # Lateness of this process that is made up for, so that fast rates are kept on average.

@@ -11,9 +11,9 @@ from typing import Literal, Protocol, TypeAlias
 
 from shearloop.drivers.defaults import FRAME_PERIOD_S, LOAD_CELL_RATE_HZ, URCAP_PORT
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel
-from shearloop.emulators import number_between
 from shearloop.emulators.boards import EitKitBoard, Hx711Board, Sketch, format_line
 from shearloop.emulators.gripper import Fingers, Gripper, GripperPlayer, ModbusSlave, UrcapSession
+from shearloop.emulators.numbers import number_between
 from shearloop.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.emulators.scene import FloatArray, Joint, Scene, TwinSettings
 from shearloop.emulators.ur_controller import FAULTS, Controller

@@ -14,7 +14,7 @@ from typing import Any
 from pymodbus.framer import FramerRTU
 
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel
-from shearloop.emulators import number_between
+from shearloop.emulators.numbers import number_between
 from shearloop.emulators.ports import Server
 
 COUNTS_MAX = 255

@@ -10,7 +10,7 @@ from copy import copy
 from pathlib import Path
 from typing import Protocol, Self, TypeAlias
 
-from shearloop.emulators import number_between
+from shearloop.emulators.numbers import number_between
 
 READ_BYTES = 4096
 OUTAGES = "silence [SECONDS], unplug [SECONDS], slow MILLISECONDS, normal"

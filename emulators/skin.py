@@ -12,8 +12,8 @@ from random import Random
 from typing import Protocol, TypeAlias
 
 from shearloop.drivers.defaults import DAQ_RATE_HZ
-from shearloop.emulators import number_between
 from shearloop.emulators.boards import EmulatedBoard
+from shearloop.emulators.numbers import number_between
 from shearloop.emulators.ports import PtyServer, SocketServer
 
 # The conductance of an open circuit's insulation.

@@ -1,6 +1,6 @@
 """The estimators' contract: requirements, features of a frame, and fit; and the estimators that read one frame.
 
-An estimator is a subclass of `Estimator`, and a line in `bank/estimator_names.py`. It must have `name` and `features`.
+An estimator is a subclass of `Estimator`, and a line in `estimator_names.py`. It must have `name` and `features`.
 """
 
 from abc import ABC, abstractmethod

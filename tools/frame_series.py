@@ -49,8 +49,8 @@ def read_series(
     if any("mm_Data_" in name for name in names):
         return [_series_of_slices(read_diameter_slices(path))]
     raise UserError(
-        f"{path} is a folder without slices; name a recording (.mcap, from `shearloop run --record` or `shearloop "
-        "import`), or a folder of slices"
+        f"{path} is a folder without slices; name a recording (.mcap, from `shearloop run --record` or "
+        "`shearloop recording import`), or a folder of slices"
     )
 
 

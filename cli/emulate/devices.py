@@ -11,7 +11,7 @@ from shearloop.cli.emulate import console
 from shearloop.cli.options import PORT, add_option, number, positive
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ, URCAP_PORT
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
-from shearloop.emulators import number_between
+from shearloop.emulators.numbers import number_between
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from shearloop.cli.emulate.devices import Playing, add_load_cell, add_robot, loa
 from shearloop.cli.options import PORT, TOOL_MM, add_option, number, positive
 from shearloop.drivers.defaults import DAQ_RATE_HZ
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
-from shearloop.emulators import number_between
+from shearloop.emulators.numbers import number_between
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:

@@ -180,12 +180,12 @@ def _beyond_cap(file: ExperimentFile, step: Step, cap: MotionCap | None) -> str:
     """Return which speed or torque of a step the robot's commissioning does not allow, or an empty string."""
     if cap is None:
         return ""
-    asked: list[tuple[str, float, float, str]] = []
-    match step:
-        case ApproachStep():
-            asked.append(("speed_m_per_s", step.speed_m_per_s, cap.linear_speed_m_per_s, "m/s"))
-        case TwistStep() | TurnToStep() | TightenStep():
-            asked.append(("speed_rad_per_s", step.speed_rad_per_s, cap.wrist_speed_rad_per_s, "rad/s"))
+    # By the names of the keys: a kind of step that is added later is checked too.
+    speeds = (
+        ("speed_m_per_s", cap.linear_speed_m_per_s, "m/s"),
+        ("speed_rad_per_s", cap.wrist_speed_rad_per_s, "rad/s"),
+    )
+    asked = [(key, getattr(step, key), most, unit) for key, most, unit in speeds if hasattr(step, key)]
     if isinstance(step, TwistingStep):
         asked.append(("limits.torque_nm", file.limits_of(step).torque_nm, cap.torque_nm, "N·m"))
     for key, value, most, unit in asked:

@@ -41,9 +41,9 @@ class CombinedTask(FingertipTask):
                 await self.process(*self._pairs.popleft())
 
     @property
-    def is_waiting(self) -> bool:
-        """Whether no pair waits for its estimate."""
-        return not self._pairs
+    def has_waiting_pairs(self) -> bool:
+        """Whether a pair waits for its estimate."""
+        return bool(self._pairs)
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
@@ -162,7 +162,7 @@ class FingertipStates:
     def _record(self) -> None:
         if not any(one.wants_state for one in self._boards):
             return
-        if self._combined is not None and not self._combined.is_waiting:
+        if self._combined is not None and self._combined.has_waiting_pairs:
             return
         now_ns = self._clock.now_ns()
         for one in self._boards:

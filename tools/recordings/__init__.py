@@ -1,1 +1,6 @@
-"""Recordings at the desk: read, repair, export, replay and import MCAP files."""
+"""Recordings at the desk; `daemon/recorder` writes them.
+
+Read: `reader` opens closed files, `intact_records` damaged ones; `tables` and `frames` give arrays; `summary`
+and `listing` give numbers. Mend: `repair`. Play: `replay`. Bring out: `export`, `lerobot_export`,
+`rerun_export`, `slice_export`. Bring in: `matlab_import`.
+"""

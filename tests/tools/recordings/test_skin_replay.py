@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from shearloop.tools.recordings.tables import RecordedTopics
-from tests.daemon.skin.test_skin_run import played
+from tests.daemon.sensing.test_skin_run import played
 from tests.tools.recordings.test_replay import measured, replayed
 
 # The daemon publishes at least one force for each push.

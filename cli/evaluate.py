@@ -116,6 +116,8 @@ def run(args: argparse.Namespace) -> int:
             print(f"Warning: {path.name}: {warning}.", file=sys.stderr)
         if part.left_out:
             print(f"Left out: {path.name}: {'; '.join(part.left_out)}.", file=sys.stderr)
+        if part.emulated:
+            print(f"EMULATED: every device of {path.name} was emulated.", file=sys.stderr)
     if args.plot or args.out:
         _draw(tracks, [path for path, _ in named], calibration, args.out or args.calibration.with_suffix(".png"))
     by_load, figures = figures_by_load(tracks, args.loaded_nm), figures_of(tracks)

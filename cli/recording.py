@@ -108,13 +108,15 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _summary_text(found: "RecordingSummary") -> str:
-    from shearloop.daemon.recorder.schema import software_version
+    from shearloop.daemon.recorder.schema import EMULATED, software_version
 
     lines = [found.path]
     if found.first_unix_ns is not None:
         began = _local_time(found.first_unix_ns)
         lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.size_bytes / 1e6:.2f} MB")
     lines.append(f"  source   {found.metadata.get('source', 'unknown: not a recording of shearloop')}")
+    if EMULATED in found.metadata:
+        lines.append("  EMULATED every device was emulated on that computer")
     lines += [f"  ran      {name}" for name in found.experiments]
     lines += [f"  tool     {found.tool_mm} mm"] if found.tool_mm is not None else []
     if software := found.metadata.get("software"):

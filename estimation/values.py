@@ -40,7 +40,7 @@ class FrameSeries:
     was measured at torque_t_s (p,) on the same clock. diameter_mm (n,) is NaN where unknown; gripper_mm is then the
     gripper's width, if there was a gripper. Diameters are not fitted to gripper_mm. first_frame is the first frame's
     number in the whole recording, load_doubt why the torque's times may be wrong, left_out what is not among the frames
-    and torques, with its number.
+    and torques, with its number. emulated says that every device was emulated.
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 
@@ -56,6 +56,7 @@ class FrameSeries:
     first_frame: int = 0
     load_doubt: str = ""
     left_out: tuple[str, ...] = ()
+    emulated: bool = False
 
     def __post_init__(self) -> None:
         """Check shapes and times."""

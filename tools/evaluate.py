@@ -239,7 +239,8 @@ def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: st
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         else:
             _draw_intervals(axes, t_s, value, low, high)
-        axes.set_title(row_name + (_loaded_text(track) if is_torque else ""), loc="left", fontsize="medium")
+        emulated = "EMULATED: " if track.series.emulated else ""
+        axes.set_title(emulated + row_name + (_loaded_text(track) if is_torque else ""), loc="left", fontsize="medium")
         axes.set_xlabel("slice" if slices else "time in s")
         axes.set_ylabel("torque in N·m" if is_torque else "diameter in mm")
     labelled = {label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}

@@ -91,6 +91,7 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
         recording.table,
         load_doubt=recording.notes.get(LOAD_DOUBT_NOTE, ""),
         left_out=recording.left_out + (() if paired.all() else (_unpaired(wanted[0], ~paired),)),
+        emulated=recording.emulated,
     )
 
 

@@ -87,6 +87,8 @@ def daemon_identity(config: DaemonConfig) -> Identity:
     """
     metadata = schema.basic_identity(f"a daemon on {platform.node()}", channel_table(config))
     metadata["python"] = f"{platform.python_version()}, numpy {np.__version__}, {platform.machine()}"
+    if config.emulated:
+        metadata[schema.EMULATED] = "every device"
     for name, fingertip in config.fingertips.items():
         if fingertip.bank is not None:
             metadata[f"bank_{name}"] = Bank.open(fingertip.bank).identity

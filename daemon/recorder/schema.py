@@ -39,6 +39,8 @@ CLOCK_TOPIC = f"{INPUT}.clock"
 METADATA = "shearloop"
 # Its key of the offset: all Unix times of a daemon's recording minus CLOCK_MONOTONIC, in ns.
 CLOCK_OFFSET = "clock_offset_ns"
+# Its key of a rig whose devices were all emulated; absent from others.
+EMULATED = "emulated"
 # One metadata record for each experiment, and one at the end of a closed recording.
 EXPERIMENT_METADATA = "shearloop.experiment"
 END_METADATA = "shearloop.end"

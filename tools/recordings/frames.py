@@ -26,6 +26,7 @@ _IDENTITY_KEYS = (
     "software",
     "code_sha256",
     schema.CLOCK_OFFSET,
+    schema.EMULATED,
 )
 
 
@@ -54,6 +55,8 @@ class Recording:
     live: bool = False
     # What is not in `sides` and `torque_nm`, with its number.
     left_out: tuple[str, ...] = ()
+    # Whether every device was emulated.
+    emulated: bool = False
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -109,6 +112,7 @@ def read_recording(path: str | Path) -> Recording:
         table,
         live,
         tuple(_left_out(distrusted, len(torques) + distrusted, why, repeated)),
+        schema.EMULATED in identity,
     )
 
 

@@ -16,7 +16,7 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.recorder import daemon_identity
-from shearloop.daemon.recorder.schema import LOAD_DOUBT_NOTE
+from shearloop.daemon.recorder.schema import EMULATED, LOAD_DOUBT_NOTE
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.errors import UserError
 from shearloop.tools.frame_series import part_of, read_series, series_of
@@ -377,3 +377,16 @@ def test_unusable_files_are_refused_by_name(mat_folder, tmp_path):
             import_mat(sources, tmp_path / "a.mcap")
     with pytest.raises(UserError, match="without slices"):
         read_series(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("emulated", [False, True])
+def test_a_recording_of_an_emulated_rig_says_so(emulated, config, tmp_path, ran):
+    identity = daemon_identity(load_daemon_config(config()).model_copy(update={"emulated": emulated}))
+    notes = {key: value for key, value in identity.metadata.items() if key == EMULATED}
+    path = tmp_path / "moved" / "twist.mcap"
+    path.parent.mkdir()
+    with new_recording(path, "a bench", notes) as writer:
+        for i, line in enumerate(LINES):
+            writer.add_frame("right", 10**18 + i * 541_000_000, 10**18 + i * 541_000_000 + 300_000_000, line)
+    assert ("EMULATED" in ran("recording", "info", path).out) is emulated
+    assert read_series(path)[0].emulated is emulated

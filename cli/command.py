@@ -130,6 +130,12 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
     if name == "stop":
         if reply.get("ended"):
             return ["stop: nothing was moving; the daemon has ended"]
+        if reply.get("held"):
+            return [
+                f"stop: nothing was moving, and {reply['held']}. The daemon goes on, so that "
+                "`shearloop command release` can open them. Ctrl-C in its terminal ends the daemon, or "
+                "`systemctl stop shearloop`."
+            ]
         return [f"stop: stopped {reply['stopped']}" if reply.get("stopped") else "stop: nothing was moving"]
     values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
     return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -170,6 +170,9 @@ class Commands:
         if spare_daemon:
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
+        if self.rig is not None and (held := self.rig.control_loop.held) is not None:
+            # Somebody who presses twice must still be able to open the gripper.
+            return {"stopped": "", "held": held}
         # Nothing moves, so the daemon itself stops, once the reply is sent.
         asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
         return {"ended": True}

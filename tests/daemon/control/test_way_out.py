@@ -4,10 +4,12 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from shearloop.daemon.commands import Commands
 from shearloop.daemon.control.control_loop import LOADED_NM, ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_check import check_steps
@@ -196,3 +198,18 @@ def test_no_straight_move_begins_with_a_tool_that_is_or_may_be_gripped(sense):
 )
 def test_the_first_motion_is_told_before_a_start(steps, said):
     assert said in first_motion(ExperimentFile.model_validate({"name": "test", "steps": steps}))
+
+
+async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
+    async with with_gripper() as cell:
+        await cell.cycles(1)
+        ends = asyncio.Event()
+        rig = SimpleNamespace(control_loop=cell.control_loop, runner=cell.runner)
+        commands = Commands(rig, SimpleNamespace(), None, SimpleNamespace(), ends)
+        stop_command = commands.handlers()["stop"]
+        for _ in range(2):
+            reply = await stop_command({})
+        assert reply["held"] == "its fingers hold something 30.0 mm wide, with an unknown force"
+        cell.holding = False
+        await cell.cycles(2)
+        assert await stop_command({}) == {"ended": True}

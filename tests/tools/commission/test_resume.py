@@ -1,0 +1,52 @@
+"""The order of the stages: what is measured is kept, a failed stage ends it, and a later run continues."""
+
+from collections.abc import Callable
+
+import pytest
+
+from shearloop.daemon.commissioning import Line, load_report
+from shearloop.daemon.config import load_daemon_config
+from shearloop.drivers.ur.control_box import ControllerInfo
+from shearloop.drivers.ur.script import UPPER
+from shearloop.tools.commission import procedure
+from shearloop.tools.commission.context import Context, Counts
+from shearloop.tools.commission.operator import WORD, DeclinedError, Operator
+from shearloop.tools.commission.report import Measured
+from tests.tools.commission.test_commission import write_rig
+
+CONTROLLER = ControllerInfo("5.17.3.0", "1", "RUNNING", "NORMAL", remote=True, registers=UPPER)
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_stages_are_kept_blocked_and_continued(tmp_path, monkeypatch):
+    ran: list[str] = []
+    verdicts = {"0 a": "passed", "1 b": "failed", "2 c": "passed"}
+
+    def stage(name: str) -> Callable[[Context], Measured]:
+        def measure(context: Context) -> Measured:
+            context.operator.allow(name)
+            ran.append(name)
+            return Measured([Line(what="w", value="v", verdict=verdicts[name])])
+
+        return measure
+
+    monkeypatch.setattr(procedure, "STAGES", {name: stage(name) for name in verdicts})
+    monkeypatch.setattr(procedure, "query_controller", lambda *_: CONTROLLER)
+    path, out, allowed = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml", {"0 a"}
+
+    def run(only: str = "") -> list[str]:
+        ran.clear()
+        operator = Operator(lambda question: WORD if any(one in question for one in allowed) else "no", lambda _: None)
+        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only)
+        return list(ran)
+
+    with pytest.raises(DeclinedError, match="not allowed: 1 b"):
+        run()
+    assert [one.stage for one in load_report(out).stages] == ["0 a"], "the stage before is kept"
+    assert "1 b, 2 c" in out.with_suffix(".html").read_text()
+    allowed |= set(verdicts)
+    assert run() == ["1 b"], "a stage that passed is not repeated, and a failed one ends the commissioning"
+    verdicts["1 b"] = "passed"
+    assert run() == ["1 b", "2 c"]
+    assert run() == []
+    assert run("2") == ["2 c"], "a named stage is run again"

@@ -98,6 +98,11 @@ class Mover:
             self._process.wait()
         if self._reader is not None:
             self._reader.join()
+        if self._process is not None:
+            for pipe in (self._process.stdin, self._process.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(BrokenPipeError):
+                        pipe.close()
         self._process = self._reader = None
 
     def stop_worker(self) -> int:

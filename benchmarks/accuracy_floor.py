@@ -22,7 +22,8 @@ from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.fingertip_validator import channel_noise, segment_grip
 from shearloop.estimation.gain import find_twists
 from shearloop.estimation.load_delay import find_load_delay
-from shearloop.tools.frame_series import read_series, series_of
+from shearloop.studies.slices.series import read_slices
+from shearloop.tools.frame_series import series_of
 from shearloop.tools.recordings.frames import read_recording
 
 # Increments, in frames. The least bound over these numbers of directions counts; each direction needs some increments.
@@ -135,7 +136,7 @@ def main() -> None:
     delay = find_load_delay(series_of(stream))
     chosen = {f"stream, {' and '.join(sides)}": series_of(stream, sides) for sides in FINGERTIPS}
     floors = {name: stream_floor_nm(one, delay.error_s if delay else 0.0) for name, one in chosen.items()}
-    (slices,) = read_series(args.recordings / "torque_slices")
+    (slices,) = read_slices(args.recordings / "torque_slices")
     zero_nm = float(np.sqrt(np.mean(slices.torque_at_frames() ** 2)))
     for degree in DEGREES:
         floor_nm = slices_floor_nm(slices, degree)

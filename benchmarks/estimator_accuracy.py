@@ -24,8 +24,11 @@ from shearloop.emulators.emulated_rig import SIDES
 from shearloop.estimation import FrameSeries, Physics, fit, measure_timing
 from shearloop.estimation.estimator_names import DEFAULT, EstimatorName
 from shearloop.studies.emulated_calibration import calibrate, record
+from shearloop.studies.slices.evaluate import estimate_slices
+from shearloop.studies.slices.fitting import fit_slices
+from shearloop.studies.slices.series import SliceSeries, read_slices
 from shearloop.tools.evaluate import EstimateTrack, Figures, estimate_series, figures_by_load, figures_of
-from shearloop.tools.frame_series import part_of, read_series, series_of
+from shearloop.tools.frame_series import part_of, series_of
 from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import import_mat
 
@@ -68,12 +71,12 @@ def splits(recordings: Path, scratch: Path) -> Iterator[tuple[str, FrameSeries, 
 
     That is the earlier part with all sides.
     """
-    (torque,) = read_series(recordings / "torque_slices")
+    (torque,) = read_slices(recordings / "torque_slices")
     for share in SLICE_SHARES:
         yield f"torque slices, first {share:.0%}", part_of(torque, 0, share), part_of(torque, share, 1), []
-    (cylinders,) = read_series(recordings / "diameter_slices")
-    past, future = part_of(cylinders, 0, CYLINDER_SHARE), part_of(cylinders, CYLINDER_SHARE, 1)
-    yield f"cylinders, first {CYLINDER_SHARE:.0%}", past, future, []
+    (cylinders,) = read_slices(recordings / "diameter_slices")
+    known, unknown = part_of(cylinders, 0, CYLINDER_SHARE), part_of(cylinders, CYLINDER_SHARE, 1)
+    yield f"cylinders, first {CYLINDER_SHARE:.0%}", known, unknown, []
     recording = read_recording(imported_stream(recordings, "3 December", scratch))
     timed_by = [part_of(series_of(recording, None), 0, TWIST_SHARE)]
     for sides in FINGERTIPS:
@@ -86,14 +89,22 @@ def later_frames(recordings: Path, scratch: Path, physics: Physics) -> Iterator[
     """Yield the estimates of every estimator on every split, or why one cannot be fitted."""
     for (title, past, future, timed_by), name in product(splits(recordings, scratch), ESTIMATORS):
         # A heatmap over all lags takes most of a second: the paper's method is judged on slices alone.
-        if name == "paper" and past.kind == "raw":
+        if name == "paper" and not isinstance(past, SliceSeries):
             continue
         try:
-            calibration = fit(name, [past], title, physics, timing=measure_timing([past], timed_by))
+            yield title, name, _judge_later(name, past, future, timed_by, physics)
         except BankError as error:
             yield title, name, str(error)
-            continue
-        yield title, name, estimate_series(calibration, future, physics.bank)
+
+
+def _judge_later(
+    name: EstimatorName, past: FrameSeries, future: FrameSeries, timed_by: list[FrameSeries], physics: Physics
+) -> EstimateTrack:
+    """Return the estimates of the later part by a calibration on the earlier one; raises BankError without one."""
+    if isinstance(past, SliceSeries) and isinstance(future, SliceSeries):
+        return estimate_slices(fit_slices(name, [past], "earlier", physics), future, physics.bank)
+    calibration = fit(name, [past], "earlier", physics, timing=measure_timing([past], timed_by))
+    return estimate_series(calibration, future, physics.bank)
 
 
 def other_recordings(recordings: Path, scratch: Path) -> Iterator[Judged]:

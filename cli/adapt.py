@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Adapt, write, and print the gains."""
     from shearloop.bank.bank_file import Bank
     from shearloop.estimation import Physics
-    from shearloop.estimation.calibration import ARCHIVE_MAGIC
+    from shearloop.estimation.archive import ARCHIVE_MAGIC
     from shearloop.tools.calibrate import adapt_to_recordings
 
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)

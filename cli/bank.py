@@ -86,11 +86,17 @@ def _result(path: Path, bank: "Bank") -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace) -> int:
-    from shearloop.tools.bank_design import design_yaml, designed_for, doubts
+    from shearloop.tools.bank_design import design_yaml, designed_for, doubts, scene_of_recording
 
     if args.out is not None:
         check_overwrite(args.out, "a configuration")
-    fingertip, design = designed_for(args.recording, args.fingertip, args.side)
+    if args.recording.is_dir():
+        from shearloop.studies.slices.scene import scene_of_folder
+
+        scene = scene_of_folder(args.recording, args.side)
+    else:
+        scene = scene_of_recording(args.recording, args.side)
+    fingertip, design = designed_for(scene, args.fingertip)
     text = design_yaml(design, fingertip, args.recording)
     for sentence in doubts(design):
         print(f"shearloop bank: {sentence}", file=sys.stderr)

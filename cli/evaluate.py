@@ -6,7 +6,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import add_cluster, add_json, add_option, add_recipe, check_recipe, number, time_range
+from shearloop.cli.options import (
+    add_cluster,
+    add_json,
+    add_option,
+    add_recipe,
+    check_recipe,
+    number,
+    of_slices,
+    time_range,
+)
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError, missing
 from shearloop.estimation.defaults import LOADED_NM
@@ -15,8 +24,8 @@ from shearloop.tools.outputs import writing
 from shearloop.words import counted
 
 if TYPE_CHECKING:
-    from shearloop.estimation import Calibration
-    from shearloop.tools.evaluate import EstimateTrack, Figures
+    from shearloop.tools.evaluate import EstimateTrack, Evaluation, Figures
+    from shearloop.tools.leave_out import Plan
 
 _FIGURES = (".png", ".svg", ".pdf")
 _MEANINGS = {
@@ -72,17 +81,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and draw on request."""
-    from shearloop.bank.bank_file import Bank
-    from shearloop.cli.options import read_judged
-    from shearloop.estimation.load_delay import load_delay_warning
-    from shearloop.tools.evaluate import (
-        estimate_in_worker,
-        figures_by_load,
-        figures_of,
-        no_better_than_clock,
-        write_estimates,
-    )
-    from shearloop.tools.frame_series import check_no_copies, part_of
+    from shearloop.cli.options import judges_slices, read_judged
+    from shearloop.tools.evaluate import evaluate_recordings, figures_by_load, figures_of, write_estimates
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
 
@@ -95,36 +95,33 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
     if args.estimates is not None:
         check_overwrite(args.estimates, "a table")
-    calibration, named = read_judged(args.calibration, args.recordings)
-    bank = Bank.open(args.bank) if args.bank else None
-    start, stop = args.time_range
-    parts = [part_of(one, start, stop) for _, one in named]
-    check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
-    shared = (calibration, None if bank is None else str(args.bank.resolve()))
     with open_executor(args.cluster) as pool:
-        # Frames before the part show the idle fingertip, as live.
-        whole = [part_of(one, 0.0, stop) for _, one in named]
-        estimated = list(pool.map(estimate_in_worker, shared, whole))
-    tracks = [track.since(part.first_frame) for track, part in zip(estimated, parts, strict=True)]
+        if judges_slices(args.calibration, args.recordings):
+            from shearloop.studies.slices.evaluate import evaluate_slices
+
+            found = evaluate_slices(args.calibration, args.recordings, args.bank, args.time_range, pool)
+        else:
+            calibration, named = read_judged(args.calibration, args.recordings)
+            found = evaluate_recordings(calibration, named, args.bank, args.time_range, pool)
+    tracks = found.tracks
     if args.estimates is not None:
         with writing(args.estimates, "the estimates"):
-            write_estimates(tracks, [str(path) for path, _ in named], args.estimates)
-    if calibration.assumptions:
-        print(f"{args.calibration} assumes that {calibration.assumption_text}.", file=sys.stderr)
-    for (path, _), part in zip(named, parts, strict=True):
-        if warning := load_delay_warning(part):
-            print(f"Warning: {path.name}: {warning}.", file=sys.stderr)
-        if part.left_out:
-            print(f"Left out: {path.name}: {'; '.join(part.left_out)}.", file=sys.stderr)
-        if part.emulated:
-            print(f"EMULATED: every device of {path.name} was emulated.", file=sys.stderr)
+            write_estimates(tracks, [str(path) for path in found.paths], args.estimates)
+    if found.assumptions:
+        print(f"{args.calibration} assumes that {found.assumptions}.", file=sys.stderr)
+    for doubt in found.doubts:
+        print(f"Warning: {doubt}.", file=sys.stderr)
+    for one in found.left_out:
+        print(f"Left out: {one}.", file=sys.stderr)
+    for name in found.emulated:
+        print(f"EMULATED: every device of {name} was emulated.", file=sys.stderr)
     if args.plot or args.out:
-        _draw(tracks, [path for path, _ in named], calibration, args.out or args.calibration.with_suffix(".png"))
+        _draw(found, args.out or args.calibration.with_suffix(".png"))
     by_load, figures = figures_by_load(tracks, args.loaded_nm), figures_of(tracks)
     sentences = [f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less."]
     sentences += _lines({**by_load, "all": figures})
     sentences += _invalid_lines(tracks)
-    if against := no_better_than_clock(tracks, args.loaded_nm):
+    if against := found.no_better_than_clock(tracks, args.loaded_nm):
         sentences.append(against)
     return print_result({**by_load, **figures}, sentences, as_json=args.json)
 
@@ -147,9 +144,8 @@ def _refuse_recipe(args: argparse.Namespace) -> None:
 
 def _leave_out(args: argparse.Namespace) -> int:
     """Judge a recipe on the blocks left out of each fit, and print the figures."""
-    from shearloop.tools.calibrate import read_parts
     from shearloop.tools.evaluate import figures_by_load, figures_of, write_estimates
-    from shearloop.tools.leave_out import Recipe, judge_left_out, sentences_of
+    from shearloop.tools.leave_out import sentences_of
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
 
@@ -161,36 +157,59 @@ def _leave_out(args: argparse.Namespace) -> int:
         raise UserError(
             f"--nested is for recordings and the estimator {DEFAULT}: only its fit has settings; leave it out"
         )
-    if args.adapt_twists is not None and args.leave_out == "levels":
+    if args.adapt_twists is not None and of_slices(paths):
         raise UserError("--adapt-twists is for recordings: slices have no gain to adapt; leave it out")
     if args.estimates is not None:
         check_overwrite(args.estimates, "a table")
-    read = read_parts(
-        paths, time_range=args.time_range, sides=args.sides, load_cell_delay_s=args.load_cell_delay_s,
-        tool_mm=args.tool_mm,
-    )  # fmt: skip
-    bank, mesh = (None if path is None else path.resolve() for path in (args.bank, args.mesh))
-    recipe = Recipe(
-        args.estimator, bank, mesh, read.timing.uncertainty_s, full_range=args.assume_full_range, nested=args.nested
-    )
+    plan, doubts, left_out = (_plan_slices if of_slices(paths) else _plan_recordings)(args, paths)
     with open_executor(args.cluster) as pool:
-        found = judge_left_out(
-            args.leave_out, recipe, read.parts, [path.name for path in read.paths], pool,
-            adapt_twists=args.adapt_twists or 0,
-        )  # fmt: skip
+        found = plan.judge(pool)
     if args.estimates is not None:
         names = [name for name, tracks in zip(found.names, found.tracks, strict=True) for _ in tracks]
         with writing(args.estimates, "the estimates"):
             write_estimates(found.all_tracks, names, args.estimates)
-    for doubt in read.doubts:
+    for doubt in doubts:
         print(f"Warning: {doubt}.", file=sys.stderr)
-    for one in read.left_out:
+    for one in left_out:
         print(f"Left out: {one}.", file=sys.stderr)
     figures = found.figures(args.loaded_nm)
     by_load = figures_by_load(found.all_tracks, args.loaded_nm)
     sentences = _lines({**by_load, "all": figures_of(found.all_tracks)})
     sentences += _invalid_lines(found.all_tracks)
     return print_result(figures, [*sentences, *sentences_of(found, args.loaded_nm)], as_json=args.json)
+
+
+def _plan_recordings(args: argparse.Namespace, paths: "Sequence[Path]") -> "tuple[Plan, Sequence[str], Sequence[str]]":
+    """Return what is left out of recordings, doubts about the load cell, and what of the recordings is not used."""
+    from shearloop.tools.calibrate import read_parts
+    from shearloop.tools.leave_out import Recipe, plan_left_out
+
+    if args.leave_out == "levels":
+        raise UserError("twists of a recording have no levels; leave out grips, twists or tools")
+    read = read_parts(
+        paths, time_range=args.time_range, sides=args.sides, load_cell_delay_s=args.load_cell_delay_s,
+        tool_mm=args.tool_mm,
+    )  # fmt: skip
+    bank, mesh = _resolved(args)
+    recipe = Recipe(args.estimator, bank, mesh, read.timing.uncertainty_s, nested=args.nested)
+    names, twists = [path.name for path in read.paths], args.adapt_twists or 0
+    plan = plan_left_out(args.leave_out, recipe, read.parts, names, adapt_twists=twists)
+    return plan, read.doubts, read.left_out
+
+
+def _plan_slices(args: argparse.Namespace, paths: "Sequence[Path]") -> "tuple[Plan, Sequence[str], Sequence[str]]":
+    """Return what is left out of folders of slices, without doubts."""
+    from shearloop.studies.slices.leave_out import SliceRecipe, plan_levels
+    from shearloop.studies.slices.series import read_parts
+
+    recipe = SliceRecipe(args.estimator, *_resolved(args), full_range=args.assume_full_range)
+    return plan_levels(args.leave_out, recipe, read_parts(paths, args.time_range)[1]), (), ()
+
+
+def _resolved(args: argparse.Namespace) -> "tuple[Path | None, Path | None]":
+    """Return bank and mesh by paths that workers find."""
+    bank, mesh = (None if path is None else path.resolve() for path in (args.bank, args.mesh))
+    return bank, mesh
 
 
 def _lines(columns: "Mapping[str, Figures]") -> list[str]:
@@ -214,13 +233,14 @@ def _invalid_lines(tracks: "Sequence[EstimateTrack]") -> list[str]:
     return lines
 
 
-def _draw(tracks: "Sequence[EstimateTrack]", paths: "Sequence[Path]", calibration: "Calibration", out: Path) -> None:
+def _draw(found: "Evaluation", out: Path) -> None:
     from shearloop.tools.evaluate import draw_tracks
 
-    names = [f"{path.name}, {' and '.join(one.series.sides)}" for path, one in zip(paths, tracks, strict=True)]
+    tracks = found.tracks
+    names = [f"{path.name}, {' and '.join(one.series.sides)}" for path, one in zip(found.paths, tracks, strict=True)]
     try:
         with writing(out, "the figure"):
-            draw_tracks(tracks, names, f"{calibration.estimator.name}, fitted to {calibration.source}", out)
+            draw_tracks(tracks, names, found.title, out, found.draw)
     except ModuleNotFoundError as error:
         raise missing(error.name, "plot", "the figure") from error
     print(f"The figure is in {out}.", file=sys.stderr)

@@ -225,27 +225,48 @@ def load_calibration(path: Path) -> "Calibration":
     """Return the calibration in a file; raises UserError for a recording, and CalibrationError as `load` does."""
     from shearloop.estimation import Calibration
 
+    _check_no_recording(path)
+    return Calibration.load(path)
+
+
+def _check_no_recording(path: Path) -> None:
     if ".mcap" in path.suffixes or path.is_dir():
         raise UserError(f"{path} is a recording, not a calibration; the calibration comes first, then recordings")
-    return Calibration.load(path)
+
+
+def of_slices(recordings: "Sequence[Path]") -> bool:
+    """Return whether these are folders of slices; raises UserError for folders among recordings."""
+    folders = [path.is_dir() for path in recordings]
+    if any(folders) and not all(folders):
+        raise UserError("raw frames and slices of differences do not fit into one calibration; make two")
+    return any(folders)
+
+
+def judges_slices(path: Path, recordings: "Sequence[Path]") -> bool:
+    """Return whether a file is a calibration of slices.
+
+    Raises UserError where the recordings are not of the same kind, and CalibrationError for a file that is none.
+    """
+    from shearloop.estimation.archive import kind_of
+    from shearloop.studies.slices.calibration import KIND
+
+    _check_no_recording(path)
+    is_slices = kind_of(path) == KIND
+    if any(one.is_dir() != is_slices for one in recordings):
+        made, other = ("slices", "raw frames") if is_slices else ("raw frames", "slices")
+        raise UserError(
+            f"{path} was made from {made}, and cannot judge {other}; calibrate on recordings of the same kind"
+        )
+    return is_slices
 
 
 def read_judged(path: Path, recordings: "Sequence[Path]") -> "tuple[Calibration, list[tuple[Path, FrameSeries]]]":
     """Return a calibration, and the series of the recordings, each with its path, that it is to judge.
 
-    Raises UserError for a recording given twice, and for slices with a calibration of raw frames, or the reverse.
+    Raises UserError for a recording that is given twice.
     """
     from shearloop.tools.frame_series import check_paths_differ, read_series
 
     check_paths_differ(recordings)
     calibration = load_calibration(path)
-    sides = calibration.sides if calibration.kind == "raw" else None
-    named = [(recording, one) for recording in recordings for one in read_series(recording, sides)]
-    kinds = {"raw": "raw frames", "difference": "slices"}
-    other = next((one.kind for _, one in named if one.kind != calibration.kind), None)
-    if other is not None:
-        raise UserError(
-            f"{path} was made from {kinds[calibration.kind]}, and cannot judge {kinds[other]}; "
-            "calibrate on recordings of the same kind"
-        )
-    return calibration, named
+    return calibration, [(one, series) for one in recordings for series in read_series(one, calibration.sides)]

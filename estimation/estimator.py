@@ -27,10 +27,9 @@ from shearloop.estimation.bank_match import (
 from shearloop.estimation.channel_imputer import ChannelImputer
 from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.grip_memory import Motion
-from shearloop.estimation.interval_fit import RegressorFit, fit_interval_regressor
+from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.left_out import later_origins, left_out_groups
-from shearloop.estimation.novelty import NoveltyDetector
 from shearloop.estimation.ridge import STRENGTHS, Ridge
 from shearloop.estimation.values import ProcessedFrame
 
@@ -59,27 +58,30 @@ class Physics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutputModel:
-    """How one quantity is predicted: its regressor, and for differences the detector of novel ones.
+    """How one quantity is predicted: its regressor.
 
     k_range holds the least and largest matched k in cm, or nothing without a bank.
     """
 
     regressor: IntervalRegressor
-    novelty: NoveltyDetector | None
     k_range: FloatArray
 
-    def match_reasons(self, match: BankMatch) -> tuple[str, ...]:
-        """Return the reason against a bank match far from the calibrated ones, if there is one."""
-        if not len(self.k_range):
-            return ()
-        low, high = self.k_range.tolist()
-        margin = max(high - low, _LEAST_MARGIN_K_CM)
-        if low - margin <= match.k <= high + margin:
-            return ()
-        return (
-            f"the bank fits best at k = {match.k:.2f} cm, outside the calibrated {low:.2f} to {high:.2f} cm; "
-            "the match is on another ridge of the bank",
-        )
+
+def match_reasons(k_range: FloatArray, match: BankMatch) -> tuple[str, ...]:
+    """Return the reason against a bank match far from the calibrated ones, if there is one.
+
+    k_range holds the least and largest calibrated k in cm, or nothing.
+    """
+    if not len(k_range):
+        return ()
+    low, high = k_range.tolist()
+    margin = max(high - low, _LEAST_MARGIN_K_CM)
+    if low - margin <= match.k <= high + margin:
+        return ()
+    return (
+        f"the bank fits best at k = {match.k:.2f} cm, outside the calibrated {low:.2f} to {high:.2f} cm; "
+        "the match is on another ridge of the bank",
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +103,7 @@ class Material:
     """What an estimator is prepared from: the scale (m, c) of its differences, knowledge before calibration, and
     the channels.
 
-    Raw recordings have validators, and the (n, m, c) frames of each grip. With `nested` the fit chooses its settings.
+    grips are the (n, m, c) frames of each grip. With `nested` the fit chooses its settings.
     """
 
     scale: FloatArray
@@ -139,7 +141,7 @@ class CalibrationRows:
 class Estimator(ABC):
     """An estimator of one calibration. The file keeps its fields, which are arrays, values, or dataclasses of these.
 
-    scale (m, c) divides differences per channel and is infinite for dead ones. imputer serves raw frames.
+    scale (m, c) divides differences per channel and is infinite for dead ones. imputer fills in dead channels.
     """
 
     name: ClassVar[str]
@@ -150,12 +152,8 @@ class Estimator(ABC):
     strengths: ClassVar[tuple[float, ...]] = STRENGTHS
     # Whether features further from their mean than any at calibration are refused.
     limits_features: ClassVar[bool] = True
-    # Whether a slice's size matters, and whether the regressor ignores NaN.
-    uses_amplitude: ClassVar[bool] = True
-    ignores_nan: ClassVar[bool] = False
-    # Whether a session imputes dead channels of raw frames along the motion, or the imputer does.
+    # Whether a session imputes dead channels along the motion, or the imputer does.
     imputes_by_motion: ClassVar[bool] = False
-    least_slices: ClassVar[int] = 10
 
     scale: FloatArray
     table: ChannelTable = PAPER_TABLE
@@ -183,16 +181,9 @@ class Estimator(ABC):
         """Return the (d,) inputs of a quantity's regressor."""
         return features[self.columns[quantity]]
 
-    def impute(
-        self, difference: FloatArray, usable: BoolArray, novelty: NoveltyDetector | None
-    ) -> tuple[FloatArray, FloatArray]:
+    def impute(self, difference: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return a (m, c) difference with unusable channels imputed, and their errors (k, m, c)."""
-        if self.imputer is not None:
-            return self.imputer.impute(difference, usable)
-        if novelty is None:
-            return difference, NO_ERRORS
-        imputed = np.nan if self.ignores_nan else novelty.impute(difference[0], usable[0])
-        return np.where(usable, difference, imputed), NO_ERRORS
+        return (difference, NO_ERRORS) if self.imputer is None else self.imputer.impute(difference, usable)
 
     def position_noise_mm(self, _regressor: IntervalRegressor) -> float:
         """Return the diameter's 95 % error from the noise of one frame."""
@@ -206,17 +197,10 @@ class Estimator(ABC):
         """Return the least and the largest k of (n, d) features, empty for an estimator without a bank."""
         return np.array([features[:, 0].min(), features[:, 0].max()]) if self.needs == "bank" else np.zeros(0)
 
-    def slices_fits(self, _quantity: Quantity, _values: FloatArray) -> tuple[RegressorFit, RegressorFit]:
-        """Return the fit to slices of (n,) values, and the fit of a line, which reads values beyond these.
-
-        Raises CalibrationError where the values do not determine the fit.
-        """
-        return self.ridge, self.ridge
-
     def fit_torque(
         self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
     ) -> tuple[Self, IntervalRegressor, float]:
-        """Return the torque's regressor on raw frames of numbered recordings (n,), and the estimator as it uses them.
+        """Return the torque's regressor on frames of numbered recordings (n,), and the estimator as it uses them.
 
         The third value is the share of the torque's variance that a tool's motion leaves unexplained on frames left
         out, 0 where that is not tested.
@@ -257,7 +241,7 @@ class Estimator(ABC):
             strengths=self.strengths,
             left_out=left_out,
         )
-        return OutputModel(regressor, None, self.k_range(rows.features))
+        return OutputModel(regressor, self.k_range(rows.features))
 
 
 class Regression(Estimator):
@@ -325,8 +309,8 @@ class BankEstimator(_OnBank):
     def prepare(cls, material: Material) -> Self:
         """Return the estimator with the numbering of the first side's electrodes."""
         bank = material.physics.bank
-        if not material.validators or bank is None:
-            return cls(material.scale, material.table)
+        if bank is None:
+            raise ValueError("a match needs a bank")
         first = material.validators[0]
         found = find_numberings(first.idle, bank.homogeneous, material.table)
         return cls(material.scale, material.table, numbering=resolve_symmetry(found, first.gripped - first.idle, bank))
@@ -350,7 +334,6 @@ class PaperEstimator(_OnBank):
     name: ClassVar[str] = "paper"
     columns: ClassVar[Mapping[Quantity, slice]] = {"torque": slice(1, 3), "diameter": slice(0, 1)}
     strengths: ClassVar[tuple[float, ...]] = (1e-9,)
-    uses_amplitude: ClassVar[bool] = False
 
     def matcher(self, bank: Bank) -> BankMatcher:
         """Return the paper's match on the bank."""

@@ -1,4 +1,4 @@
-"""Fitting an estimator to recordings: one function for all estimators, on raw frames or on slices.
+"""Fitting an estimator to recordings: one function for all estimators.
 
 Every choice is made on data left out of the fit: later data, blocks of time or recordings (docs/calibrations.md).
 Nothing looks at the recordings that the calibration will be evaluated on.
@@ -13,7 +13,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.bank_match import BankMatcher
-from shearloop.estimation.calibration import Assumption, Calibration
+from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.channel_imputer import ChannelImputer
 from shearloop.estimation.estimator import (
     LEAST_DIAMETERS,
@@ -22,21 +22,17 @@ from shearloop.estimation.estimator import (
     Material,
     OutputModel,
     Physics,
-    Quantity,
     Reading,
 )
 from shearloop.estimation.estimator_names import EstimatorName, estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator, segment_grip
 from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, first_twists, loaded_log_gain
-from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor
-from shearloop.estimation.left_out import later_levels
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
-from shearloop.estimation.novelty import NoveltyDetector
 from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
-from shearloop.estimation.values import FrameSeries, Measured, ProcessedFrame, TactileFrame, check_finite, distinct
+from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75
@@ -53,31 +49,23 @@ def fit(
     physics: Physics | None = None,
     *,
     timing: LoadTiming | None = None,
-    full_range: bool = False,
     nested: bool = False,
 ) -> Calibration:
-    """Calibrate an estimator on recordings of one kind, in time order; `source` describes them in words.
+    """Calibrate an estimator on recordings, in time order; `source` describes them in words.
 
-    Slices with torque give a torque, those with diameters a diameter. `timing` is measured on the recordings where it
-    is not given. With `full_range` the user guarantees that no torque exceeds the slices: intervals do not extend
-    further. With `nested` a fit of motion chooses its settings too, instead of the usual ones. Raises CalibrationError
-    for recordings that do not determine the calibration, and for missing physics.
+    `timing` is measured on the recordings where it is not given. With `nested` a fit of motion chooses its settings
+    too, instead of the usual ones. Raises CalibrationError for recordings that do not determine the calibration, and
+    for missing physics.
     """
     physics, kind = physics or Physics(), estimator_class(name)
     sides = _check_recordings(recordings)
-    if kind.needs and getattr(physics, kind.needs) is None:
-        raise CalibrationError(f"the estimator {name} needs a {kind.needs}; name it with --{kind.needs}")
+    check_physics(kind, physics)
     chosen = [one.select_sides(sides) for one in recordings]
-    is_raw = recordings[0].kind == "raw"
-    if is_raw:
-        timing = timing or measure_timing(recordings)
-    table = recordings[0].table
-    slices = Material(np.ones((len(sides), table.n_channels)), physics, table)
-    material = replace(_material(chosen, physics), nested=nested) if is_raw else slices
+    timing = timing or measure_timing(recordings)
+    material = replace(_material(chosen, physics), nested=nested)
     tools = _tools_of(recordings)
     blank = Calibration(
         estimator=kind.prepare(material),
-        kind=recordings[0].kind,
         sides=sides,
         source=source,
         bank_identity=physics.bank.identity if physics.bank is not None and kind.needs == "bank" else "",
@@ -85,10 +73,14 @@ def fit(
         validators=material.validators,
         profile=TorqueProfile.fit(chosen),
     )
-    if timing is None or not is_raw:
-        return _fit_slices(blank, chosen, physics, full_range=full_range)
-    fitted = _fit_raw(blank, chosen, physics, timing.uncertainty_s)
+    fitted = _fit_outputs(blank, chosen, physics, timing.uncertainty_s)
     return fitted if timing.references else replace(fitted, assumptions=("load timing",))
+
+
+def check_physics(kind: type[Estimator], physics: Physics) -> None:
+    """Raise CalibrationError for an estimator without its bank or mesh."""
+    if kind.needs and getattr(physics, kind.needs) is None:
+        raise CalibrationError(f"the estimator {kind.name} needs a {kind.needs}; name it with --{kind.needs}")
 
 
 def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:
@@ -98,8 +90,6 @@ def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:
     check_finite(recordings)
     if len({one.table for one in recordings}) > 1:
         raise CalibrationError("the recordings are of different kinds of fingertips; make a calibration of each")
-    if len({one.kind for one in recordings}) > 1:
-        raise CalibrationError("raw frames and slices of differences do not fit into one calibration; make two")
     sides = tuple(side for side in recordings[0].sides if all(side in one.sides for one in recordings))
     if not sides:
         raise CalibrationError("the recordings have no side in common; name the side of each when importing")
@@ -107,12 +97,12 @@ def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:
 
 
 def _tools_of(recordings: Sequence[FrameSeries]) -> list[Measured]:
-    """Return the known diameters in mm of raw recordings' different tools."""
+    """Return the known diameters in mm of the recordings' different tools."""
     return distinct([tool for one in recordings if (tool := one.tool_mm) is not None])
 
 
 def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
-    """Return what an estimator of raw frames is prepared from."""
+    """Return what an estimator is prepared from."""
     parts = [segment_grip(one) for one in recordings]
     validators = tuple(
         FingertipValidator.fit(
@@ -128,7 +118,7 @@ def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
     return Material(np.array([one.noise for one in validators]), physics, recordings[0].table, validators, grips)
 
 
-def _fit_raw(
+def _fit_outputs(
     calibration: Calibration, recordings: list[FrameSeries], physics: Physics, timing_uncertainty_s: float
 ) -> Calibration:
     """Return the calibration with its outputs; the torques may be off by the uncertainty in time."""
@@ -163,7 +153,7 @@ def _fit_raw(
                 f"the tools of {' and '.join(f'{one.value:.3g}' for one in tools)} mm turn so differently that they "
                 "have no torque in common; calibrate on each alone, or on three diameters"
             )
-    torque = OutputModel(regressor, None, estimator.k_range(rows.features))
+    torque = OutputModel(regressor, estimator.k_range(rows.features))
     return replace(calibration, estimator=estimator, torque=torque, diameter=diameter, tools=law)
 
 
@@ -262,71 +252,3 @@ def _replay(
             places = ((one / estimator.scale).ravel() for one in (processed.difference, processed.mean_difference))
             rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, *truth, grip))
     return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None
-
-
-def _fit_slices(
-    blank: Calibration, recordings: list[FrameSeries], physics: Physics, *, full_range: bool = False
-) -> Calibration:
-    """Return a blank calibration with torque and diameter fitted to slices in time order.
-
-    With `full_range` no torque beyond theirs will occur. Raises CalibrationError for slices of several fingertips, and
-    for too few.
-    """
-    if len(blank.sides) > 1:
-        raise CalibrationError(
-            f"slices of {len(blank.sides)} fingertips ({', '.join(blank.sides)}) do not fit into one calibration; make "
-            "one for each"
-        )
-    estimator = blank.estimator
-    frames = np.concatenate([one.channels for one in recordings])
-    times = _consecutive([one.t_s for one in recordings])
-    torque = np.concatenate([one.torque_at_frames() for one in recordings])
-    diameter = np.concatenate([one.diameter_mm for one in recordings])
-    matcher = blank.matcher(physics.bank)
-    models: dict[Quantity, OutputModel] = {}
-    # Cylinders were twisted too, but at one torque each, which determines no torque.
-    torque = np.where(np.isfinite(diameter), np.nan, torque)
-    truths: dict[Quantity, FloatArray] = {"torque": torque, "diameter": diameter}
-    for quantity, values in truths.items():
-        known = np.isfinite(values)
-        if not known.any():
-            continue
-        n = int(known.sum())
-        if quantity == "torque" and n < estimator.least_slices:
-            raise CalibrationError(
-                f"too few slices with a torque for the estimator {estimator.name}: {n}; record "
-                f"{estimator.least_slices} or more"
-            )
-        differences = np.abs(frames[known, 0])
-        # First, because it checks that a board sent the slices.
-        novelty = NoveltyDetector.fit(differences, estimator.table)
-        every = np.ones((1, differences.shape[1]), dtype=np.bool_)
-        readings = (
-            Reading.of(ProcessedFrame(one[None], (), every), t_s, matcher)
-            for one, t_s in zip(differences, times[known].tolist(), strict=True)
-        )
-        features = np.array([estimator.features(one) for one in readings])
-        of_value, line = estimator.slices_fits(quantity, values[known])
-        regressor = fit_interval_regressor(
-            features[:, estimator.columns[quantity]],
-            values[known],
-            of_value,
-            strengths=estimator.strengths,
-            left_out=later_levels(values[known]) if quantity == "torque" else (),
-            fit_line=line if quantity == "torque" else None,
-            full_range=full_range,
-        )
-        models[quantity] = OutputModel(regressor, novelty, estimator.k_range(features))
-    if not models:
-        raise CalibrationError("the slices come with neither torque nor diameter")
-    assumptions: tuple[Assumption, ...] = ("full range",) if full_range and "torque" in models else ()
-    return replace(blank, torque=models.get("torque"), diameter=models.get("diameter"), assumptions=assumptions)
-
-
-def _consecutive(times: list[FloatArray]) -> FloatArray:
-    """Return the times of several series one after another; each starts one after the end of the last, or later."""
-    shifted: list[FloatArray] = []
-    for one in times:
-        begins_early = bool(shifted) and one[0] <= shifted[-1][-1]
-        shifted.append(one - one[0] + shifted[-1][-1] + 1.0 if begins_early else one)
-    return np.concatenate(shifted)

@@ -1,41 +1,36 @@
 """Fits a regressor with its intervals, by frames left out of the fit."""
 
-import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
-from functools import partial
 from typing import TypeAlias
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.curve import CurveMean
 from shearloop.estimation.gain import LOADED_SHARE, GainSpread, find_twists, first_twists, loaded_log_gain
 from shearloop.estimation.interval_regressor import IntervalRegressor, Regressor, reported_values
 from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange, student_inflation
 from shearloop.estimation.left_out import LeftOut, later_splits, left_out_blocks, left_out_groups
-from shearloop.estimation.ridge import STRENGTHS, CensoredRidge
+from shearloop.estimation.ridge import STRENGTHS, CensoredRidge, Predictor
 from shearloop.words import counted
 
 # The future differs from the past more than one part of a recording from the next.
-_INFLATION = 1.05
-_LEAST_FRAMES = 8
-# Share of values left out at either end of the range to test extrapolation. It fails if the prediction covers less
-# than half of the way beyond.
-_AT_END, _LARGEST_SHORTFALL = 0.2, 0.5
-# Left-out values count as at least this far beyond the rest, in spans: noise would dominate a shorter distance.
-_LEAST_DISTANCE = 0.05
-# Values up to this many spans beyond the range can look familiar. Slices of 0.14 N·m do after a calibration below
-# 0.06, 1.6 spans beyond, and no slice lies further (`extrapolation-torque-slices` of docs/charts.md).
-_UNSEEN = 2.0
-# Distance beyond the range that decides from where on a prediction may hide a value beyond: more doubts more good ones.
-_LIKELY_UNSEEN = 0.5
+INFLATION = 1.05
+LEAST_FRAMES = 8
 # This share of the loads must lie within their intervals.
 _LEAST_COVERED = 0.75
 
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
+
+
+def check_values(values: FloatArray) -> None:
+    """Raise CalibrationError for (n,) values that are few, or all alike."""
+    if len(values) < LEAST_FRAMES or np.ptp(values) == 0:
+        raise CalibrationError(
+            f"{counted(len(values), 'frame')} with values between {np.min(values, initial=np.inf):.3g} and "
+            f"{np.max(values, initial=-np.inf):.3g} cannot determine a calibration; record more, at different loads"
+        )
 
 
 def fit_interval_regressor(
@@ -47,31 +42,24 @@ def fit_interval_regressor(
     limit_features: bool = False,
     left_out: LeftOut = (),
     twists: LeftOut = (),
-    fit_line: RegressorFit | None = None,
     bounds: tuple[FloatArray, FloatArray] | None = None,
-    full_range: bool = False,
     recordings: IntArray | None = None,
     fingertips: int = 1,
 ) -> IntervalRegressor:
     """Fit to (n, d) features and (n,) values in time order.
 
     `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With `twists`
-    instead each pair with a load counts as one error, because the frames of a twist err alike. Torques of slices
-    come with `fit_line`: they keep their sign, and unless they cover the `full_range` that will ever occur, it fits
-    what reads values beyond it. `bounds` are the least and largest value (n,) that each frame may have: intervals
-    extend to the further one. With the number of each row's recording, `recordings` (n,), intervals allow for the gain
-    of another recording of as many `fingertips`. Raises CalibrationError where the data does not determine the fit.
+    instead each pair with a load counts as one error, because the frames of a twist err alike. `bounds` are the least
+    and largest value (n,) that each frame may have: intervals extend to the further one. With the number of each row's
+    recording, `recordings` (n,), intervals allow for the gain of another recording of as many `fingertips`. Raises
+    CalibrationError where the data does not determine the fit.
     """
-    if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
-        raise CalibrationError(
-            f"{counted(len(values), 'frame')} with values between {np.min(values, initial=np.inf):.3g} and "
-            f"{np.max(values, initial=-np.inf):.3g} cannot determine a calibration; record more, at different loads"
-        )
+    check_values(values)
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
     blocks = list(twists or left_out or left_out_blocks(len(values)))
 
-    def refit(rows: IntArray, by: RegressorFit = fit) -> Regressor:
-        return by(features[rows], values[rows], strength)
+    def refit(rows: IntArray) -> Regressor:
+        return fit(features[rows], values[rows], strength)
 
     parts = [refit(past) for past, _ in blocks]
     raw = [part.predict(features[future]) for part, (_, future) in zip(parts, blocks, strict=True)]
@@ -80,7 +68,7 @@ def fit_interval_regressor(
     point, truth = fit(features, values, strength), values[rows]
     residuals = reported - truth
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
-    inflation = _inflation(point, rows, left_out)
+    inflation = _inflation(rows, left_out)
     of_loads = _inflation_of_twists(values, twists) if twists else None
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
@@ -88,7 +76,7 @@ def fit_interval_regressor(
     intervals, widening = Intervals.fit(predicted, residuals, edges, inflation, least, of_loads), 1.0
     # Before widening for unknown times: a load that is not seen is not seen at any time.
     half = np.array([intervals.half_width(one) for one in predicted])
-    misses_loads = fit_line is None and _misses_loads(truth, np.abs(residuals) <= half)
+    misses_loads = _misses_loads(truth, np.abs(residuals) <= half)
     if bounds is not None:
         if not (twists or left_out):
             # Unknown times mean few loads, in a block or two each.
@@ -97,24 +85,19 @@ def fit_interval_regressor(
         known = intervals.half_widths[-1]
         intervals = Intervals.fit(predicted, errors, edges, inflation, least, of_loads)
         widening = float(intervals.half_widths[-1] / known)
-    span, line = ValueRange(float(values.min()), float(values.max())), None
-    if fit_line is not None:
-        refit_line = None if full_range else partial(refit, by=fit_line)
-        span, line = _range_of_slices(point, features, values, refit, refit_line)
+    span = ValueRange(float(values.min()), float(values.max()))
     gain = GainSpread()
     if recordings is not None:
         gains = _gains_of_recordings(features, values, recordings, refit)
         gain = _spread_of_gain(values, recordings, rows, reported, gains, fingertips)
-    return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain, line)
+    return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain)
 
 
-def _inflation(point: Regressor, rows: IntArray, left_out: LeftOut) -> float:
+def _inflation(rows: IntArray, left_out: LeftOut) -> float:
     """Return the factor by which residuals of the left-out rows are widened."""
     if left_out:
         return student_inflation(len(np.unique(rows)))
-    if isinstance(point, CurveMean):
-        return 1.0
-    return _INFLATION
+    return INFLATION
 
 
 def _inflation_of_twists(values: FloatArray, twists: LeftOut) -> float:
@@ -151,54 +134,6 @@ def _spread_of_gain(
     return GainSpread.fit(predicted, values[rows], recordings[rows], is_first[rows], gains, fingertips)
 
 
-def _range_of_slices(
-    point: Regressor, features: FloatArray, values: FloatArray, refit: Refit, refit_line: Refit | None
-) -> tuple[ValueRange, Regressor | None]:
-    """Return the range of slices and the line that reads values beyond it, if any can occur.
-
-    Peaks of twists one way are of one sign, and no load is always possible.
-    """
-    low, high, beyond = float(values.min()), float(values.max()), _UNSEEN * float(np.ptp(values))
-    span = ValueRange(low, high, 0.0 if low >= 0 else low - beyond, 0.0 if high <= 0 else high + beyond)
-    if refit_line is None:
-        return span, None
-    low_end, high_end = (_range_end(point, features, values, refit, refit_line, sign) for sign in (1, -1))
-    if low_end > high_end:
-        # Every prediction may hide a value beyond either end.
-        low_end, high_end = math.inf, -math.inf
-    return replace(span, low_end=low_end, high_end=high_end), refit_line(np.arange(len(values)))
-
-
-def _range_end(
-    point: Regressor, features: FloatArray, values: FloatArray, refit: Refit, refit_line: Refit, sign: int
-) -> float:
-    """Return the prediction at or below which (sign −1: above which) the truth may lie anywhere further out.
-
-    The outermost values are left out and predicted from the rest. If a line predicts them at its end or even within it,
-    values beyond the whole range hide too, the more the further out they are; the end is then moved inwards for values
-    `_LIKELY_UNSEEN` spans beyond. Otherwise nothing hides: the end is infinite.
-    """
-    outward = sign * values
-    order = np.argsort(outward, kind="stable")
-    # Equal values stay together, else those that remain would reveal the others.
-    n_out = int((outward <= outward[order[round(_AT_END * len(values)) - 1]]).sum())
-    out, kept = order[:n_out], np.sort(order[n_out:])
-
-    def median(by: Regressor, rows: IntArray) -> float:
-        return float(np.median(sign * reported_values(by, by.predict(features[rows]))))
-
-    end, outermost = float(outward.min()), median(point, order[: max(n_out // 2, 1)])
-    if len(kept) < _LEAST_FRAMES or np.ptp(values[kept]) == 0:
-        # Untestable: no prediction as far out as the outermost ones now is known to be right.
-        return sign * max(end, outermost)
-    inside, true = float(outward[kept].min()), float(np.median(outward[out]))
-    if not median(refit_line(kept), out) - true > _LARGEST_SHORTFALL * (inside - true) > 0:
-        return -sign * math.inf
-    span = float(np.ptp(values))
-    shortfall = (median(refit(kept), out) - inside) / max(inside - true, _LEAST_DISTANCE * span)
-    return sign * max(end, end + shortfall * _LIKELY_UNSEEN * span, outermost)
-
-
 def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:
     """Return whether too many loads lie outside their intervals.
 
@@ -212,7 +147,7 @@ def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:
 def best_strength(
     features: FloatArray,
     values: FloatArray,
-    fit: RegressorFit,
+    fit: Callable[[FloatArray, FloatArray, float], Predictor],
     strengths: Sequence[float],
     left_out: Iterable[tuple[IntArray, IntArray]] = (),
 ) -> tuple[float, float]:

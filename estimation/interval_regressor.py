@@ -14,15 +14,12 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation.curve import CurveMean
 from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists
 from shearloop.estimation.intervals import Intervals, ValueRange
-from shearloop.estimation.ridge import CensoredRidge, Ridge
+from shearloop.estimation.ridge import CensoredRidge, Predictor, Ridge
 from shearloop.estimation.values import INLINE
 
-Regressor: TypeAlias = Ridge | CensoredRidge | CurveMean
-# Values further beyond the calibrated range, in spans of it, are refused as extrapolation.
-_LARGEST_BEYOND = 0.35
+Regressor: TypeAlias = Ridge | CensoredRidge
 # Features larger than any at calibration by this factor are refused.
 _LARGEST_DEVIATION = 1.6
 
@@ -34,7 +31,7 @@ class IntervalRegressor:
     Features are limited to largest_deviation from mean_feature unless that is empty. With misses_loads, too many
     left-out loads lay outside their intervals, so every interval spans the calibrated range. timing_widening is the
     factor on the loads' intervals for unknown load timing. `gain` is how much a torque's gain changes between
-    recordings. `line` reads values beyond the range.
+    recordings.
     """
 
     point: Regressor
@@ -45,46 +42,34 @@ class IntervalRegressor:
     misses_loads: bool = False
     timing_widening: float = 1.0
     gain: GainSpread = field(default=GainSpread(), metadata=INLINE)
-    line: Regressor | None = None
 
-    def predict(
-        self, features: FloatArray, usable_share: float = 1.0, complete: FloatArray | None = None
-    ) -> tuple[float, float, float]:
+    def predict(self, features: FloatArray, usable_share: float = 1.0) -> tuple[float, float, float]:
         """Return the value of (d,) features and how far its 95 % interval extends below and above it.
 
-        With a share of the channels unusable, the interval grows by the root of it. `complete` (d,) are the features
-        with a response that may be missing: the interval extends to their value. Where the lever does not touch, the
-        tool may be twisted the other way as far as the frames allow.
+        With a share of the channels unusable, the interval grows by the root of it.
         """
-        rows = features[None] if complete is None else np.array([features, complete])
-        raws = self.point.predict(rows)
-        raw, (value, *others) = float(raws[0]), reported_values(self.point, raws).tolist()
+        raw = float(self.point.predict(features[None])[0])
+        value = float(reported_values(self.point, np.array(raw)))
         widening = 1.0 / math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
-        moved = others[0] - value if others else 0.0
         down, up = self.gain.reach(value)
-        below, above = math.hypot(half, down) + max(-moved, 0.0), math.hypot(half, up) + max(moved, 0.0)
+        return value, *self._guarded(raw, value, widening, math.hypot(half, down), math.hypot(half, up))
+
+    def _guarded(self, raw: float, value: float, widening: float, below: float, above: float) -> tuple[float, float]:
+        """Return the interval's reach below and above a value, widened where the prediction may be wrong by more.
+
+        Loads that are not seen can have any calibrated value. Where the lever does not touch, the tool may be twisted
+        the other way as far as the frames allow.
+        """
         if self.misses_loads:
             below, above = below + max(value - self.range.low, 0.0), above + max(self.range.high - value, 0.0)
         if isinstance(self.point, CensoredRidge) and raw < 0:
             other_way = widening * TWO_SIDED_95 * self.point.sigma - raw
             below, above = (max(below, other_way), above) if self.point.sign > 0 else (below, max(above, other_way))
-        span = self.range
-        if value <= span.low_end:
-            below = math.inf
-        if value >= span.high_end:
-            above = math.inf
-        if self.line is not None:
-            # A line reads at least half of the way beyond the range.
-            read = float(self.line.predict(features))
-            below = max(below, value - 2 * read + span.low if read < span.low else 0.0)
-            above = max(above, 2 * read - span.high - value if read > span.high else 0.0)
-        return value, min(below, max(value - span.lowest, 0.0)), min(above, max(span.highest - value, 0.0))
+        return below, above
 
     def scaled(self, factor: float, spread: float) -> "IntervalRegressor":
         """Return the regressor of values larger by a factor; its gain and zero have this spread."""
-        if isinstance(self.point, CurveMean):
-            raise CalibrationError("a curve of slices has no gain")
         return replace(
             self,
             point=self.point.scaled(factor),
@@ -104,7 +89,7 @@ class IntervalRegressor:
         point = self.point
         least_nm = LOADED_SHARE * max(abs(self.range.low), abs(self.range.high))
         twists = [one for one in find_twists(torque_nm) if np.abs(torque_nm[one]).max() >= least_nm]
-        if isinstance(point, CurveMean) or not twists:
+        if not twists:
             raise CalibrationError(
                 f"no twist reaches {least_nm:.3g} N·m while an estimate is possible; twist further, some seconds "
                 "after the grip"
@@ -133,18 +118,14 @@ class IntervalRegressor:
 
     def range_reasons(self, value: float, features: FloatArray, quantity: str, unit: str) -> tuple[str, ...]:
         """Return the reason against a value or features beyond the calibration, if there is one."""
-        beyond = _LARGEST_BEYOND * (self.range.high - self.range.low)
-        if not self.range.low - beyond <= value <= self.range.high + beyond:
-            return (
-                f"the {quantity} would be {value:.3g} {unit}, beyond the calibrated {self.range.low:.3g} to "
-                f"{self.range.high:.3g} {unit}",
-            )
+        if reasons := self.range.reasons(value, quantity, unit):
+            return reasons
         limits = _LARGEST_DEVIATION * self.largest_deviation
         if len(limits) and (np.abs(features - self.mean_feature) > limits).any():
             return ("the frame moves further or faster than any at calibration",)
         return ()
 
 
-def reported_values(point: Regressor, raw: FloatArray) -> FloatArray:
+def reported_values(point: Predictor, raw: FloatArray) -> FloatArray:
     """Return the values that (n,) raw predictions mean: no torque where the lever would not touch."""
     return point.sign * np.maximum(raw, 0.0) if isinstance(point, CensoredRidge) else raw

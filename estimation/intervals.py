@@ -5,7 +5,6 @@ stratum the half width is the 95 % quantile of the absolute residuals with the c
 many easy frames do not narrow the intervals of few hard ones.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Self
 
@@ -20,6 +19,8 @@ LEAST_IN_STRATUM = 20
 _LEAST_RESIDUALS = 5
 # Narrowest interval as a share of the calibrated range: load cells are noisy too.
 LEAST_HALF_WIDTH = 1e-3
+# Values further beyond the calibrated range, in spans of it, are refused as extrapolation.
+_LARGEST_BEYOND = 0.35
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,19 +81,21 @@ def _conformal_quantile(absolute: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ValueRange:
-    """The calibrated values, low to high, and what predictions at their ends may hide.
-
-    Predictions at or below low_end may hide any lower value, those at or above high_end any higher one (−∞ and ∞ where
-    none is hidden); lowest and highest are the furthest values that may occur.
-    """
+    """The calibrated values, low to high."""
 
     low: float
     high: float
-    lowest: float = -math.inf
-    highest: float = math.inf
-    low_end: float = -math.inf
-    high_end: float = math.inf
 
     def scaled(self, factor: float) -> "ValueRange":
-        """Return the range of values larger by a factor, where no prediction hides a value."""
-        return ValueRange(*(factor * end for end in (self.low, self.high, self.lowest, self.highest)))
+        """Return the range of values larger by a factor."""
+        return ValueRange(factor * self.low, factor * self.high)
+
+    def reasons(self, value: float, quantity: str, unit: str) -> tuple[str, ...]:
+        """Return the reason against a value far beyond the range, if there is one."""
+        beyond = _LARGEST_BEYOND * (self.high - self.low)
+        if self.low - beyond <= value <= self.high + beyond:
+            return ()
+        return (
+            f"the {quantity} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to {self.high:.3g} "
+            f"{unit}",
+        )

@@ -1,19 +1,17 @@
-"""Ways to leave frames out of a fit: blocks of time, groups, later parts, and later parts of another level."""
+"""Ways to leave frames out of a fit: blocks of time, groups, and later parts."""
 
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.arrays import IntArray
 
 # Pairs of rows to fit to and rows to validate on.
 LeftOut: TypeAlias = Sequence[tuple[IntArray, IntArray]]
 
 N_BLOCKS = 5
 FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
-# Values within this fraction of their range have one level: a little more than half the distance between ten levels.
-NEAR_LEVEL = 0.06
 
 
 def left_out_groups(numbers: IntArray) -> list[tuple[IntArray, IntArray]]:
@@ -35,26 +33,6 @@ def later_origins(n: int) -> list[tuple[IntArray, IntArray]]:
     if first < LEAST_BEFORE_ORIGIN:
         return []
     return [(np.arange(cut), np.arange(cut, n)) for cut in range(first, n - 1, max(1, n // N_ORIGINS))]
-
-
-def later_levels(values: FloatArray) -> list[tuple[IntArray, IntArray]]:
-    """Return (earlier, later) parts of (n,) values as `later_origins`, without earlier values near the later one.
-
-    Torques repeat. With the same level among the earlier ones, a flexible curve learns the levels and not the torque.
-    Where too few other values remain, the level stays.
-    """
-    near = NEAR_LEVEL * float(np.ptp(values))
-    found: list[tuple[IntArray, IntArray]] = []
-    for earlier, later in later_origins(len(values)):
-        # Later rows with the same earlier ones are one part.
-        parts: dict[bytes, tuple[IntArray, list[int]]] = {}
-        for row in later.tolist():
-            rest = earlier[np.abs(values[earlier] - values[row]) > near]
-            kept = rest if len(rest) >= LEAST_BEFORE_ORIGIN else earlier
-            _, rows = parts.setdefault(kept.tobytes(), (kept, []))
-            rows.append(row)
-        found += [(kept, np.array(rows)) for kept, rows in parts.values()]
-    return found
 
 
 def later_splits(n: int) -> Iterator[tuple[IntArray, IntArray]]:

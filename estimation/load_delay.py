@@ -100,7 +100,7 @@ def measure_timing(recordings: Sequence[FrameSeries], others: Sequence[FrameSeri
     nothing. Raises CalibrationError for a recording without torque, with values that are not finite, or with torques
     clearly stamped at other times than its frames.
     """
-    if not recordings or any(one.kind != "raw" for one in recordings):
+    if not recordings:
         return TRUSTED
     check_finite(recordings)
     timed: Sequence[tuple[FrameSeries, LoadDelay | None]] = [(one, find_load_delay(one)) for one in recordings]
@@ -154,7 +154,7 @@ def _sure_delays(recordings: Sequence[FrameSeries]) -> list[tuple[FrameSeries, L
 
 def load_delay_warning(series: FrameSeries) -> str:
     """Return a doubt about the times of a recording's torques, empty without any."""
-    if series.kind != "raw" or not np.abs(series.torque_nm).any():
+    if not np.abs(series.torque_nm).any():
         return ""
     try:
         return _doubt(series, find_load_delay(series))

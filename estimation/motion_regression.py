@@ -1,4 +1,4 @@
-"""The estimator of motion, the default: the gel's motion over the last seconds; for slices a curve over the value.
+"""The estimator of motion, the default: the gel's motion over the last seconds.
 
 Its features are how far the frame has moved since some frames ago, in a few directions per fingertip; older frames are
 averaged in growing steps. The gel creeps for seconds under a held twist, so its speed shows torque that its position
@@ -8,16 +8,14 @@ too and shows a long twist. `motion_fit` chooses directions and memory.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.channels import ChannelTable, smoothed_along_channels
-from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation.curve import CurveMean
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator import (
     LEAST_LEFT,
@@ -31,7 +29,7 @@ from shearloop.estimation.estimator import (
 )
 from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.grip_memory import Motion
-from shearloop.estimation.interval_fit import RegressorFit, fit_interval_regressor
+from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange
 from shearloop.estimation.left_out import left_out_blocks
@@ -44,7 +42,6 @@ from shearloop.estimation.motion_fit import (
     choose_motion,
     twists_left_out,
 )
-from shearloop.estimation.novelty import fitted_parts
 from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
 
 # The directions of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err
@@ -65,13 +62,6 @@ _N_NUISANCE, _MOST_FRAMES = 16, 500
 _CLEAR, _LEAST_SHARE = 2.0, 0.2
 # Centred positions have one direction less than their number; the last one is rounding.
 _ROUNDING = 1e-9
-# Inverse calibration over torque and over diameter: degrees of the averaged curves, directions of drift, trend. The
-# torque's have the least mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones) with and
-# without the judged level of torque (docs/decisions/0045).
-_CURVES: dict[Quantity, tuple[tuple[int, ...], int, bool]] = {
-    "torque": ((1, 3, 4), 3, True),
-    "diameter": ((1,), 1, False),
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,50 +155,38 @@ def _main_directions(parts: Sequence[FloatArray], noise: FloatArray, frames: int
 
 @dataclass(frozen=True, eq=False)
 class MotionRegression(Estimator):
-    """A ridge on the gel's motion over the last frames; for slices a curve of frames over the value.
-
-    Slices have no temporal features.
-    """
+    """A ridge on the gel's motion over the last frames."""
 
     name: ClassVar[str] = "motion_regression"
     strengths: ClassVar[tuple[float, ...]] = (0.0,)
-    # With a block left out, enough remain for the torque's curve.
-    least_slices: ClassVar[int] = 15
-    ignores_nan: ClassVar[bool] = True
     imputes_by_motion: ClassVar[bool] = True
 
-    temporal: TemporalFeatures | None = None
+    temporal: TemporalFeatures = field(kw_only=True)
 
     @classmethod
     def prepare(cls, material: Material) -> Self:
         """Return the estimator with the directions of the grips' motion."""
-        if not material.validators:
-            return cls(material.scale, material.table)
         temporal = TemporalFeatures.fit(material.grips, material.validators, nested=material.nested)
         return cls(material.scale, material.table, temporal=temporal)
 
     @property
     def motion(self) -> Motion:
         """What a session remembers of the gel's motion."""
-        return self.temporal or Motion()
+        return self.temporal
 
     def features(self, reading: Reading) -> FloatArray:
-        """Return the features of motion. A slice has its time as a feature, because the gel drifts."""
-        if self.temporal is not None:
-            return reading.frame.motion
-        return np.append((reading.frame.difference / self.scale).ravel(), reading.t_s)
+        """Return the features of motion."""
+        return reading.frame.motion
 
     def inputs(self, quantity: Quantity, features: FloatArray, reading: Reading) -> FloatArray:
         """Return the inputs of a quantity's regressor; the diameter's are the gel's mean position in this grip."""
-        if self.temporal is not None and quantity == "diameter":
+        if quantity == "diameter":
             return np.asarray((reading.frame.mean_difference / self.scale).ravel())
         return features
 
     def feature_width(self, quantity: Quantity) -> int:
         """Return the number of inputs of a quantity's regressor; raises ValueError for directions of other channels."""
         m, c = map(int, self.scale.shape)
-        if self.temporal is None:
-            return m * c + 1
         directions = self.temporal.directions
         if directions.ndim != 3 or (directions.shape[0], directions.shape[2]) != (m, c):
             raise ValueError(f"directions have the shape {directions.shape}, expected {m} sides of {c} channels")
@@ -231,8 +209,6 @@ class MotionRegression(Estimator):
         A mean of n frames has a root of n less. The calibrated interval lacks this noise: it comes from means of whole
         grips, which have little noise left.
         """
-        if not isinstance(regressor.point, Ridge):
-            return 0.0
         weights = regressor.point.weights
         return TWO_SIDED_95 * math.sqrt(weights @ weights)
 
@@ -240,8 +216,7 @@ class MotionRegression(Estimator):
         self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
     ) -> tuple[Self, IntervalRegressor, float]:
         """Return the torque's regressor, and the estimator with the chosen features."""
-        if (temporal := self.temporal) is None:
-            raise ValueError("raw frames have motion")
+        temporal = self.temporal
         fit_one: LinearFit = CensoredRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
         twists, variance = twists_left_out(torque_nm), float(torque_nm.var())
         left_out = twists or left_out_blocks(len(torque_nm))
@@ -260,32 +235,13 @@ class MotionRegression(Estimator):
 
     def side_of_features(self, n_features: int) -> IntArray:
         """Return the side (d,) that each of the torque's features comes from."""
-        m, p, _ = self.temporal.directions.shape if self.temporal is not None else (1, 1, 0)
+        m, p, _ = self.temporal.directions.shape
         return np.tile(np.repeat(np.arange(m), p), n_features // (m * p))
 
     def fit_diameter(self, rows: CalibrationRows) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""
         grips = [rows.where(rows.recording == one) for one in np.unique(rows.recording)]
-        return OutputModel(fit_cylinders(grips, self.table), None, np.zeros(0))
-
-    def slices_fits(self, quantity: Quantity, values: FloatArray) -> tuple[RegressorFit, RegressorFit]:
-        """Return the fits of a curve and of a line.
-
-        Raises CalibrationError where a part of (n,) values has too few distinct ones.
-        """
-        degrees, n_drift, trend = _CURVES[quantity]
-        for rows in fitted_parts(len(values)) if np.ptp(values) > 0 else ():
-            n_distinct = len(np.unique(values[rows]))
-            if n_distinct <= max(degrees):
-                raise CalibrationError(
-                    f"{len(rows)} of the {len(values)} slices have too few different {quantity}s for the estimator "
-                    f"motion_regression, {n_distinct}; record more of them, in turn"
-                )
-
-        def fit_of(degrees: tuple[int, ...]) -> RegressorFit:
-            return lambda frames, known, _: CurveMean.fit(frames, known, degrees, n_drift, trend=trend)
-
-        return fit_of(degrees), fit_of((1,))
+        return OutputModel(fit_cylinders(grips, self.table), np.zeros(0))
 
 
 def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> IntervalRegressor:

@@ -5,7 +5,7 @@ side only: where it reads nothing the twist may be anything below, so these fram
 """
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -18,6 +18,13 @@ _MARGIN_SHARE = 0.05
 _LEAST_SIGMA_SHARE, _HINGE_ROUNDS = 0.01, 50
 # Penalties to choose from, in units of the features' sum of squares.
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
+
+
+class Predictor(Protocol):
+    """Predicts a value from features."""
+
+    def predict(self, features: FloatArray) -> FloatArray:
+        """Return the values of (…, d) features."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from shearloop.estimation.bank_match import BankMatch, BankMatcher
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.defaults import BASELINE_FRAMES
-from shearloop.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading
+from shearloop.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading, match_reasons
 from shearloop.estimation.fingertip_validator import (
     LARGEST_JUMPING_SHARE,
     FingertipSet,
@@ -34,13 +34,13 @@ from shearloop.estimation.values import Estimate, Measured, ProcessedFrame, Tact
 from shearloop.words import counted
 
 _REPEATED_FRAME = ("the board sent the same frame again",)
-_UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
+UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _UNKNOWN = (None, None, None)
 _UNCALIBRATED = ("no calibration is configured: k and sigma have no torque",)
-_AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
+AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
 
 # A value, and its 95 % interval: how far it extends below and above, or its ends.
-_Interval = tuple[float, float, float]
+Interval = tuple[float, float, float]
 # Searches a whole bank. It has no state, so sessions may share one.
 BankSearch: TypeAlias = PrunedMatcher | PrunedZeroLagMatcher
 
@@ -85,12 +85,7 @@ class Session:
             self._calibration, self._tool_reasons = self.calibration, (str(error),)
 
     def tare(self, frames: int | None = None) -> None:
-        """Forget the session and average the next `frames` usable frames, of untouched fingertips, into the idle frame.
-
-        Raises CalibrationError for a calibration of slices, which have no idle frame.
-        """
-        if self.calibration.kind != "raw":
-            raise CalibrationError("slices are differences already: they have no zero")
+        """Forget the session; the next `frames` usable frames, of untouched fingertips, make the idle frame."""
         self.reset(frames or self._baseline_frames)
 
     def reset(self, idle_frames: int = 0) -> None:
@@ -104,8 +99,6 @@ class Session:
     def _begin(self, idle_frames: int) -> None:
         """Forget all frames."""
         calibration = self.calibration
-        if calibration.kind != "raw":
-            return
         motion, fingertips = calibration.estimator.motion, FingertipSet(calibration.validators)
         self._fingertips = fingertips
         self._motion = motion
@@ -128,7 +121,7 @@ class Session:
     @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
-        return self.calibration.kind == "raw" and self._idle.taring
+        return self._idle.taring
 
     @property
     def grip_t_s(self) -> FloatArray:
@@ -166,7 +159,7 @@ class Session:
         # Noise makes every side of a new frame differ, except where no channel has a signal.
         repeats = ((frame.channels == self._latest).all(axis=1) & frame.channels.any(axis=1)).any()
         self._latest = frame.channels
-        if repeats and self.calibration.kind == "raw":
+        if repeats:
             return Estimate(valid=False, reasons=_REPEATED_FRAME)
         processed = self.process(frame)
         if not processed.held_frames:
@@ -180,8 +173,6 @@ class Session:
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next frame and return its difference to the idle frame, or the reasons against it."""
-        if self.calibration.kind != "raw":
-            return ProcessedFrame(np.abs(frame.channels), (), frame.usable)
         checks, idle = self._checks, self._idle
         missing = self._timer.missing_before(frame.t_s)
         if missing is None:
@@ -268,16 +259,15 @@ class Session:
             return Estimate(valid=False, reasons=tuple(reasons))
         errors = NO_ERRORS
         if not frame.usable.all():
-            novelty = next((one.novelty for one in outputs.values() if one.novelty is not None), None)
-            difference, errors = calibration.estimator.impute(frame.difference, frame.usable, novelty)
+            difference, errors = calibration.estimator.impute(frame.difference, frame.usable)
             self.difference, frame = difference, replace(frame, difference=difference)
         reading = Reading.of(frame, t_s, self._matcher)
         features, match = calibration.estimator.features(reading), next(iter(reading.matches), None)
         if match is not None and match.ambiguous:
-            return _estimate({}, _AMBIGUOUS, match)
+            return estimate_of({}, AMBIGUOUS, match)
         if "torque" in outputs:
             self._gain.frames.append((t_s, features[calibration.estimator.columns["torque"]]))
-        values: dict[Quantity, _Interval] = {}
+        values: dict[Quantity, Interval] = {}
         for quantity, model in outputs.items():
             value, against = self._predict_quantity(quantity, model, reading, features, errors)
             reasons |= dict.fromkeys(against)
@@ -286,10 +276,10 @@ class Session:
         # Tools of several diameters have a diameter where they have no torque.
         several = calibration.tools is not None and bool(self._tool_reasons)
         torque_missing = calibration.torque is not None and "torque" not in values and not several
-        if calibration.kind == "raw" and torque_missing:
+        if torque_missing:
             # A frame beyond the calibrated torques is beyond the calibrated diameters too.
             values.clear()
-        return _estimate(values, reasons, match)
+        return estimate_of(values, reasons, match)
 
     def _select_outputs(self, frame: ProcessedFrame) -> tuple[dict[Quantity, OutputModel], dict[str, None]]:
         """Return the models to apply to a frame, and the reasons against the others, in order."""
@@ -300,8 +290,6 @@ class Session:
                 # The gel's position means nothing without its idle position.
                 continue
             against = self._tool_reasons if quantity == "torque" else ()
-            if model.novelty is not None:
-                against = (*model.novelty.reasons(frame.difference[0], frame.usable[0]), *against)
             reasons |= dict.fromkeys(against)
             if not against:
                 outputs[quantity] = model
@@ -309,19 +297,15 @@ class Session:
 
     def _predict_quantity(
         self, quantity: Quantity, model: OutputModel, reading: Reading, features: FloatArray, errors: FloatArray
-    ) -> tuple[_Interval, tuple[str, ...]]:
+    ) -> tuple[Interval, tuple[str, ...]]:
         """Return one quantity with its interval, and the reasons against it.
 
         Imputed channels have the (k, m, c) errors, one standard deviation each.
         """
         frame, estimator = reading.frame, self.calibration.estimator
-        features, complete = estimator.inputs(quantity, features, reading), None
-        if quantity == "torque" and model.novelty is not None and estimator.uses_amplitude:
-            missing = model.novelty.missing_share(frame.difference[0], frame.usable[0])
-            if missing:
-                complete = self._regressor_inputs(quantity, reading, frame.difference / (1.0 - missing))
+        features = estimator.inputs(quantity, features, reading)
         usable_share = np.count_nonzero(frame.usable) / frame.usable.size
-        value = model.regressor.predict(features, usable_share, complete)
+        value = model.regressor.predict(features, usable_share)
         dead: tuple[str, ...] = ()
         if len(errors):
             changed = [self._regressor_inputs(quantity, reading, frame.difference + one) for one in errors]
@@ -336,8 +320,8 @@ class Session:
         if quantity == "diameter":
             error = estimator.position_noise_mm(model.regressor) / math.sqrt(frame.held_frames)
             value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)
-        against = dead or tuple(why for match in reading.matches[:1] for why in model.match_reasons(match))
-        return value, against or model.regressor.range_reasons(value[0], features, quantity, _UNITS[quantity])
+        against = dead or tuple(why for match in reading.matches[:1] for why in match_reasons(model.k_range, match))
+        return value, against or model.regressor.range_reasons(value[0], features, quantity, UNITS[quantity])
 
     def _regressor_inputs(self, quantity: Quantity, reading: Reading, difference: FloatArray) -> FloatArray:
         """Return the regressor's inputs if this were the frame's difference."""
@@ -358,7 +342,7 @@ def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: Bo
     )
 
 
-def _estimate(values: Mapping[Quantity, _Interval], reasons: Iterable[str], match: BankMatch | None) -> Estimate:
+def estimate_of(values: Mapping[Quantity, Interval], reasons: Iterable[str], match: BankMatch | None) -> Estimate:
     """Return the estimate of values with the ends of their intervals."""
     torque, diameter = values.get("torque", _UNKNOWN), values.get("diameter", _UNKNOWN)
     estimate = Estimate(bool(values), () if values else tuple(reasons), *torque, *diameter)

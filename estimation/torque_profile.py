@@ -10,47 +10,36 @@ from typing import Self
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.arrays import FloatArray
 from shearloop.estimation.gain import find_twists
 from shearloop.estimation.values import FrameSeries
 
 # Step of a twist's profile, and how far it reaches either way from the twist's middle: a twist of the paper takes 5 s.
 _STEP_S, _REACH_S = 0.25, 15.0
-# A fall by more than this fraction of the range begins another repeat of a series of slices.
-_RESTART = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueProfile:
-    """Mean torque_nm (p,) at rising offsets (p,): seconds from a twist's middle, or slices from a repeat's end."""
+    """Mean torque_nm (p,) at rising offsets (p,): seconds from a twist's middle."""
 
     offsets: FloatArray
     torque_nm: FloatArray
 
     @classmethod
     def fit(cls, recordings: Sequence[FrameSeries]) -> Self | None:
-        """Return the profile of recordings of one kind, None without a known torque."""
-        if recordings[0].kind == "raw":
-            offsets = np.arange(-_REACH_S, _REACH_S + _STEP_S / 2, _STEP_S)
-            twists = [
-                np.interp(middle + offsets, one.torque_t_s, one.torque_nm, left=np.nan, right=np.nan)
-                for one in recordings
-                for middle in _middles(one)
-            ]
-            rows = np.array(twists).reshape(-1, len(offsets))
-            known = np.isfinite(rows).any(axis=0) if len(rows) else np.zeros(len(offsets), dtype=np.bool_)
-            return cls(offsets[known], np.nanmean(rows[:, known], axis=0)) if known.any() else None
-        places = np.concatenate([_places(one.torque_at_frames()) for one in recordings])
-        torque_nm = np.concatenate([one.torque_at_frames() for one in recordings])
-        each = np.unique(places[np.isfinite(torque_nm)])
-        if not len(each):
-            return None
-        return cls(each.astype(np.float64), np.array([np.nanmean(torque_nm[places == one]) for one in each]))
+        """Return the profile of recordings, None without a known torque."""
+        offsets = np.arange(-_REACH_S, _REACH_S + _STEP_S / 2, _STEP_S)
+        twists = [
+            np.interp(middle + offsets, one.torque_t_s, one.torque_nm, left=np.nan, right=np.nan)
+            for one in recordings
+            for middle in _middles(one)
+        ]
+        rows = np.array(twists).reshape(-1, len(offsets))
+        known = np.isfinite(rows).any(axis=0) if len(rows) else np.zeros(len(offsets), dtype=np.bool_)
+        return cls(offsets[known], np.nanmean(rows[:, known], axis=0)) if known.any() else None
 
     def predict(self, series: FrameSeries) -> FloatArray:
-        """Return the (n,) torques of a series' frames by the moments of its twists, or by the places of its slices."""
-        if series.kind != "raw":
-            return np.interp(_places(series.torque_at_frames()), self.offsets, self.torque_nm)
+        """Return the (n,) torques of a series' frames by the moments of its twists."""
         predicted, middles = np.zeros(len(series.t_s)), np.array(_middles(series))
         if len(middles):
             nearest = middles[np.abs(series.t_s[:, None] - middles).argmin(axis=1)]
@@ -62,20 +51,3 @@ def _middles(series: FrameSeries) -> list[float]:
     """Return the times of the middles of a recording's twists, weighted by their torque."""
     torque_nm = np.nan_to_num(series.torque_at_frames())
     return [float(np.average(series.t_s[rows], weights=np.abs(torque_nm[rows]))) for rows in find_twists(torque_nm)]
-
-
-def _places(torque_nm: FloatArray) -> IntArray:
-    """Return the place (n,) of each slice in its repeat: −1 for the last place of a whole repeat, less before.
-
-    The first repeat may lack its first slices, the last one its last slices. A whole repeat is the longest one.
-    """
-    known = np.nan_to_num(torque_nm)
-    falls = np.flatnonzero(np.diff(known) < -_RESTART * float(np.ptp(known))) + 1
-    starts = np.array([0, *falls.tolist()])
-    lengths = np.diff([*starts.tolist(), len(known)])
-    whole = int(lengths.max())
-    # The first repeat ends in its place, so it counts as begun earlier.
-    starts[0] += lengths[0] - whole
-    rows = np.arange(len(known))
-    own_start = starts[np.searchsorted(falls, rows, side="right")]
-    return np.asarray(rows - own_start - whole)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 
@@ -12,9 +12,6 @@ from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.words import counted
-
-# "raw": volts as the board sends them. "difference": slices, |frame − idle frame| smoothed over time.
-Kind = Literal["raw", "difference"]
 
 # Metadata of a dataclass's field: in the calibration's file its fields join the other fields of the dataclass.
 INLINE = {"inline": True}
@@ -44,7 +41,6 @@ class FrameSeries:
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 
-    kind: Kind
     sides: tuple[str, ...]
     t_s: FloatArray
     channels: FloatArray
@@ -77,7 +73,7 @@ class FrameSeries:
         """Return the (n,) torque in N·m at the middle of each frame, NaN where no reading is near."""
         return torque_at(self.t_s, self.torque_t_s, self.torque_nm)
 
-    def select_sides(self, sides: tuple[str, ...]) -> "FrameSeries":
+    def select_sides(self, sides: tuple[str, ...]) -> Self:
         """Return the series with these sides only; raises CalibrationError for a side that is missing."""
         missing = [side for side in sides if side not in self.sides]
         if missing:
@@ -88,7 +84,7 @@ class FrameSeries:
         layers = [self.sides.index(side) for side in sides]
         return replace(self, sides=sides, channels=self.channels[:, layers])
 
-    def between(self, start: int, stop: int) -> "FrameSeries":
+    def between(self, start: int, stop: int) -> Self:
         """Return frames `start` to `stop` with all torques."""
         part = slice(start, stop)
         return replace(
@@ -101,8 +97,8 @@ class FrameSeries:
 
     @property
     def tool_mm(self) -> Measured | None:
-        """Diameter of the tool of raw frames, None where unknown."""
-        if self.kind != "raw" or not len(self.t_s):
+        """Diameter of the tool, None where unknown."""
+        if not len(self.t_s):
             return None
         known_mm = float(self.diameter_mm[0])
         return Measured(known_mm, 0.0) if np.isfinite(known_mm) else self.gripper_mm
@@ -194,13 +190,16 @@ def torque_at(t_s: FloatArray, torque_t_s: FloatArray, torque_nm: FloatArray) ->
 
 def check_finite(recordings: Sequence[FrameSeries]) -> None:
     """Raise CalibrationError for a recording without frames, or with values that are not finite."""
-    for number, one in enumerate(recordings, 1):
+    check_finite_values([(one.t_s, one.channels, one.torque_nm) for one in recordings])
+
+
+def check_finite_values(recordings: Sequence[tuple[FloatArray, ...]]) -> None:
+    """Raise CalibrationError for times, frames and further values that are not finite, and for no frames."""
+    for number, values in enumerate(recordings, 1):
         which = f"recording {number} of {len(recordings)}"
-        if not len(one.t_s):
+        if not len(values[0]):
             raise CalibrationError(f"{which} has no frames to calibrate on; leave it out, or use a longer part of it")
-        # A slice without a torque may be of a cylinder.
-        torque = one.torque_nm if one.kind == "raw" else np.zeros(0)
-        wrong = sum(int(np.count_nonzero(~np.isfinite(values))) for values in (one.t_s, one.channels, torque))
+        wrong = sum(int(np.count_nonzero(~np.isfinite(one))) for one in values)
         if wrong:
             found = counted(wrong, "value that is not a finite number", "values that are not finite numbers")
             raise CalibrationError(f"{which} holds {found}; leave those frames out")

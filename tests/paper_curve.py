@@ -21,7 +21,7 @@ def paper_curve(bank_identity: str, *, torque: Points | None = None, diameter: P
 
     def curve(features: FloatArray, values: FloatArray) -> OutputModel:
         regressor = fit_interval_regressor(features, values, blank.estimator.ridge, strengths=blank.estimator.strengths)
-        return OutputModel(regressor, None, np.zeros(0))
+        return OutputModel(regressor, np.zeros(0))
 
     return replace(
         blank,

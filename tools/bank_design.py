@@ -22,25 +22,29 @@ _MAX_UNEXPLAINED = 0.71
 _MAX_NOISE = 1.0 / 3.0
 
 
-def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> tuple[Path, Design]:
+def designed_for(scene: MeasuredFrames, fingertip: Path | None) -> tuple[Path, Design]:
     """Return the fingertip's file and the design; raises UserError and BankError for unusable files."""
     path = fingertip or OWN_FINGERTIP
+    return path, design_bank(load_fingertip(path), scene)
+
+
+def scene_of_recording(recording: Path, side: str | None) -> MeasuredFrames:
+    """Return what a design needs of a recording; raises UserError without a torque."""
     # A named side is read alone, so that gaps of the other do not matter.
-    sides = None if side is None else (side,)
-    series = [one for one in read_series(recording, sides) if one.torque_t_s.size]
-    if not series:
-        raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
-    # Slices have no side.
-    one = series[0] if sides is None else series[0].select_sides(sides)
-    return path, design_bank(load_fingertip(path), scene_of(one))
+    (series,) = read_series(recording, None if side is None else (side,))
+    if not series.torque_t_s.size:
+        raise no_torque(recording)
+    return scene_of(series)
+
+
+def no_torque(recording: Path) -> UserError:
+    """Return the error for a recording without torques."""
+    return UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
 
 
 def scene_of(series: FrameSeries) -> MeasuredFrames:
     """Return the first side's gripped differences, their noise, and the torque."""
     torque = series.torque_at_frames()
-    if series.kind == "difference":
-        frames = series.channels[:, 0]
-        return MeasuredFrames(frames, residual_noise(frames), torque if np.isfinite(torque).all() else None)
     idle, gripped, _ = segment_grip(series)
     frames = series.channels[gripped, 0]
     # A recording that begins gripped has no idle frame: use its first one.

@@ -36,14 +36,6 @@ class CalibrationResult:
         return None if self.calibration.torque is None else self.calibration.torque.regressor
 
     @property
-    def reads_beyond(self) -> bool | None:
-        """Whether torques beyond the calibrated ones are seen to be beyond; None where that was not tested."""
-        one, calibration = self.regressor, self.calibration
-        if one is None or calibration.kind == "raw" or "full range" in calibration.assumptions:
-            return None
-        return not (one.range.low_end > one.range.low or one.range.high_end < one.range.high)
-
-    @property
     def tool_mm(self) -> float | None:
         """The diameter of the only tool in the recordings, None where it is not known."""
         return None if math.isnan(self.calibration.tool_mm) else self.calibration.tool_mm
@@ -67,8 +59,6 @@ class CalibrationResult:
         }
         if self.regressor is not None:
             found["sees_loads"] = not self.regressor.misses_loads
-        if self.reads_beyond is not None:
-            found["reads_beyond"] = self.reads_beyond
         if timing.references:
             found["load_cell_delay_s"] = [one and round(one.delay_s, 3) for one in timing.delays]
             found["load_cell_warnings"] = list(self.doubts)
@@ -77,7 +67,7 @@ class CalibrationResult:
             found["readings_left_out"] = list(self.left_out)
         if self.widening is not None:
             found["widening"] = self.widening
-        return found | ({"tool_mm": self.tool_mm} if calibration.kind == "raw" else {})
+        return found | {"tool_mm": self.tool_mm}
 
 
 def calibrate(
@@ -88,19 +78,17 @@ def calibrate(
     time_range: tuple[float, float],
     sides: tuple[str, ...] | None = None,
     load_cell_delay_s: float | None = None,
-    assume_full_range: bool = False,
     tool_mm: float | None = None,
 ) -> CalibrationResult:
-    """Fit an estimator to these shares (0 to 1) of recordings or of folders of slices, oldest first.
+    """Fit an estimator to these shares (0 to 1) of recordings, oldest first.
 
-    A `load_cell_delay_s` is subtracted from the load cell's times, which are then not checked. With `assume_full_range`
-    no torque will exceed the slices. Raises UserError for recordings that are given twice, and CalibrationError for
-    those that determine no calibration.
+    A `load_cell_delay_s` is subtracted from the load cell's times, which are then not checked. Raises UserError for
+    recordings that are given twice, and CalibrationError for those that determine no calibration.
     """
     read = read_parts(paths, time_range=time_range, sides=sides, load_cell_delay_s=load_cell_delay_s, tool_mm=tool_mm)
-    source = _source(paths, time_range, load_cell_delay_s)
+    source = source_text(paths, time_range, load_cell_delay_s)
     begun = time.perf_counter()
-    calibration = fit(estimator, read.parts, source, physics, timing=read.timing, full_range=assume_full_range)
+    calibration = fit(estimator, read.parts, source, physics, timing=read.timing)
     fit_s = time.perf_counter() - begun
     frames = sum(len(one.t_s) for one in read.parts)
     tools = distinct([one.tool_mm for one in read.parts if one.tool_mm is not None])
@@ -126,7 +114,7 @@ def read_parts(
     load_cell_delay_s: float | None = None,
     tool_mm: float | None = None,
 ) -> ReadParts:
-    """Return what `calibrate` fits to these shares (0 to 1) of recordings or of folders of slices.
+    """Return what `calibrate` fits to these shares (0 to 1) of recordings.
 
     Raises UserError for recordings that are given twice, and CalibrationError for a load cell with a wrong clock.
     """
@@ -136,15 +124,12 @@ def read_parts(
     all_live = True
     for path in paths:
         not_fitted: list[FrameSeries] = []
-        if path.is_dir():
-            own, all_live = read_series(path), False
-        else:
-            recording = read_recording(path)
-            own, all_live = [series_of(recording, sides, tool_mm)], all_live and recording.live
-            if sides is not None and load_cell_delay_s is None:
-                # Other sides may show the load cell's delay better.
-                not_fitted = [series_of(recording, (side,), tool_mm) for side in recording.sides if side not in sides]
-        chosen += [(path, part_of(one, *time_range)) for one in own]
+        recording = read_recording(path)
+        all_live = all_live and recording.live
+        if sides is not None and load_cell_delay_s is None:
+            # Other sides may show the load cell's delay better.
+            not_fitted = [series_of(recording, (side,), tool_mm) for side in recording.sides if side not in sides]
+        chosen.append((path, part_of(series_of(recording, sides, tool_mm), *time_range)))
         others += [(f"{path.name}, {one.sides[0]}", part_of(one, *time_range)) for one in not_fitted]
     parts = [part for _, part in chosen]
     check_no_copies([(str(path), part) for path, part in chosen])
@@ -180,10 +165,11 @@ def adapt_to_recordings(
     # Earlier frames show the session the idle fingertip.
     until = [part_of(replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s), 0.0, stop) for one in series]
     first = [part_of(one, start, stop).first_frame for one in series]
-    return adapt(calibration, until, _source(paths, time_range, load_cell_delay_s), physics, first_frames=first)
+    return adapt(calibration, until, source_text(paths, time_range, load_cell_delay_s), physics, first_frames=first)
 
 
-def _source(paths: Sequence[Path], time_range: tuple[float, float], delay_s: float | None) -> str:
+def source_text(paths: Sequence[Path], time_range: tuple[float, float], delay_s: float | None = None) -> str:
+    """Return what a calibration is made from, in words."""
     source = ", ".join(path.name for path in paths)
     if time_range != (0.0, 1.0):
         source += " from {:g} to {:g}".format(*time_range)

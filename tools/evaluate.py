@@ -6,7 +6,7 @@ import math
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -17,8 +17,11 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.bank_file import Bank
 from shearloop.estimation import Calibration, Estimate, FrameSeries, Session, TactileFrame
 from shearloop.estimation.defaults import LOADED_NM
+from shearloop.estimation.load_delay import load_delay_warning
 from shearloop.estimation.values import winkler_scores
 from shearloop.files import replace_file
+from shearloop.tools.frame_series import check_no_copies, part_of
+from shearloop.tools.parallel import Executor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,6 +75,57 @@ def estimate_in_worker(shared: tuple[Calibration, str | None], series: FrameSeri
     return estimate_series(calibration, series, None if path is None else Bank.open(path))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """The tracks of parts of recordings, the path of each, and what to know of the calibration and the recordings.
+
+    `title` describes the calibration, `assumptions` what the user guarantees. `draw` draws a track. With
+    `no_better_than_clock` guesses without a sensor err less. `left_out` is what of the recordings was not used;
+    `emulated` names those of emulated devices.
+    """
+
+    tracks: Sequence[EstimateTrack]
+    paths: Sequence[Path]
+    title: str
+    assumptions: str
+    draw: "Callable[[Axes, EstimateTrack, str], None]"
+    no_better_than_clock: Callable[[Sequence[EstimateTrack], float], str]
+    doubts: Sequence[str] = ()
+    left_out: Sequence[str] = ()
+    emulated: Sequence[str] = ()
+
+
+def evaluate_recordings(
+    calibration: Calibration, named: Sequence[tuple[Path, FrameSeries]], bank: Path | None,
+    time_range: tuple[float, float], pool: Executor,
+) -> Evaluation:  # fmt: skip
+    """Return a calibration's estimates of these shares (0 to 1) of recordings; raises UserError for copies."""
+    start, stop = time_range
+    parts = [part_of(one, start, stop) for _, one in named]
+    check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
+    if bank is not None:
+        Bank.open(bank)
+    shared = (calibration, None if bank is None else str(bank.resolve()))
+    # Frames before the part show the idle fingertip, as live.
+    estimated = pool.map(estimate_in_worker, shared, [part_of(one, 0.0, stop) for _, one in named])
+    tracks = [track.since(part.first_frame) for track, part in zip(estimated, parts, strict=True)]
+    warned = [(path.name, load_delay_warning(part)) for (path, _), part in zip(named, parts, strict=True)]
+    return Evaluation(
+        tracks,
+        [path for path, _ in named],
+        f"{calibration.estimator.name}, fitted to {calibration.source}",
+        calibration.assumption_text,
+        draw_stream,
+        no_better_than_clock,
+        [f"{name}: {warning}" for name, warning in warned if warning],
+        [
+            f"{path.name}: {'; '.join(one.left_out)}"
+            for (path, _), one in zip(named, parts, strict=True)
+            if one.left_out
+        ],
+    )
+
+
 def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     """Return the figures of all frames, by the names that `shearloop evaluate` prints.
 
@@ -113,13 +167,16 @@ def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_N
     return found
 
 
+def beats_clock(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_NM) -> bool:
+    """Return whether the estimate errs less than guesses without a sensor, or has no loaded frame."""
+    ratio = figures_by_load(tracks, loaded_nm)["loaded"]["baseline_ratio"]
+    return ratio is None or ratio < 1.0
+
+
 def no_better_than_clock(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_NM) -> str:
     """Return a sentence against an estimate that errs as much as a guess without a sensor, empty for a better one."""
-    ratio = figures_by_load(tracks, loaded_nm)["loaded"]["baseline_ratio"]
-    if ratio is None or ratio < 1.0:
+    if beats_clock(tracks, loaded_nm):
         return ""
-    if tracks[0].series.kind != "raw":
-        return "The sensor does not beat the place in the sequence: record the levels in random order."
     sides = tracks[0].series.sides
     if len(sides) == 1:
         return f"This fingertip ({sides[0]}) does not beat the stopwatch: use both."
@@ -166,7 +223,7 @@ def values_of(estimates: Sequence[Estimate], quantity: str = "torque") -> FloatA
     return np.array([[getattr(estimate, name) for estimate in estimates] for name in names], dtype=np.float64)
 
 
-def _frames(track: EstimateTrack, quantity: str) -> FloatArray:
+def frames_of(track: EstimateTrack, quantity: str) -> FloatArray:
     """Return truth, estimate, the interval's ends and the profile (5, n) of all frames, NaN for unknown ones."""
     truth = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
     profile = track.profile_nm if quantity == "torque" and track.profile_nm is not None else np.full(len(truth), np.nan)
@@ -175,7 +232,7 @@ def _frames(track: EstimateTrack, quantity: str) -> FloatArray:
 
 def _known_frames(tracks: Sequence[EstimateTrack], quantity: str) -> FloatArray:
     """Return truth, estimate, the interval's ends and the profile (5, n) of the frames with a known truth."""
-    frames = np.concatenate([_frames(track, quantity) for track in tracks], axis=1)
+    frames = np.concatenate([frames_of(track, quantity) for track in tracks], axis=1)
     return frames[:, np.isfinite(frames[0])]
 
 
@@ -217,36 +274,36 @@ def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path:
                 table.writerow([name, number, t_s, truth, *cells, estimate.valid, "; ".join(estimate.reasons)])
 
 
-def draw_tracks(tracks: Sequence[EstimateTrack], names: Sequence[str], title: str, path: Path) -> None:
-    """Write a figure with a named row per series: truth, estimates with intervals, and where none is valid."""
-    from matplotlib.ticker import MaxNLocator
-
+def draw_tracks(
+    tracks: Sequence[EstimateTrack],
+    names: Sequence[str],
+    title: str,
+    path: Path,
+    draw: "Callable[[Axes, EstimateTrack, str], None]",
+) -> None:
+    """Write a figure with a named row per series, which `draw` draws."""
     from shearloop.tools.drawing import figure
 
     made = figure(11, 3.2 * len(tracks))
     rows = np.ravel(made.subplots(len(tracks), 1, squeeze=False))
     for axes, track, row_name in zip(rows, tracks, names, strict=True):
-        slices = track.series.kind == "difference"
-        # A stream has one tool: its diameter would be a flat line.
-        is_torque = not slices or not np.isfinite(track.series.diameter_mm).any()
-        truth, value, low, high, _ = _frames(track, "torque" if is_torque else "diameter")
-        t_s = track.series.t_s
-        known = "load cell" if is_torque else "known diameter"
-        axes.plot(t_s, truth, "ko" if slices else "k-", linewidth=1.0, markersize=5, label=known)
-        if slices:
-            shown = "estimate with its 95 % interval"
-            axes.errorbar(t_s, value, [value - low, high - value], fmt="s", markersize=4, label=shown)
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        else:
-            _draw_intervals(axes, t_s, value, low, high)
-        emulated = "EMULATED: " if track.series.emulated else ""
-        axes.set_title(emulated + row_name + (_loaded_text(track) if is_torque else ""), loc="left", fontsize="medium")
-        axes.set_xlabel("slice" if slices else "time in s")
-        axes.set_ylabel("torque in N·m" if is_torque else "diameter in mm")
+        draw(axes, track, row_name)
     labelled = {label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     made.legend(labelled.values(), labelled, loc="outside lower left", ncols=3, frameon=False, fontsize="small")
     made.suptitle(title)
     made.savefig(path, dpi=110)
+
+
+def draw_stream(axes: "Axes", track: EstimateTrack, name: str) -> None:
+    """Draw truth and estimates of a stream over time, with intervals, and where none is valid."""
+    truth, value, low, high, _ = frames_of(track, "torque")
+    t_s = track.series.t_s
+    axes.plot(t_s, truth, "k-", linewidth=1.0, markersize=5, label="load cell")
+    _draw_intervals(axes, t_s, value, low, high)
+    emulated = "EMULATED: " if track.series.emulated else ""
+    axes.set_title(emulated + name + loaded_text(track), loc="left", fontsize="medium")
+    axes.set_xlabel("time in s")
+    axes.set_ylabel("torque in N·m")
 
 
 def _draw_intervals(axes: "Axes", t_s: FloatArray, value: FloatArray, low: FloatArray, high: FloatArray) -> None:
@@ -265,7 +322,7 @@ def _draw_intervals(axes: "Axes", t_s: FloatArray, value: FloatArray, low: Float
         )
 
 
-def _loaded_text(track: EstimateTrack) -> str:
+def loaded_text(track: EstimateTrack) -> str:
     """Return the errors of a track's loaded frames as the end of a title, empty without any."""
     loaded = figures_by_load([track])["loaded"]
     error, zero = loaded["rmse_nm"], loaded["zero_rmse_nm"]

@@ -1,8 +1,9 @@
-"""Recordings and folders of slices as series of frames, with the tool of each and a check for copies."""
+"""Recordings as series of frames, with the tool of each and a check for copies."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,17 +13,10 @@ from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
 from shearloop.estimation.calibration import LARGEST_TOOL_SHARE
 from shearloop.tools.recordings.frames import Recording, read_recording
-from shearloop.tools.recordings.matlab_import import (
-    DIAMETER_FOLDER,
-    TORQUE_FOLDER,
-    Slices,
-    read_diameter_slices,
-    read_torque_slices,
-)
 from shearloop.words import counted
 
-# Slices do not name their side.
-SLICE_SIDE = "right"
+Series = TypeVar("Series", bound=FrameSeries)
+
 # Largest distance in time of a pair of frames, as a share of the period.
 _LARGEST_APART = 0.75
 # Share of the time with another grip that does not count as another tool: the fingers met something or gripped again.
@@ -32,26 +26,18 @@ _MOMENTARY = 0.05
 def read_series(
     path: str | Path, sides: tuple[str, ...] | None = None, tool_mm: float | None = None
 ) -> list[FrameSeries]:
-    """Return the series of a recording, of a folder of slices, or of a folder with torque_slices and diameter_slices.
+    """Return the series of a recording, a list of one.
 
     `sides` selects the sides of a recording, by default all; `tool_mm` is the diameter of its tool, if the recording
     does not name it. Raises UserError for anything else.
     """
     path = Path(path)
-    if not path.is_dir():
-        return [series_of(read_recording(path), sides, tool_mm)]
-    inside = [path / name for name in (TORQUE_FOLDER, DIAMETER_FOLDER) if (path / name).is_dir()]
-    if inside:
-        return [series for folder in inside for series in read_series(folder)]
-    names = [one.name for one in path.iterdir()]
-    if any(name.startswith("Data_Slice_") for name in names):
-        return [_series_of_slices(read_torque_slices(path))]
-    if any("mm_Data_" in name for name in names):
-        return [_series_of_slices(read_diameter_slices(path))]
-    raise UserError(
-        f"{path} is a folder without slices; name a recording (.mcap, from `shearloop run --record` or "
-        "`shearloop recording import`), or a folder of slices"
-    )
+    if path.is_dir():
+        raise UserError(
+            f"{path} is a folder; name a recording (.mcap, from `shearloop run --record` or "
+            "`shearloop recording import`)"
+        )
+    return [series_of(read_recording(path), sides, tool_mm)]
 
 
 def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> FrameSeries:
@@ -80,7 +66,6 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
     t_s = (times[:, paired] - start).mean(axis=0) / 1e9
     diameter_mm, gripper_mm = tool_of(recording, first.t_mid_ns, tool_mm)
     return FrameSeries(
-        "raw",
         wanted,
         t_s,
         np.stack([recording.table.channels_of_line(one) for one in lines], axis=1),
@@ -99,7 +84,7 @@ def _unpaired(side: str, apart: BoolArray) -> str:
     return f"{counted(int(apart.sum()), 'frame')} of the {side} side, without one of the others at that time"
 
 
-def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:
+def part_of(series: Series, start: float, stop: float) -> Series:
     """Return the frames between two shares (0 to 1) of a series, in time order; UserError for an empty part."""
     n = len(series.t_s)
     first, end = round(start * n), round(stop * n)
@@ -111,17 +96,6 @@ def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:
 def _nearest(wanted: IntArray, times: IntArray) -> IntArray:
     """Return the places of the nearest of rising times, the earlier of two that are equally near."""
     return np.searchsorted(times[:-1] + np.diff(times) // 2, wanted)
-
-
-def _series_of_slices(slices: Slices) -> FrameSeries:
-    """Return slices in time order; slices of cylinders in turn, so that every part in time has all cylinders."""
-    diameter_mm, t_s = slices.diameter_mm, slices.numbers.astype(np.float64)
-    order = np.arange(len(t_s))
-    if np.isfinite(diameter_mm).all():
-        numbers = np.concatenate([np.arange(count) for count in np.unique(diameter_mm, return_counts=True)[1]])
-        order, t_s = np.lexsort((diameter_mm, numbers)), np.arange(len(t_s), dtype=np.float64)
-    frames, torque_nm = slices.differences[order, None], slices.torque_nm[order]
-    return FrameSeries("difference", (SLICE_SIDE,), t_s, frames, t_s, torque_nm, diameter_mm[order])
 
 
 def tool_of(recording: Recording, t_ns: IntArray, given_mm: float | None = None) -> tuple[float, Measured | None]:
@@ -190,32 +164,22 @@ def check_paths_differ(paths: Sequence[Path]) -> None:
 
 
 def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:
-    """Raise UserError for named series of the same frames, and for slices with the same frame.
+    """Raise UserError for named recordings of the same frames."""
+    refuse_copies((name, one.channels) for name, one in series)
+
+
+def refuse_copies(measurements: Iterable[tuple[str, FloatArray]]) -> None:
+    """Raise UserError for named measurements of the same values.
 
     A copy is no second measurement: intervals fitted to it are too narrow, and figures count frames twice.
     """
     known: dict[bytes, str] = {}
     copies = []
-    for name, one in series:
-        for part, frames in _measurements(name, one):
-            first = known.setdefault(hashlib.sha256(np.ascontiguousarray(frames).data).digest(), part)
-            if first is not part:
-                copies.append((part, first))
+    for name, frames in measurements:
+        first = known.setdefault(hashlib.sha256(np.ascontiguousarray(frames).data).digest(), name)
+        if first is not name:
+            copies.append((name, first))
     if copies:
         others = counted(len(copies) - 1, "more is such a copy", "more are such copies")
         more = f", and {others}" if len(copies) > 1 else ""
         raise UserError("{} equals {}{}; leave copies out: they add nothing".format(*copies[0], more))
-
-
-def _measurements(name: str, series: FrameSeries) -> Iterator[tuple[str, FloatArray]]:
-    """Yield the independent measurements with their names: each slice, or the whole recording."""
-    if series.kind == "raw":
-        yield name, series.channels
-        return
-    for i, (number, frame, diameter) in enumerate(zip(series.t_s, series.channels, series.diameter_mm, strict=True)):
-        if np.isfinite(diameter):
-            # The times of cylinders in turn are not their numbers.
-            nth = np.count_nonzero(series.diameter_mm[: i + 1] == diameter)
-            yield f"{name}: slice {nth} of {diameter:g} mm", frame
-        else:
-            yield f"{name}: Data_Slice_{number:g}.mat", frame

@@ -1,12 +1,14 @@
-"""Judges a recipe for a calibration by leave-one-out: each grip, twist, tool or level of torque in turn.
+"""Judges a recipe for a calibration by leave-one-out: each grip, twist or tool in turn.
 
 A recipe is fitted to the rest, and judged on the block that it has not seen. Neither frames nor torques of a block
 take part in its fit. Only the load cell's timing is measured on everything: it belongs to the load cell.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, Protocol, TypeVar
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
@@ -14,8 +16,8 @@ from shearloop.bank.mesh import load_mesh
 from shearloop.estimation import Calibration, FrameSeries, LoadTiming, Physics, adapt, fit
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
+from shearloop.tools.frame_series import Series
 from shearloop.tools.left_out_blocks import Block, Kind, after_twists, find_blocks, kept, tools_of
 from shearloop.tools.parallel import Executor
 from shearloop.words import counted
@@ -24,8 +26,27 @@ from shearloop.words import counted
 _ENOUGH_GRIPS = 3
 # A tool that is left out needs three others, which determine the gain over the diameter.
 _ENOUGH_TOOLS = 4
+NO_ESTIMATE = "No loaded frame has an estimate: see why with `shearloop evaluate CAL REC`."
 # Below this coverage of the 95 % intervals, the advice is more data.
 _LEAST_COVERAGE = 0.9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """The tracks of a block's spans by a calibration on the other rows.
+
+    Where the gain was adapted to twists, `before` are the same without it.
+    """
+
+    tracks: tuple[EstimateTrack, ...]
+    before: tuple[EstimateTrack, ...] = ()
+
+
+class Judge(Protocol):
+    """A recipe that judges a block by a calibration on the rest."""
+
+    def judge(self, recordings: Sequence[Any], block: Block, /) -> Judged:
+        """Return the block's tracks; raises CalibrationError naming it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,34 +60,47 @@ class Recipe:
     bank: Path | None = None
     mesh: Path | None = None
     timing_uncertainty_s: float = 0.0
-    full_range: bool = False
     nested: bool = False
 
     def fit(self, recordings: Sequence[FrameSeries]) -> Calibration:
         """Return the calibration of recordings; raises CalibrationError as `fit` does."""
         physics = Physics(bank=self.open_bank(), mesh=load_mesh(self.mesh) if self.mesh else None)
         timing = LoadTiming(uncertainty_s=self.timing_uncertainty_s)
-        return fit(
-            self.estimator, recordings, "left out", physics,
-            timing=timing, full_range=self.full_range, nested=self.nested,
-        )  # fmt: skip
+        return fit(self.estimator, recordings, "left out", physics, timing=timing, nested=self.nested)
 
     def open_bank(self) -> Bank | None:
         """Return the bank, None without one."""
         return Bank.open(self.bank) if self.bank else None
 
+    def judge(self, recordings: Sequence[FrameSeries], block: Block) -> Judged:
+        """Return the block's tracks; raises CalibrationError naming it."""
+        calibration = fit_without(self.fit, recordings, block)
+        if block.adapted is None:
+            return Judged(self._tracks(recordings, block, calibration))
+        adapted = _adapted(self, recordings, block, calibration)
+        before, after = (self._tracks(recordings, block, one) for one in (calibration, adapted))
+        return Judged(after, before)
+
+    def _tracks(
+        self, recordings: Sequence[FrameSeries], block: Block, calibration: Calibration
+    ) -> tuple[EstimateTrack, ...]:
+        numbers, bank = {span.recording for span in block.judged}, self.open_bank()
+        tracks = {number: estimate_series(calibration, recordings[number], bank) for number in sorted(numbers)}
+        return tuple(tracks[span.recording].between(span.first, span.stop) for span in block.judged)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeftOut:
-    """The names of the blocks, the tracks of each, and a sentence of advice.
+    """The names of the blocks, the tracks of each, a sentence of advice, and the name of the guess without a sensor.
 
     Where the gain was adapted to twists, `before` are the tracks of the same frames without it.
     """
 
-    kind: Kind
+    kind: str
     names: tuple[str, ...]
     tracks: tuple[tuple[EstimateTrack, ...], ...]
     advice: str
+    clock: str
     before: tuple[EstimateTrack, ...] = ()
 
     @property
@@ -87,70 +121,57 @@ class LeftOut:
         return {**figures_by_load(tracks, loaded_nm), **figures_of(tracks), **named}
 
 
-def judge_left_out(
-    kind: Kind,
-    recipe: Recipe,
-    recordings: Sequence[FrameSeries],
-    names: Sequence[str],
-    pool: Executor,
-    *,
-    adapt_twists: int = 0,
-) -> LeftOut:
-    """Fit a recipe without each block of named recordings, and judge it there.
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """What is fitted and judged: a recipe, recordings, and the blocks to leave out in turn.
+
+    `advice` returns a sentence on the tracks of the blocks. `clock` names the guess without a sensor.
+    """
+
+    kind: str
+    recipe: Judge
+    recordings: Sequence[FrameSeries]
+    blocks: Sequence[Block]
+    advice: Callable[[Sequence[Sequence[EstimateTrack]]], str]
+    clock: str = "a stopwatch with the mean twist"
+
+    def judge(self, pool: Executor) -> LeftOut:
+        """Fit and judge each block; raises CalibrationError where the rest determines no calibration."""
+        judged = list(pool.map(judge_block, (self.recipe, self.recordings), self.blocks))
+        tracks, names = tuple(one.tracks for one in judged), tuple(one.name for one in self.blocks)
+        before = tuple(track for one in judged for track in one.before)
+        return LeftOut(self.kind, names, tracks, self.advice(tracks), self.clock, before)
+
+
+def judge_block(shared: tuple[Judge, Sequence[FrameSeries]], block: Block) -> Judged:
+    """Return the tracks of a block, in a worker."""
+    recipe, recordings = shared
+    return recipe.judge(recordings, block)
+
+
+def plan_left_out(
+    kind: Kind, recipe: Recipe, recordings: Sequence[FrameSeries], names: Sequence[str], *, adapt_twists: int = 0
+) -> Plan:
+    """Return the plan for named recordings.
 
     With `adapt_twists` the gain is adapted to as many twists at the beginning of each judged recording, which are
-    neither fitted nor judged. Raises UserError for recordings without two such blocks, and CalibrationError where the
-    rest determines no calibration.
+    neither fitted nor judged. Raises UserError for recordings without two such blocks.
     """
     sides = [side for side in recordings[0].sides if all(side in one.sides for one in recordings)]
     chosen = tuple(one.select_sides(tuple(sides)) for one in recordings) if sides else tuple(recordings)
     blocks = find_blocks(kind, chosen, names)
-    before: list[EstimateTrack] = []
     if adapt_twists:
         blocks = after_twists(blocks, chosen, adapt_twists)
-        pairs = list(pool.map(judge_before_and_after, (recipe, chosen), blocks))
-        before = [track for tracks, _ in pairs for track in tracks]
-        tracks = tuple(tracks for _, tracks in pairs)
-    else:
-        tracks = tuple(pool.map(judge_block, (recipe, chosen), blocks))
-    advice = advice_on(kind, chosen, tracks, adapted=bool(adapt_twists))
-    return LeftOut(kind, tuple(one.name for one in blocks), tracks, advice, tuple(before))
+    return Plan(kind, recipe, chosen, blocks, partial(advice_on, kind, chosen, adapted=bool(adapt_twists)))
 
 
-def judge_block(shared: tuple[Recipe, Sequence[FrameSeries]], block: Block) -> tuple[EstimateTrack, ...]:
-    """Return the tracks of a block's spans by a calibration on the other rows; raises CalibrationError naming it."""
-    recipe, recordings = shared
-    return _tracks(recipe, recordings, block, fit_without(recipe, recordings, block))
+Fitted = TypeVar("Fitted")
 
 
-def judge_before_and_after(
-    shared: tuple[Recipe, Sequence[FrameSeries]], block: Block
-) -> tuple[tuple[EstimateTrack, ...], tuple[EstimateTrack, ...]]:
-    """Return `judge_block`, and the same after the gain is adapted to the block's first twists."""
-    recipe, recordings = shared
-    calibration = fit_without(recipe, recordings, block)
-    adapted = _adapted(recipe, recordings, block, calibration)
-    before, after = (_tracks(recipe, recordings, block, one) for one in (calibration, adapted))
-    return before, after
-
-
-def _tracks(
-    recipe: Recipe, recordings: Sequence[FrameSeries], block: Block, calibration: Calibration
-) -> tuple[EstimateTrack, ...]:
-    bank, estimated = recipe.open_bank(), dict[int, EstimateTrack]()
-    for number in sorted({span.recording for span in block.judged}):
-        track = estimate_series(calibration, recordings[number], bank)
-        if block.timed:
-            profile = TorqueProfile.fit(kept(recordings, block.timed))
-            track = replace(track, profile_nm=None if profile is None else profile.predict(recordings[number]))
-        estimated[number] = track
-    return tuple(estimated[span.recording].between(span.first, span.stop) for span in block.judged)
-
-
-def fit_without(recipe: Recipe, recordings: Sequence[FrameSeries], block: Block) -> Calibration:
+def fit_without(fit_rest: Callable[[list[Series]], Fitted], recordings: Sequence[Series], block: Block) -> Fitted:
     """Return the calibration on all but a block; raises CalibrationError, naming the block, where that fails."""
     try:
-        return recipe.fit(kept(recordings, block.fitted))
+        return fit_rest(kept(recordings, block.fitted))
     except CalibrationError as error:
         raise CalibrationError(f"without {block.name} the rest gives no calibration: {error}") from error
 
@@ -177,17 +198,23 @@ def advice_on(
     judged = [one for each in tracks for one in each]
     loaded = figures_by_load(judged)["loaded"]
     if loaded["baseline_ratio"] is None:
-        return "No loaded frame has an estimate: see why with `shearloop evaluate CAL REC`."
+        return NO_ESTIMATE
     if kind == "tools" and (n_tools := len(tools_of(recordings))) < _ENOUGH_TOOLS:
         return f"{counted(n_tools, 'tool')} only: record four, because three others tell the gain of one left out."
     if kind == "tools" and not adapted:
         return "Another tool has a gain of its own: correct it with `shearloop adapt` on two twists of known torque."
     if against := no_better_than_clock(judged):
         return against
-    if kind != "levels" and len(recordings) < _ENOUGH_GRIPS:
+    if len(recordings) < _ENOUGH_GRIPS:
         grips = "One grip" if len(recordings) == 1 else "Two grips"
         return f"{grips} only: record three, because the gain changes from grip to grip."
-    if (coverage := loaded["coverage_95"]) is not None and coverage < _LEAST_COVERAGE:
+    return advice_of_coverage(judged, kind)
+
+
+def advice_of_coverage(tracks: Sequence[EstimateTrack], kind: str) -> str:
+    """Return the advice where the sensor helps: by how many truths lie within the intervals."""
+    coverage = figures_by_load(tracks)["loaded"]["coverage_95"]
+    if coverage is not None and coverage < _LEAST_COVERAGE:
         return f"The intervals hold too few truths: record more {kind}."
     return "Nothing stands out: judge it on a recording of another day."
 
@@ -199,13 +226,12 @@ def sentences_of(result: LeftOut, loaded_nm: float = LOADED_NM) -> list[str]:
     if loaded["rmse_nm"] is None:
         return [f"{blocks}: too few loaded frames have an estimate.", result.advice]
     coverage, ratio = loaded["coverage_95"], loaded["baseline_ratio"]
-    clock = "the mean of the place in the sequence" if result.kind == "levels" else "a stopwatch with the mean twist"
     return [
         f"{blocks}: loaded frames have an RMSE of {_milli(loaded['rmse_nm'])} mN·m, intervals of "
         f"{_milli(loaded['interval_nm'])} mN·m (median), coverage {coverage:.2f} and a score of "
         f"{_milli(loaded['winkler_nm'])} mN·m.",
         f"Without a sensor: {_milli(loaded['baseline_zero_rmse_nm'])} mN·m for always 0, "
-        f"{_milli(loaded['baseline_profile_rmse_nm'])} mN·m for {clock}. Ratio to the better: "
+        f"{_milli(loaded['baseline_profile_rmse_nm'])} mN·m for {result.clock}. Ratio to the better: "
         f"{'unknown' if ratio is None else f'{ratio:.2f}'}.",
         *_before_adapting(result, loaded_nm),
         result.advice,

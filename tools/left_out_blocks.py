@@ -1,4 +1,4 @@
-"""What is left out of a fit: each grip, twist, tool or level of torque in turn, as rows of the recordings."""
+"""What is left out of a fit: each grip, twist or tool in turn, as rows of the recordings."""
 
 import itertools
 from collections.abc import Sequence
@@ -7,16 +7,16 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.arrays import BoolArray
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.fingertip_validator import segment_grip
 from shearloop.estimation.gain import find_twists
-from shearloop.estimation.left_out import NEAR_LEVEL, later_levels
 from shearloop.estimation.values import Measured, distinct
+from shearloop.tools.frame_series import Series
 from shearloop.words import counted
 
-Kind: TypeAlias = Literal["grips", "twists", "levels", "tools"]
+Kind: TypeAlias = Literal["grips", "twists", "tools"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
@@ -46,22 +46,13 @@ class Block:
 
 def find_blocks(kind: Kind, recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
     """Return the blocks of a kind; raises UserError for recordings that have fewer than two."""
-    is_raw = all(one.kind == "raw" for one in recordings)
-    if kind == "levels":
-        if is_raw:
-            raise UserError("twists of a recording have no levels; leave out grips, twists or tools")
-        return _levels(recordings)
-    if not is_raw:
-        raise UserError(f"slices show no {kind}; use --leave-out levels")
     if kind == "twists":
         return _twists(recordings, names)
     return _grips(recordings, names) if kind == "grips" else _tools(recordings, names)
 
 
 def usual_kind(recordings: Sequence[FrameSeries]) -> Kind:
-    """Return the widest kind that recordings allow: tools, else grips, else twists; of slices, levels."""
-    if recordings[0].kind != "raw":
-        return "levels"
+    """Return the widest kind that recordings allow: tools, else grips, else twists."""
     if len(tools_of(recordings)) > 1 and all(one.tool_mm is not None for one in recordings):
         return "tools"
     return "grips" if len(recordings) > 1 else "twists"
@@ -136,46 +127,9 @@ def _twist_edges(series: FrameSeries) -> list[int]:
     return [grip.start, *middles, grip.stop]
 
 
-def _levels(recordings: Sequence[FrameSeries]) -> list[Block]:
-    """Return a block for each level of later slices: fitted to earlier slices of other levels.
-
-    The stopwatch knows the earlier slices of all levels: it reads the place in the sequence, and no sensor.
-    """
-    torque = np.concatenate([_torque_of_slices(one) for one in recordings])
-    places = [(number, row) for number, one in enumerate(recordings) for row in range(len(one.t_s))]
-    known = np.flatnonzero(np.isfinite(torque))
-    parts = later_levels(torque[known]) if len(known) else []
-    if not parts:
-        raise UserError(f"{counted(len(known), 'slice')} with a torque cannot be split; record 20 or more")
-    blocks: list[Block] = []
-    near_nm = NEAR_LEVEL * float(np.ptp(torque[known]))
-    for kept, later in parts:
-        own = torque[known[later]]
-        if np.abs(torque[known[kept], None] - own).min() <= near_nm:
-            raise UserError("too few slices remain without those of one level; record ten levels, three times or more")
-        level = f"slices of {1e3 * float(own.mean()):.3g} mN·m after the first {int(kept[-1]) + 1}"
-        earlier = known[: int(kept[-1]) + 1]
-        fitted = _rows_of(recordings, np.isin(np.arange(len(torque)), known[kept]))
-        timed = _rows_of(recordings, np.isin(np.arange(len(torque)), earlier))
-        spans = tuple(Span(number, row, row + 1) for number, row in (places[one] for one in known[later].tolist()))
-        blocks.append(Block(level, fitted, spans, timed))
-    return blocks
-
-
-def _torque_of_slices(series: FrameSeries) -> FloatArray:
-    """Return the (n,) torques of slices, NaN where a slice is of a cylinder: these are not fitted to a torque."""
-    return np.where(np.isfinite(series.diameter_mm), np.nan, series.torque_at_frames())
-
-
-def _rows_of(recordings: Sequence[FrameSeries], rows: BoolArray) -> tuple[BoolArray, ...]:
-    """Return rows of all recordings together as rows (n,) of each."""
-    ends = np.cumsum([len(one.t_s) for one in recordings])
-    return tuple(np.split(rows, ends[:-1]))
-
-
-def kept(recordings: Sequence[FrameSeries], rows: Sequence[BoolArray]) -> list[FrameSeries]:
+def kept(recordings: Sequence[Series], rows: Sequence[BoolArray]) -> list[Series]:
     """Return the recordings with only these rows and the torques nearest to them; drop recordings without rows."""
-    found: list[FrameSeries] = []
+    found: list[Series] = []
     for one, own in zip(recordings, rows, strict=True):
         if not own.any():
             continue

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from shearloop.cli.options import add_json, add_option, read_judged
+from shearloop.cli.options import add_json, add_option, judges_slices, read_judged
 from shearloop.cli.terminal import print_result
 from shearloop.words import counted
 
@@ -24,6 +24,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.tools.evaluate import estimate_series
     from shearloop.tools.frame_series import check_no_copies
 
+    judges_slices(args.calibration, args.recordings)
     calibration, named = read_judged(args.calibration, args.recordings)
     check_no_copies([(str(path), one) for path, one in named])
     bank = Bank.open(args.bank) if args.bank else None

@@ -1,21 +1,23 @@
 """`shearloop calibrate REC… --estimator NAME --out CAL`: fit an estimator to recordings."""
 
 import argparse
-import math
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import add_json, add_option, add_recipe, check_recipe, time_range
+from shearloop.cli.options import add_json, add_option, add_recipe, check_recipe, of_slices, time_range
 from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
 from shearloop.estimation.estimator_names import DEFAULT
 from shearloop.tools.outputs import check_overwrite
 
 if TYPE_CHECKING:
-    from shearloop.estimation import Calibration
+    from collections.abc import Callable
+
+    from shearloop.estimation import Calibration, Physics
     from shearloop.estimation.interval_regressor import IntervalRegressor
     from shearloop.tools.calibrate import CalibrationResult
+    from shearloop.tools.leave_out import Plan
 
 # The refits without each block may take about this long, estimated from the time of one fit.
 LEFT_OUT_WITHIN_S = 20.0
@@ -41,51 +43,78 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.bank_file import Bank
     from shearloop.bank.mesh import load_mesh
     from shearloop.estimation import Physics
-    from shearloop.estimation.calibration import ARCHIVE_MAGIC
-    from shearloop.tools.calibrate import calibrate
+    from shearloop.estimation.archive import ARCHIVE_MAGIC
 
     check_recipe(args, args.recordings)
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
+    made = _calibrate_slices if of_slices(args.recordings) else _calibrate_recordings
+    figures, sentences = made(args, physics)
+    sentences.append(f"Written to {args.out}.")
+    return print_result({"path": str(args.out), **figures}, sentences, as_json=args.json)
+
+
+def _calibrate_recordings(args: argparse.Namespace, physics: "Physics") -> tuple[dict[str, object], list[str]]:
+    """Write a calibration on recordings; return its figures, and what the user should know of it."""
+    from shearloop.tools.calibrate import calibrate
+    from shearloop.tools.leave_out import Recipe, plan_left_out
+    from shearloop.tools.left_out_blocks import usual_kind
+
     result = calibrate(
         args.recordings, args.estimator, physics, time_range=args.time_range, sides=args.sides,
-        load_cell_delay_s=args.load_cell_delay_s, assume_full_range=args.assume_full_range, tool_mm=args.tool_mm,
+        load_cell_delay_s=args.load_cell_delay_s, tool_mm=args.tool_mm,
     )  # fmt: skip
-    if args.assume_full_range and result.calibration.torque is None:
-        raise UserError("--assume-full-range is about torques, and these slices have diameters only; leave it out")
     result.calibration.save(args.out)
-    judged, said = _judge_left_out(args, result)
-    sentences = [*sentences_of(result), *said, f"Written to {args.out}."]
-    return print_result({"path": str(args.out), **result.figures(), **judged}, sentences, as_json=args.json)
+    figures, sentences = result.figures(), sentences_of(result)
+    if result.calibration.torque is None:
+        return {**figures, "left_out": None}, sentences
+    kind = usual_kind(result.parts)
+    recipe = Recipe(args.estimator, args.bank, args.mesh, result.timing.uncertainty_s)
+    names = [path.name for path in args.recordings]
+    judged, said = _judge_left_out(args, kind, result.fit_s, lambda: plan_left_out(kind, recipe, result.parts, names))
+    return {**figures, **judged}, sentences + said
 
 
-def _judge_left_out(args: argparse.Namespace, result: "CalibrationResult") -> tuple[dict[str, object], list[str]]:
+def _calibrate_slices(args: argparse.Namespace, physics: "Physics") -> tuple[dict[str, object], list[str]]:
+    """Write a calibration on folders of slices; return its figures, and what the user should know of it."""
+    from shearloop.studies.slices.calibrate import calibrate_slices
+    from shearloop.studies.slices.leave_out import LEVELS, SliceRecipe, plan_levels
+
+    result = calibrate_slices(
+        args.recordings, args.estimator, physics,
+        time_range=args.time_range, assume_full_range=args.assume_full_range,
+    )  # fmt: skip
+    result.calibration.save(args.out)
+    figures, sentences = result.figures(), result.sentences()
+    if result.calibration.torque is None:
+        return {**figures, "left_out": None}, sentences
+    recipe = SliceRecipe(args.estimator, args.bank, args.mesh, args.assume_full_range)
+    judged, said = _judge_left_out(args, LEVELS, result.fit_s, lambda: plan_levels(LEVELS, recipe, result.parts))
+    return {**figures, **judged}, sentences + said
+
+
+def _judge_left_out(
+    args: argparse.Namespace, kind: str, fit_s: float, plan_of: "Callable[[], Plan]"
+) -> tuple[dict[str, object], list[str]]:
     """Return the figures of the blocks left out, and the advice for the user.
 
     Where the refits would take longer than some seconds, that is the command; without two blocks, it is why.
     """
     from shearloop.bank.errors import CalibrationError
-    from shearloop.tools import leave_out, left_out_blocks
+    from shearloop.tools.leave_out import sentences_of as sentences_of_left_out
     from shearloop.tools.parallel import SerialExecutor
 
-    if result.calibration.torque is None:
-        return {"left_out": None}, []
-    kind = left_out_blocks.usual_kind(result.parts)
-    recipe = leave_out.Recipe(
-        args.estimator, args.bank, args.mesh, result.timing.uncertainty_s, full_range=args.assume_full_range
-    )
-    names = [path.name for path in args.recordings]
     try:
-        blocks = left_out_blocks.find_blocks(kind, result.parts, names if result.calibration.kind == "raw" else [])
-        if len(blocks) * result.fit_s > LEFT_OUT_WITHIN_S:
+        plan = plan_of()
+        if len(plan.blocks) * fit_s > LEFT_OUT_WITHIN_S:
             command = shlex.join(_evaluate_command(args, kind))
             return {"left_out": None, "left_out_command": command}, [f"Judge it by {kind} left out: {command}"]
-        found = leave_out.judge_left_out(kind, recipe, result.parts, names, SerialExecutor())
+        found = plan.judge(SerialExecutor())
     except (UserError, CalibrationError) as error:
         return {"left_out": None, "left_out_refused": str(error)}, [f"Not judged by {kind} left out: {error}."]
-    return {"left_out": found.figures()}, leave_out.sentences_of(found)
+    return {"left_out": found.figures()}, sentences_of_left_out(found)
 
 
 def _evaluate_command(args: argparse.Namespace, kind: str) -> list[str]:
@@ -112,8 +141,6 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
     sentences = [f"Estimator {calibration.estimator.name}, {outputs} from {result.frames} frames of the {sides} side."]
     if regressor is not None and regressor.misses_loads:
         sentences.append(_misses_loads(regressor, calibration))
-    if regressor is not None and result.reads_beyond is False:
-        sentences.append(_range_ends(regressor))
     known = [f"{abs(one.delay_s):.2f} s {'before' if one.delay_s < 0 else 'after'}" for one in timing.delays if one]
     if known:
         probably = "probably " if timing.uncertainty_s else ""
@@ -127,23 +154,22 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
             "Record more changes of load, such as ten twists, or confirm the load cell's clock with "
             "--load-cell-delay-s 0."
         )
-    if calibration.kind == "raw":
-        if result.tool_mm is not None:
-            sentences.append(f"The tool's diameter is {result.tool_mm:.3g} mm.")
-        elif (law := calibration.tools) is not None:
-            sentences.append(
-                f"The tools' diameters are {law.low_mm:.3g} to {law.high_mm:.3g} mm. Before a twist of known torque, "
-                f"the torque on another tool may be off by a factor of {law.factor:.2g} either way, and the interval "
-                "shows it; correct it with `shearloop adapt`."
-            )
-        elif result.tools:
-            named = " and ".join(f"{one.value:.3g}" for one in result.tools)
-            sentences.append(f"The tools of {named} mm have the torque in common.")
-            if calibration.diameter is None:
-                sentences.append("Diameters are not estimated: that takes recordings of three.")
-        else:
-            unnamed = "The recordings do not name one tool's diameter, and on another tool the torque would be wrong"
-            sentences.append(f"{unnamed}: name it with --tool-mm.")
+    if result.tool_mm is not None:
+        sentences.append(f"The tool's diameter is {result.tool_mm:.3g} mm.")
+    elif (law := calibration.tools) is not None:
+        sentences.append(
+            f"The tools' diameters are {law.low_mm:.3g} to {law.high_mm:.3g} mm. Before a twist of known torque, "
+            f"the torque on another tool may be off by a factor of {law.factor:.2g} either way, and the interval "
+            "shows it; correct it with `shearloop adapt`."
+        )
+    elif result.tools:
+        named = " and ".join(f"{one.value:.3g}" for one in result.tools)
+        sentences.append(f"The tools of {named} mm have the torque in common.")
+        if calibration.diameter is None:
+            sentences.append("Diameters are not estimated: that takes recordings of three.")
+    else:
+        unnamed = "The recordings do not name one tool's diameter, and on another tool the torque would be wrong"
+        sentences.append(f"{unnamed}: name it with --tool-mm.")
     return sentences
 
 
@@ -156,23 +182,4 @@ def _misses_loads(regressor: "IntervalRegressor", calibration: "Calibration") ->
         "It does not see the load: too many of the loads left out for validation lay outside their intervals. So every "
         f"interval spans all calibrated torques, {low_nm:g} to {high_nm:g} N·m, and the torque is useless. "
         f"{cure} a grip in which the tool twists the gel more."
-    )
-
-
-def _range_ends(regressor: "IntervalRegressor") -> str:
-    span = regressor.range
-    limits = (span.low, span.high, span.low_end, span.high_end, span.lowest, span.highest)
-    low_nm, high_nm, below_nm, above_nm, lowest_nm, highest_nm = (round(limit, 3) + 0.0 for limit in limits)
-    ends = (("below", below_nm, lowest_nm), ("above", above_nm, highest_nm))
-    reach = [
-        f"of estimates {side} {end_nm:g} N·m reach to {reached_nm:g} N·m at least"
-        for side, end_nm, reached_nm in ends
-        if math.isfinite(end_nm)
-    ]
-    where = f"intervals {', and '.join(reach)}"
-    if below_nm >= high_nm and above_nm <= low_nm:
-        where = f"all intervals reach from {lowest_nm:g} to {highest_nm:g} N·m at least, and the torque is useless"
-    return (
-        f"Torques beyond the calibrated {low_nm:g} to {high_nm:g} N·m may be estimated within them, as the outermost "
-        f"were when they were left out: {where}. Calibrate on all torques that will occur, and add --assume-full-range."
     )

@@ -172,8 +172,6 @@ def _shared_search(bank: Bank, matching: str) -> BankSearch:
 
 def _load(path: Path, wanted: str | None) -> Calibration:
     calibration = Calibration.load(path)
-    if calibration.kind != "raw":
-        raise UserError(f"{path} was made from slices; the daemon has raw frames: calibrate on a recording of them")
     if wanted not in (None, calibration.estimator.name):
         raise UserError(
             f"{path} is a calibration of the estimator {calibration.estimator.name}, and {wanted} is configured; "

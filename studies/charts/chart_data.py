@@ -15,6 +15,9 @@ from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.emulators.synthetic_frames import LARGEST_TORQUE_NM, Synthesiser, TwistProgramme
 from shearloop.estimation import Calibration, FrameSeries, Physics, fit, measure_timing
 from shearloop.estimation.estimator_names import EstimatorName
+from shearloop.studies.slices.calibration import SliceCalibration
+from shearloop.studies.slices.fitting import fit_slices
+from shearloop.studies.slices.series import SliceSeries, read_slices
 from shearloop.tools.bank_config import load_fingertip
 from shearloop.tools.banks import OWN_FINGERTIP, Grid, cached_bank
 from shearloop.tools.frame_series import part_of, read_series
@@ -48,14 +51,18 @@ def own_fingertip(mesh_size_cm: float) -> Fingertip:
 
 def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:
     """Return each recording's earlier part, a `share` of it, and later part; synthetic recordings without paths."""
-    named = [(path.name or str(path), series) for path in paths for series in read_series(path)]
+    named: list[tuple[str, FrameSeries]] = []
+    for path in paths:
+        read = read_slices(path) if path.is_dir() else read_series(path)
+        named += [(path.name or str(path), series) for series in read]
     if not named:
         named = [("synthetic slices", synthetic_slices(scratch)), ("synthetic stream", synthetic_stream(scratch))]
     found = []
     for name, series in named:
+        of_slices = isinstance(series, SliceSeries)
         # Slices of a known diameter are not of a known torque.
-        if series.torque_t_s.size and (series.kind == "raw" or not np.isfinite(series.diameter_mm).any()):
-            kind, warm_up = ("stream", WARM_UP_FRAMES) if series.kind == "raw" else ("slices", 0)
+        if series.torque_t_s.size and not (of_slices and np.isfinite(series.diameter_mm).any()):
+            kind, warm_up = ("slices", 0) if of_slices else ("stream", WARM_UP_FRAMES)
             start = max(round(share * len(series.t_s)) - warm_up, 0)
             future = series.between(start, len(series.t_s))
             found.append(Split(f"{name}, {kind}, first {share:.0%}", part_of(series, 0, share), future, series))
@@ -66,14 +73,17 @@ def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:
 
 def fitted(
     split: Split, names: Sequence[EstimatorName], physics: Physics, sides: tuple[str, ...] | None = None
-) -> list[Calibration]:
+) -> list[Calibration | SliceCalibration]:
     """Return the calibrations that the past allows, by default of all sides; print the reason for each missing one."""
     past, of = (split.past, "") if sides is None else (split.past.select_sides(sides), f", {' and '.join(sides)}")
-    found = []
+    found: list[Calibration | SliceCalibration] = []
     for name in names:
         try:
-            timing = measure_timing([past], [split.past])
-            found.append(fit(name, [past], split.title, physics, timing=timing))
+            if isinstance(past, SliceSeries):
+                found.append(fit_slices(name, [past], split.title, physics))
+            else:
+                timing = measure_timing([past], [split.past])
+                found.append(fit(name, [past], split.title, physics, timing=timing))
         except BankError as error:
             print(f"{split.title}: {name}{of} is left out: {error}")
     return found
@@ -101,19 +111,19 @@ class SyntheticSlices:
         self._synthesiser = Synthesiser(bank)
         self._idle = self._mean_frame(3.2, 1.5, 0.0)
 
-    def series(self, places: Sequence[tuple[float, float, float]], torque_nm: FloatArray) -> FrameSeries:
+    def series(self, places: Sequence[tuple[float, float, float]], torque_nm: FloatArray) -> SliceSeries:
         """Return the slices of n places (k and σ in cm, grip from 0 to 1) with these torques (n,)."""
         n = len(places)
         frames = np.array([np.abs(self._mean_frame(*place) - self._idle) for place in places])
         t_s = np.arange(float(n))
-        return FrameSeries("difference", ("right",), t_s, frames[:, None], t_s, torque_nm, np.full(n, np.nan))
+        return SliceSeries(("right",), t_s, frames[:, None], t_s, torque_nm, np.full(n, np.nan))
 
     def _mean_frame(self, k: float, sigma: float, grip: float) -> FloatArray:
         lines = [self._synthesiser.line(k, sigma, grip) for _ in range(_AVERAGED_FRAMES)]
         return np.asarray(np.mean([PAPER_TABLE.channels_of_line(line) for line in lines], axis=0))
 
 
-def synthetic_slices(scratch: Path) -> FrameSeries:
+def synthetic_slices(scratch: Path) -> SliceSeries:
     """Return 49 differences like the paper's slices: five repeats of ten torques."""
     levels = np.tile(np.linspace(0.01, LARGEST_TORQUE_NM, 10), 5)[1:]
     torque = np.clip(levels + np.random.default_rng((0, 1)).normal(0.0, 0.003, 49), 0.0, LARGEST_TORQUE_NM)
@@ -137,4 +147,4 @@ def synthetic_stream(scratch: Path) -> FrameSeries:
         synthesiser = Synthesiser(played_bank(scratch), seed=100 * side)
         for i, (sigma, grip) in enumerate(zip(sigma_of(torque), grips, strict=True)):
             channels[i, side] = PAPER_TABLE.channels_of_line(synthesiser.line(k, sigma, grip))
-    return FrameSeries("raw", ("right", "left"), t_s, channels, t_s, torque, np.full(len(t_s), np.nan))
+    return FrameSeries(("right", "left"), t_s, channels, t_s, torque, np.full(len(t_s), np.nan))

@@ -18,6 +18,9 @@ from shearloop.estimation.bank_match import ElectrodeNumbering
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.fingertip_validator import channel_noise
 from shearloop.studies.charts.chart_data import Split, fitted
+from shearloop.studies.slices.calibration import SliceCalibration
+from shearloop.studies.slices.reader import SliceReader
+from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.bank_design import residual_noise
 from shearloop.tools.drawing import figure, look
 from shearloop.tools.evaluate import values_of
@@ -54,7 +57,7 @@ class FrameFault:
         """
         series, channels = scene.series, self.change(scene, level, rng)
         usable = channels == series.channels if self.reported else None
-        magnitudes = np.abs(channels) if series.kind == "difference" else channels
+        magnitudes = np.abs(channels) if isinstance(series, SliceSeries) else channels
         return replace(series, channels=magnitudes), usable
 
 
@@ -72,7 +75,7 @@ def _lost(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatArr
     """Let electrodes read one ADC step."""
     lost = lost_channels(rng.choice(PAPER_TABLE.n_electrodes, int(level), replace=False))
     channels = scene.series.channels.copy()
-    channels[:, :, lost] = ADC_STEP_V - scene.idle[:, lost] if scene.series.kind == "difference" else ADC_STEP_V
+    channels[:, :, lost] = ADC_STEP_V - scene.idle[:, lost] if isinstance(scene.series, SliceSeries) else ADC_STEP_V
     return channels
 
 
@@ -82,7 +85,7 @@ def _saturated(scene: FaultScene, level: float, _: np.random.Generator) -> Float
     if not level:
         return channels
     rail = np.quantile(scene.idle, 1.0 - level)
-    if scene.series.kind == "raw":
+    if not isinstance(scene.series, SliceSeries):
         return np.minimum(channels, rail)
     # Differences have lost their sign: let half of the channels rise.
     signs = np.where(np.arange(PAPER_TABLE.n_channels) % 2, -1.0, 1.0)
@@ -93,7 +96,7 @@ def _drift(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatAr
     """Move the baseline over the recording by a random pattern of RMS `level` of the idle frame."""
     channels = scene.series.channels
     pattern = rng.normal(0.0, 1.0, channels.shape[1:]) * scene.idle * level
-    if scene.series.kind == "raw":
+    if not isinstance(scene.series, SliceSeries):
         pattern = np.linspace(0.5, 1.0, len(channels))[:, None, None] * pattern
     return channels + pattern
 
@@ -101,7 +104,7 @@ def _drift(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatAr
 def _gain(scene: FaultScene, level: float, _: np.random.Generator) -> FloatArray:
     """Raise all channels by this share, as when the gel dries or the current source drifts."""
     channels = scene.series.channels
-    return channels + level * (scene.idle if scene.series.kind == "difference" else channels)
+    return channels + level * (scene.idle if isinstance(scene.series, SliceSeries) else channels)
 
 
 def _turned(scene: FaultScene, level: float, _: np.random.Generator) -> FloatArray:
@@ -200,9 +203,19 @@ def judge_level(estimates: Sequence[Estimate], truth_nm: FloatArray, level: floa
     return FaultLevel(level, float(error.mean()), float(error.std()), valid, false_valid)
 
 
-def estimate_frames(tracker: Session, series: FrameSeries, usable: BoolArray | None = None) -> list[Estimate]:
+def reading_with(calibration: Calibration | SliceCalibration, bank: Bank | None) -> Session | SliceReader:
+    """Return what estimates with a calibration."""
+    if isinstance(calibration, SliceCalibration):
+        return SliceReader(calibration, bank)
+    return Session(calibration, bank)
+
+
+def estimate_frames(
+    tracker: Session | SliceReader, series: FrameSeries, usable: BoolArray | None = None
+) -> list[Estimate]:
     """Return the estimates of frames with usable channels (n, m, 896), as in a live session that starts with them."""
-    tracker.reset()
+    if isinstance(tracker, Session):
+        tracker.reset()
     masks = repeat(None) if usable is None else usable
     frames = zip(series.t_s.tolist(), series.channels, masks, strict=False)
     return [tracker.estimate(TactileFrame.of(*one)) for one in frames]
@@ -211,7 +224,7 @@ def estimate_frames(tracker: Session, series: FrameSeries, usable: BoolArray | N
 def true_torques(series: FrameSeries) -> FloatArray:
     """Return the (n,) true torques of a series, NaN for frames that do not count."""
     torque = series.torque_at_frames()
-    return balanced(torque) if series.kind == "raw" else torque
+    return torque if isinstance(series, SliceSeries) else balanced(torque)
 
 
 def balanced(truth_nm: FloatArray) -> FloatArray:
@@ -225,13 +238,13 @@ def balanced(truth_nm: FloatArray) -> FloatArray:
     return np.where(loaded | np.isin(np.arange(len(truth_nm)), kept), truth_nm, np.nan)
 
 
-def sweep(tracker: Session, scene: FaultScene, fault: FrameFault) -> FaultCurve:
+def sweep(tracker: Session | SliceReader, scene: FaultScene, fault: FrameFault) -> FaultCurve:
     """Return an estimator's curve through one fault; slices are drawn several times, as chance picks electrodes."""
     truth = true_torques(scene.series)
     levels = []
     for level in fault.levels:
         estimates: list[Estimate] = []
-        draws = _DRAWS if level > fault.levels[0] and scene.series.kind == "difference" else 1
+        draws = _DRAWS if level > fault.levels[0] and isinstance(scene.series, SliceSeries) else 1
         for draw in range(draws):
             estimates += estimate_frames(tracker, *fault.apply(scene, level, np.random.default_rng((5, draw))))
         levels.append(judge_level(estimates, np.tile(truth, draws), level))
@@ -252,7 +265,7 @@ def misaligned(
         calibrations = fitted(replace(split, past=late), [name], physics)
         if not calibrations:
             return FaultLevel(shift_s)
-        estimates = estimate_frames(Session(calibrations[0], physics.bank), judged)
+        estimates = estimate_frames(reading_with(calibrations[0], physics.bank), judged)
         return judge_level(estimates, true_torques(judged), shift_s)
 
     fault = "calibrated on misaligned times"
@@ -273,7 +286,7 @@ def scene_for(split: Split, bank: Bank) -> FaultScene:
     series = shortened(split.future)
     rng = np.random.default_rng(7)
     foreign = np.array([layer[rng.permutation(PAPER_TABLE.n_channels)] for layer in series.channels.mean(axis=0)])
-    if series.kind == "difference":
+    if isinstance(series, SliceSeries):
         idle = np.abs(bank.homogeneous) * (MEAN_V / float(np.abs(bank.homogeneous).mean()))
         noise = residual_noise(split.past.channels[:, 0])
         return FaultScene(series, np.tile(idle, (len(series.sides), 1)), noise, foreign)
@@ -289,10 +302,10 @@ def sweeps(
     return [one for curves in executor.map(sweep_estimator, shared, fitted(split, names, physics)) for one in curves]
 
 
-def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration) -> list[FaultCurve]:
+def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration | SliceCalibration) -> list[FaultCurve]:
     """Return one estimator's curves through all faults; a worker opens the bank's file by its path."""
     scene, path = shared
-    tracker = Session(calibration, Bank.open(path))
+    tracker = reading_with(calibration, Bank.open(path))
     return [sweep(tracker, scene, fault) for fault in FAULTS]
 
 

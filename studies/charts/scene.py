@@ -10,6 +10,8 @@ from matplotlib.axes import Axes
 
 from shearloop.bank.design import ALLOWED, Design, DesignChoice, design_bank, simulated_frames
 from shearloop.studies.charts.chart_data import Split, own_fingertip
+from shearloop.studies.slices.scene import scene_of_slices
+from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.bank_config import load_fingertip
 from shearloop.tools.bank_design import doubts, scene_of
 from shearloop.tools.banks import OWN_FINGERTIP
@@ -26,7 +28,8 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
     Recordings are of the paper's fingertip. On the others the same grip is simulated with the same share of noise.
     """
     titles = [split.title.split(",", maxsplit=1)[0] for split in parts]
-    scenes = [scene_of(split.whole) for split in parts]
+    wholes = [split.whole for split in parts]
+    scenes = [scene_of_slices(one) if isinstance(one, SliceSeries) else scene_of(one) for one in wholes]
     found = list(executor.map(design_bank, own_fingertip(_MESH_SIZE_CM), scenes))
     written = []
     for title, design in zip(titles, found, strict=True):

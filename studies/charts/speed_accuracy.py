@@ -18,7 +18,6 @@ from shearloop.bank.mesh import Mesh
 from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.estimation import Calibration, FrameSeries, Physics
 from shearloop.estimation.bank_match import NOT_TURNED, BankMatcher, RefinedMatcher
-from shearloop.estimation.curve import ranked_channels
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator import PaperEstimator
 from shearloop.estimation.estimator_names import EstimatorName
@@ -28,6 +27,10 @@ from shearloop.estimation.ridge import Ridge
 from shearloop.studies.charts.chart_data import Split, fitted
 from shearloop.studies.charts.forward_methods import CELLS, SolvedForward, forward_methods
 from shearloop.studies.charts.simulated_loop import GAIN, LOOPS, TrackingError, tracking_errors
+from shearloop.studies.slices.calibration import SliceCalibration
+from shearloop.studies.slices.curve import ranked_channels
+from shearloop.studies.slices.evaluate import estimate_slices
+from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools import drawing
 from shearloop.tools.drawing import LINES, MARKS, SHADES
 from shearloop.tools.evaluate import estimate_series, values_of
@@ -87,11 +90,14 @@ def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> l
 
 def estimators(split: Split, physics: Physics, sides: tuple[str, ...]) -> Iterator[TorqueMethod]:
     """Yield the package's estimators on these sides as they run live; print why one cannot be fitted."""
-    count = f", {sides[0] if len(sides) == 1 else 'both'}" if split.past.kind == "raw" else ""
+    count = f", {sides[0] if len(sides) == 1 else 'both'}" if not isinstance(split.past, SliceSeries) else ""
     family = "estimator, two fingertips" if len(sides) > 1 else "estimator"
 
-    def run(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
-        track = estimate_series(calibration, split.future, physics.bank)
+    def run(calibration: Calibration | SliceCalibration) -> tuple[FloatArray, FloatArray]:
+        if isinstance(calibration, SliceCalibration) and isinstance(split.future, SliceSeries):
+            track = estimate_slices(calibration, split.future, physics.bank)
+        elif isinstance(calibration, Calibration):
+            track = estimate_series(calibration, split.future, physics.bank)
         return values_of(track.estimates)[0], track.latency_ms
 
     for calibration in fitted(split, _ESTIMATORS, physics, sides):
@@ -191,7 +197,7 @@ _JOINED = {"zero lag, bank of rank r": "rank", "regression on the best n channel
 def compare_methods(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> list[MeasuredMethod]:
     """Return every method's time and error on a split; print where none can be judged."""
     physics, sides = Physics(bank, mesh), split.past.sides
-    if split.past.kind == "difference":
+    if isinstance(split.past, SliceSeries):
         methods = [*matchers(split, bank), *fewer_channels(split), *estimators(split, physics, sides[:1])]
     else:
         chosen = dict.fromkeys((sides[:1], sides))

@@ -16,7 +16,7 @@ from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.bank.mesh import Mesh
 from shearloop.errors import UserError
-from shearloop.estimation import Calibration, FrameSeries, Physics, Session, TactileFrame, bank_match, fit
+from shearloop.estimation import Calibration, Physics, TactileFrame, bank_match
 from shearloop.estimation.bank_match import NOT_TURNED
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.studies.charts import skin_loop
@@ -31,15 +31,21 @@ from shearloop.studies.charts.fault_sweeps import (
     label_panel,
     misaligned,
     offset_places,
+    reading_with,
     sweeps,
     sweeps_figure,
 )
 from shearloop.studies.charts.speed_accuracy import matched_sigma, parabola
+from shearloop.studies.slices.calibration import SliceCalibration
+from shearloop.studies.slices.fitting import fit_slices
+from shearloop.studies.slices.reader import SliceReader
+from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.banks import Grid
 from shearloop.tools.drawing import figure, look, save, slug
 from shearloop.tools.evaluate import values_of
 from shearloop.tools.parallel import Executor
 
+AnyCalibration: TypeAlias = Calibration | SliceCalibration
 STEPS = 25
 SLICE_NAMES: tuple[EstimatorName, ...] = ("paper", "bank", "regression", "reconstruction", "motion_regression")
 STREAM_NAMES: tuple[EstimatorName, ...] = ("bank", "regression", "motion_regression")
@@ -49,21 +55,21 @@ SHIFTS_S = (-0.54, -0.27, -0.13, 0.0, 0.13, 0.27, 0.54, 1.08)
 def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path, executor: Executor) -> list[Path]:
     """Measure, draw and write a chart per recording, the checks of slices, the bank's rim, and the loop on the skin."""
     physics, written = Physics(bank, mesh), []
-    names = {"raw": STREAM_NAMES, "difference": SLICE_NAMES}
     for number, split in enumerate(parts, start=1):
         _report(f"{split.title} ({number} of {len(parts)})")
-        curves = sweeps(split, names[split.past.kind], physics, bank, executor)
-        if split.past.kind == "raw":
+        of_slices = isinstance(split.past, SliceSeries)
+        curves = sweeps(split, SLICE_NAMES if of_slices else STREAM_NAMES, physics, bank, executor)
+        if not of_slices:
             curves += misaligned(split, STREAM_NAMES, physics, SHIFTS_S)
         if not curves:
             raise UserError(
                 f"{split.title}: no estimator can be calibrated on it (see above); chart a longer recording"
             )
         written += _written(f"stability-{slug(split.title)}", split.title, curves, out)
-        if split.past.kind == "difference":
+        if of_slices:
             written += _of_slices(split, bank, mesh, out, executor)
     _report("the rim of the bank")
-    synthetic = next(one for one in splits([], 0.6, scratch) if one.past.kind == "difference")
+    synthetic = next(one for one in splits([], 0.6, scratch) if isinstance(one.past, SliceSeries))
     curves = list(sweep_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
     written += _written("stability-rims", "the rim of the bank, on synthetic slices", curves, out)
     _report("the loop on the skin")
@@ -109,7 +115,7 @@ class ContinuityWalk:
     hops: int
 
 
-def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[ContinuityWalk]:
+def walks(split: Split, bank: Bank, calibrations: Sequence[AnyCalibration]) -> list[ContinuityWalk]:
     """Return the torques of each estimator along the straight lines between later frames, by rising torque.
 
     The first three estimators differ only in the cell they choose.
@@ -129,7 +135,7 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
         torque_nm_of = parabola(split, partial(matched_sigma, locator))
         torques[name] = np.array([torque_nm_of(one) for one in path])
     for calibration in calibrations:
-        tracker = Session(calibration, bank)
+        tracker = reading_with(calibration, bank)
         estimates = [tracker.estimate(TactileFrame.of(0.0, one[None])) for one in path]
         torques[calibration.estimator.name] = values_of(estimates)[0]
     found = []
@@ -188,6 +194,8 @@ def extrapolate(
 
     A refused calibration gives no valid estimate; its reason is printed.
     """
+    if not isinstance(split.whole, SliceSeries):
+        raise TypeError("only slices have levels to leave out")
     known = select_rows(split.whole, np.isfinite(split.whole.torque_at_frames()))
     later, beyond = known.t_s > split.past.t_s[-1], calibration_parts(known.torque_nm)
     for which, extreme in ((SMALLER, np.max), (LARGER, np.min)):
@@ -208,7 +216,7 @@ def extrapolate(
     return found
 
 
-def select_rows(series: FrameSeries, chosen: BoolArray) -> FrameSeries:
+def select_rows(series: SliceSeries, chosen: BoolArray) -> SliceSeries:
     """Return the chosen (n,) frames of a series with their own torques only."""
     t_s = series.t_s[chosen]
     return replace(
@@ -218,17 +226,17 @@ def select_rows(series: FrameSeries, chosen: BoolArray) -> FrameSeries:
 
 
 def judge_others(
-    shared: tuple[FrameSeries, str, Mesh | None], task: tuple[str, EstimatorName, CalibrationPart]
+    shared: tuple[SliceSeries, str, Mesh | None], task: tuple[str, EstimatorName, CalibrationPart]
 ) -> tuple[FaultLevel, float | None, str]:
     """Return the figures and the median width of a part's judged slices, and the reason of a refused calibration."""
     (series, path, mesh), (_, name, (limit_nm, judged)) = shared, task
     bank = Bank.open(path)
     try:
-        calibration = fit(name, [select_rows(series, ~judged)], "some torques", Physics(bank, mesh))
+        calibration = fit_slices(name, [select_rows(series, ~judged)], "some torques", Physics(bank, mesh))
     except BankError as error:
         return FaultLevel(limit_nm), None, str(error)
     others = select_rows(series, judged)
-    estimates = estimate_frames(Session(calibration, bank), others)
+    estimates = estimate_frames(SliceReader(calibration, bank), others)
     _, low_nm, high_nm = values_of([one for one in estimates if one.valid])
     width_nm = float(np.median(high_nm - low_nm)) if len(low_nm) else None
     return judge_level(estimates, others.torque_nm, limit_nm), width_nm, ""
@@ -240,7 +248,7 @@ _FRAMES = 6
 _STEEPEST = float(np.exp(-0.5))
 
 
-def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -> Iterable[FaultCurve]:
+def sweep_rims(calibrations: Sequence[AnyCalibration], bank: Bank, scratch: Path) -> Iterable[FaultCurve]:
     """Return the curves of estimators calibrated on synthetic slices along three paths of (k, σ) out of the bank."""
     lowest = (0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
     k_end, sigma_end = float(bank.k_grid[-1]), float(bank.sigma_grid[-1])
@@ -255,7 +263,7 @@ def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -
     k_grid, sigma_grid = (np.unique(each) for each in np.array([place for *_, places in rims for place in places]).T)
     # The same idle frame as the slices': its noise is in every difference.
     slices = SyntheticSlices(played_bank(scratch, Grid(k_grid, sigma_grid)))
-    trackers = [Session(calibration, bank) for calibration in calibrations]
+    trackers = [reading_with(calibration, bank) for calibration in calibrations]
     for name, unit, settings, places in rims:
         series = [slices.series([(k, s, 1.0)] * _FRAMES, np.full(_FRAMES, torque_of(s))) for k, s in places]
         for tracker in trackers:

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.errors import UserError
-from shearloop.estimation.curve import ranked_channels
 from shearloop.estimation.fingertip_validator import segment_grip
+from shearloop.studies.slices.curve import ranked_channels
 from shearloop.tools.drawing import figure
 from shearloop.tools.frame_series import series_of
 from shearloop.tools.recordings.frames import read_recording

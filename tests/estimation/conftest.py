@@ -67,38 +67,12 @@ def twisting(
         layers.append(clean + rng.normal(0, noise_v, clean.shape))
     sides = ("right", "left")[: len(tips)]
     channels = np.stack(layers, axis=1)
-    return FrameSeries("raw", sides, t, channels, fine, torque, np.full(len(t), np.nan))
-
-
-def sliced(n_repeats: int = 5, seed: int = 0, noise_v: float = 0.0008) -> FrameSeries:
-    """Return |differences| of ten rising torques, repeated, with a drift that grows from repeat to repeat."""
-    rng = np.random.default_rng(seed)
-    shape = np.random.default_rng(77)
-    base, slope, bend, drift = (
-        np.abs(shape.normal(0, scale, PAPER_TABLE.n_channels)) for scale in (6e-3, 1e-3, 2e-4, 6e-4)
-    )
-    torque = np.tile(np.linspace(0.01, 0.14, 10), n_repeats) + rng.normal(0, 0.002, 10 * n_repeats)
-    z = (torque - 0.075) / 0.04
-    wandering = np.linspace(0, 1, len(torque)) + rng.normal(0, 0.1, len(torque))
-    frames = base + z[:, None] * slope + (z**2)[:, None] * bend + wandering[:, None] * drift
-    return slices_of(frames + rng.normal(0, noise_v, frames.shape), torque)
-
-
-def slices_of(frames: FloatArray, torque: FloatArray) -> FrameSeries:
-    """Return the magnitudes of (n, 896) differences as slices of one fingertip, one a second."""
-    t = np.arange(len(torque), dtype=float)
-    return FrameSeries("difference", ("right",), t, np.abs(frames)[:, None], t, torque, np.full(len(t), np.nan))
+    return FrameSeries(sides, t, channels, fine, torque, np.full(len(t), np.nan))
 
 
 def kept(whole: FrameSeries, rows: BoolArray) -> FrameSeries:
     """Return the frames of a series that are not lost."""
     return replace(whole, t_s=whole.t_s[rows], channels=whole.channels[rows], diameter_mm=whole.diameter_mm[rows])
-
-
-def mixed(own: FrameSeries, share: float) -> FrameSeries:
-    """Return slices mixed with a share of a foreign one."""
-    foreign = own.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(PAPER_TABLE.n_channels)]
-    return replace(own, channels=(1 - share) * own.channels + share * foreign)
 
 
 class Judged(NamedTuple):
@@ -144,12 +118,6 @@ def recorded() -> FrameSeries:
 def motion_calibration(recorded) -> Calibration:
     """An estimator calibrated on the shared recording."""
     return fit("motion_regression", [recorded], "rig")
-
-
-@pytest.fixture(scope="session")
-def sliced_calibration() -> Calibration:
-    """An estimator calibrated on fifty slices."""
-    return fit("motion_regression", [sliced()], "all")
 
 
 @pytest.fixture(scope="session")

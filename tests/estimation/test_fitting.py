@@ -7,7 +7,6 @@ import pytest
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import TRUSTED, fit
-from tests.estimation.conftest import sliced
 
 
 def with_a_nan(series, name):
@@ -28,16 +27,14 @@ NO_NUMBER = "holds 1 value that is not a finite number"
 @pytest.mark.parametrize(
     ("recordings_of", "message"),
     [
-        (lambda raw, _: [raw, with_a_nan(raw, "t_s")], f"recording 2 of 2 {NO_NUMBER}"),
-        (lambda raw, _: [raw, with_a_nan(raw, "channels")], f"recording 2 of 2 {NO_NUMBER}"),
-        (lambda raw, _: [raw, with_a_nan(raw, "torque_nm")], f"recording 2 of 2 {NO_NUMBER}"),
-        (lambda _, slices: [with_a_nan(slices, "channels")], NO_NUMBER),
-        (lambda raw, _: [raw.between(0, 0)], "recording 1 of 1 has no frames"),
-        (lambda _, slices: [slices, slices.between(0, 0)], "recording 2 of 2 has no frames"),
-        (lambda raw, slices: [slices, raw], "do not fit into one calibration"),
-        (lambda raw, _: [of_a_single_frame(raw)], "from the first torque to the last there are 1 frames"),
+        (lambda raw: [raw, with_a_nan(raw, "t_s")], f"recording 2 of 2 {NO_NUMBER}"),
+        (lambda raw: [raw, with_a_nan(raw, "channels")], f"recording 2 of 2 {NO_NUMBER}"),
+        (lambda raw: [raw, with_a_nan(raw, "torque_nm")], f"recording 2 of 2 {NO_NUMBER}"),
+        (lambda raw: [raw.between(0, 0)], "recording 1 of 1 has no frames"),
+        (lambda raw: [raw, raw.between(0, 0)], "recording 2 of 2 has no frames"),
+        (lambda raw: [of_a_single_frame(raw)], "from the first torque to the last there are 1 frames"),
     ],
 )
 def test_recordings_that_determine_nothing_are_refused(recorded, recordings_of, message):
     with pytest.raises(CalibrationError, match=message):
-        fit("motion_regression", recordings_of(recorded, sliced()), "rig", timing=TRUSTED)
+        fit("motion_regression", recordings_of(recorded), "rig", timing=TRUSTED)

@@ -6,7 +6,7 @@ import pytest
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.forward import ForwardModel
-from shearloop.estimation import Physics, Session, TactileFrame, fit
+from shearloop.estimation import Physics, TactileFrame
 from shearloop.estimation.bank_match import (
     NOT_TURNED,
     ElectrodeNumbering,
@@ -15,7 +15,9 @@ from shearloop.estimation.bank_match import (
     image_matrix,
     resolve_symmetry,
 )
-from tests.estimation.conftest import slices_of
+from shearloop.studies.slices.fitting import fit_slices
+from shearloop.studies.slices.reader import SliceReader
+from tests.studies.slices.conftest import slices_of
 
 
 @pytest.mark.parametrize("reflected", [False, True])
@@ -73,23 +75,23 @@ def test_torque_by_the_place_in_the_bank(bank, name):
     sigma = 1.8 - 7 * torque
     frames = np.exp(-0.5 * ((channel - 2.0) / (0.3 * sigma[:, None])) ** 2) + np.abs(rng.normal(0, 0.01, (32, 896)))
     whole = slices_of(frames, torque)
-    calibration = fit(name, [whole.between(0, 24)], "earlier", Physics(bank=bank))
-    tracker = Session(calibration, bank)
+    calibration = fit_slices(name, [whole.between(0, 24)], "earlier", Physics(bank=bank))
+    tracker = SliceReader(calibration, bank)
     for i in range(24, 32):
         estimate = tracker.estimate(TactileFrame.of(float(i), frames[i][None]))
         assert estimate.torque_nm == pytest.approx(torque[i], abs=0.015)
         assert estimate.sigma == pytest.approx(sigma[i], abs=0.15)
         assert estimate.score > 0.95
     with pytest.raises(CalibrationError, match="needs its bank"):
-        Session(calibration)
+        SliceReader(calibration)
 
 
 def test_another_bank_is_refused(bank):
     rng = np.random.default_rng(5)
     series = slices_of(rng.normal(1, 0.1, (20, 896)), rng.uniform(0, 1, 20))
-    calibration = fit("bank", [series], "x", Physics(bank=bank))
+    calibration = fit_slices("bank", [series], "x", Physics(bank=bank))
     with pytest.raises(CalibrationError, match="name the bank it was made with"):
-        Session(calibration, dataclasses.replace(bank, geometry_hash="0" * 64))
+        SliceReader(calibration, dataclasses.replace(bank, geometry_hash="0" * 64))
 
 
 def test_an_image_shows_where_and_which_way(fingertip):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.curve import InverseCalibration
 from shearloop.estimation.interval_fit import best_strength, fit_interval_regressor
 from shearloop.estimation.intervals import Intervals, student_inflation
 from shearloop.estimation.left_out import later_origins, later_splits, left_out_blocks
 from shearloop.estimation.ridge import CensoredRidge, Ridge
+from shearloop.studies.slices.curve import InverseCalibration
 
 
 def test_a_ridge_without_strength_is_least_squares():
@@ -187,3 +187,37 @@ def test_of_few_values_an_interval_is_as_wide_as_students(n, students_t):
 def test_too_few_residuals_are_refused():
     with pytest.raises(CalibrationError, match="record more repeats"):
         Intervals.fit(np.zeros(3), np.zeros(3), (), 1.0)
+
+
+def loads(frames):
+    """Return torques (600,), loaded for so many frames in turn, and features that hardly and that clearly show them."""
+    rng = np.random.default_rng(3)
+    torque = np.where(np.arange(600) % 40 < frames, rng.uniform(0.02, 0.06, 600), 0.0)
+    blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
+    return torque, blind, np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
+
+
+def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
+    """Of a stream most is free of load: its small residuals must not stand for a load that leaves no trace."""
+    torque, blind, seeing = loads(frames=3)
+    reader = fit_interval_regressor(blind, torque, Ridge.fit)
+    loaded = np.flatnonzero(torque > 0.01)
+    read = np.array([reader.predict(blind[i]) for i in loaded])
+    assert (torque[loaded] - read[:, 0] <= read[:, 2]).mean() > 0.9
+    assert reader.misses_loads
+    # One that sees it pays nothing.
+    assert not fit_interval_regressor(seeing, torque, Ridge.fit).misses_loads
+
+
+def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
+    torque, blind, seeing = loads(frames=5)
+    beside = np.array([np.roll(torque, shift) for shift in range(-6, 7)])
+    reader = fit_interval_regressor(blind, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
+    assert reader.timing_widening > 1.2
+    loaded = torque > 0.01
+    read = np.array([reader.predict(one) for one in blind[loaded]])
+    half = np.array([reader.intervals.half_width(one) for one in read[:, 0]])
+    assert (np.abs(torque[loaded] - read[:, 0]) <= half).mean() > 0.75, "as wide as that they would hold these loads"
+    assert reader.misses_loads
+    sighted = fit_interval_regressor(seeing, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
+    assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"

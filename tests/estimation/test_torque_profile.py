@@ -6,7 +6,7 @@ import pytest
 from shearloop.estimation import TRUSTED, fit
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.tools.evaluate import estimate_series, figures_by_load
-from tests.estimation.conftest import sliced, twisting
+from tests.estimation.conftest import twisting
 
 
 def test_equal_twists_are_known_without_a_sensor():
@@ -16,21 +16,6 @@ def test_equal_twists_are_known_without_a_sensor():
     error = profile.predict(played)[loaded] - played.torque_at_frames()[loaded]
     # The peaks grow by 3 % from twist to twist.
     assert np.sqrt(np.mean(error**2)) < 0.1 * 0.06
-
-
-def test_repeated_slices_are_known_by_their_place():
-    played = sliced()
-    profile = TorqueProfile.fit([played.between(1, 40)])
-    later = played.between(40, 50)
-    assert profile.predict(later) == pytest.approx(later.torque_at_frames(), abs=0.008)
-
-
-@pytest.mark.parametrize("stop", range(21, 41))
-def test_a_repeat_that_ends_early_counts_from_its_beginning(stop):
-    played = sliced().between(1, 50)
-    profile = TorqueProfile.fit([played.between(1, 1 + stop)])
-    later = played.between(1 + stop, 50)
-    assert profile.predict(played)[1 + stop :] == pytest.approx(later.torque_at_frames(), abs=0.01)
 
 
 def test_evaluate_says_what_a_sensor_adds():

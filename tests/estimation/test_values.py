@@ -56,13 +56,13 @@ def test_nothing_measured_is_nothing():
 
 
 LOAD = np.array([0.5, 1.5]), np.array([0.0, 1.0])
-EMPTY = FrameSeries("raw", ("right",), np.arange(3.0), np.zeros((3, 1, 896)), *LOAD, np.full(3, np.nan))
+EMPTY = FrameSeries(("right",), np.arange(3.0), np.zeros((3, 1, 896)), *LOAD, np.full(3, np.nan))
 
 
 def test_where_the_load_cell_was_silent_for_long_no_torque_is_made_up():
     t_s, nothing = np.arange(0.0, 12.0, 0.5), np.zeros(24)
     torque_t_s = np.array([*np.arange(0.0, 3.0, 0.1), *np.arange(9.0, 12.0, 0.1)])
-    series = FrameSeries("raw", ("right",), t_s, np.zeros((24, 1, 896)), torque_t_s, np.sin(torque_t_s), nothing)
+    series = FrameSeries(("right",), t_s, np.zeros((24, 1, 896)), torque_t_s, np.sin(torque_t_s), nothing)
     torque = series.torque_at_frames()
     np.testing.assert_array_equal(np.isfinite(torque), (t_s < 4.0) | (t_s >= 8.0))
     known = (t_s < 3.0) | (t_s >= 9.0)

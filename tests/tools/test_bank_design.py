@@ -17,8 +17,10 @@ from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.estimation.values import FrameSeries
+from shearloop.studies.slices.scene import scene_of_slices
+from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.bank_config import FingertipGeometryConfig, load_bank_plan, load_geometry
-from shearloop.tools.bank_design import design_yaml, designed_for, scene_of
+from shearloop.tools.bank_design import design_yaml, scene_of, scene_of_recording
 from shearloop.tools.banks import OWN_FINGERTIP
 
 
@@ -87,7 +89,7 @@ def test_frames_that_no_model_explains_are_called_so_on_screen_and_in_the_config
 def test_sizes_that_overflow_are_refused_without_a_warning():
     t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 1e200, (12, 1, PAPER_TABLE.n_channels))
     with pytest.raises(CalibrationError, match="no noise to design for"):
-        scene_of(FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan)))
+        scene_of_slices(SliceSeries(("right",), t_s, frames, t_s, t_s, np.full(12, np.nan)))
 
 
 def test_a_recording_that_is_none_is_one_sentence(tmp_path, mistake):
@@ -97,12 +99,12 @@ def test_a_recording_that_is_none_is_one_sentence(tmp_path, mistake):
 def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_stands_in_for_the_idle_one():
     rng = np.random.default_rng(4)
     t_s, frames = np.arange(12.0), rng.normal(0.3, 0.01, (12, 1, PAPER_TABLE.n_channels))
-    series = FrameSeries("raw", ("right",), t_s, frames, t_s, np.full(12, 0.1), np.full(12, np.nan))
+    series = FrameSeries(("right",), t_s, frames, t_s, np.full(12, 0.1), np.full(12, np.nan))
     found = scene_of(series)
     np.testing.assert_array_equal(found.differences, frames[1:, 0] - frames[0, 0])
 
 
-def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(tmp_path, monkeypatch):
+def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(tmp_path):
     rng, period_ns = np.random.default_rng(5), 540_800_000
     with new_recording(tmp_path / "one.mcap", "a test") as writer:
         for number in range(12):
@@ -112,8 +114,6 @@ def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(
         # A board that was lost soon, and whose frames lie beside the other's.
         for t_ns in (6 * period_ns, 20 * period_ns):
             writer.add_frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, PAPER_TABLE.n_line_values))
-    scenes: list[MeasuredFrames] = []
-    monkeypatch.setattr("shearloop.tools.bank_design.design_bank", lambda _, scene: scenes.append(scene))
-    designed_for(tmp_path / "one.mcap", None, "left")
     # Of the twelve the first stands in for the idle one.
-    assert scenes[0].differences.shape == (11, PAPER_TABLE.n_channels)
+    found = scene_of_recording(tmp_path / "one.mcap", "left")
+    assert found.differences.shape == (11, PAPER_TABLE.n_channels)

@@ -93,7 +93,7 @@ def track(valid: np.ndarray | None = None) -> EstimateTrack:
     times, shears, torques = twisted(600.0, 0.002)
     valid = np.ones(times.size, bool) if valid is None else valid
     nothing = np.full(times.size, np.nan)
-    series = FrameSeries("raw", ("right",), times, np.zeros((times.size, 1, 896)), times, torques, nothing)
+    series = FrameSeries(("right",), times, np.zeros((times.size, 1, 896)), times, torques, nothing)
     estimates = [
         Estimate(valid=True, torque_nm=float(shear), torque_low_nm=shear - 0.01, torque_high_nm=shear + 0.01)
         if good

@@ -23,7 +23,7 @@ def track_of(rows):
     ]  # fmt: skip
     t = np.arange(float(len(rows)))
     truth = np.array([one for one, _ in rows])
-    series = FrameSeries("raw", ("right",), t, np.zeros((len(rows), 1, 896)), t, truth, np.full(len(rows), np.nan))
+    series = FrameSeries(("right",), t, np.zeros((len(rows), 1, 896)), t, truth, np.full(len(rows), np.nan))
     return EstimateTrack(series, tuple(estimates), np.ones(len(rows)))
 
 

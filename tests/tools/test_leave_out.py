@@ -2,20 +2,26 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from shearloop.errors import UserError
 from shearloop.estimation.values import Estimate, FrameSeries
+from shearloop.studies.slices.evaluate import no_better_than_place
+from shearloop.studies.slices.leave_out import SliceRecipe, find_levels, plan_levels
+from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
-from shearloop.tools.leave_out import Recipe, advice_on, fit_without, judge_block, judge_left_out, sentences_of
+from shearloop.tools.leave_out import Recipe, advice_on, fit_without, plan_left_out, sentences_of
 from shearloop.tools.left_out_blocks import KINDS, after_twists, find_blocks, usual_kind
 from shearloop.tools.parallel import SerialExecutor
-from tests.estimation.conftest import sliced, twisting
+from tests.estimation.conftest import twisting
+from tests.studies.slices.conftest import sliced
 
 RECIPE = Recipe("motion_regression")
 NESTED = replace(RECIPE, nested=True)
+OF_SLICES = SliceRecipe("motion_regression")
 
 
 def of_tool(diameter_mm: float, seed: int) -> FrameSeries:
@@ -26,7 +32,6 @@ def of_tool(diameter_mm: float, seed: int) -> FrameSeries:
 MATERIAL = {
     "twists": lambda: [twisting(cycles=4, tips=(1,))],
     "grips": lambda: [twisting(cycles=3, seed=seed, tips=(1,)) for seed in (1, 2)],
-    "levels": lambda: [sliced()],
     "tools": lambda: [of_tool(10.0, 1), of_tool(12.0, 2)],
 }
 
@@ -44,14 +49,17 @@ def corrupted(recordings, block):
     return found
 
 
-@pytest.mark.parametrize(("kind", "recipe"), [*((kind, RECIPE) for kind in KINDS), ("twists", NESTED)])
+@pytest.mark.parametrize(
+    ("kind", "recipe"), [*((kind, RECIPE) for kind in KINDS), ("twists", NESTED), ("levels", OF_SLICES)]
+)
 def test_a_block_is_not_in_its_own_fit(kind, recipe, tmp_path):
-    recordings = MATERIAL[kind]()
+    recordings = MATERIAL[kind]() if kind in MATERIAL else [sliced()]
     names = [f"{number}.mcap" for number in range(len(recordings))]
-    for number, block in enumerate(find_blocks(kind, recordings, names)[:2]):
+    blocks = find_blocks(kind, recordings, names) if kind in MATERIAL else find_levels(recordings)
+    for number, block in enumerate(blocks[:2]):
         own, other = tmp_path / f"{number}.cal", tmp_path / f"{number}_other.cal"
-        fit_without(recipe, recordings, block).save(own)
-        fit_without(recipe, corrupted(recordings, block), block).save(other)
+        fit_without(recipe.fit, recordings, block).save(own)
+        fit_without(recipe.fit, corrupted(recordings, block), block).save(other)
         assert own.read_bytes() == other.read_bytes(), block.name
 
 
@@ -66,7 +74,7 @@ def test_every_loaded_frame_is_judged_once_by_twists():
 
 def test_figures_are_those_of_a_slow_loop():
     recordings = MATERIAL["grips"]()
-    result = judge_left_out("grips", RECIPE, recordings, ["a", "b"], SerialExecutor())
+    result = plan_left_out("grips", RECIPE, recordings, ["a", "b"]).judge(SerialExecutor())
     errors = []
     for number, one in enumerate(recordings):
         calibration = RECIPE.fit([recordings[1 - number]])
@@ -84,10 +92,10 @@ def test_figures_are_those_of_a_slow_loop():
 
 
 def test_the_stopwatch_knows_the_level_that_the_fit_does_not():
-    recordings = MATERIAL["levels"]()
-    blocks = find_blocks("levels", recordings, [])
+    recordings = [sliced()]
+    blocks = find_levels(recordings)
     for block in (blocks[0], blocks[len(blocks) // 2]):
-        tracks = judge_block((RECIPE, recordings), block)
+        tracks = OF_SLICES.judge(recordings, block).tracks
         truth = np.concatenate([one.series.torque_at_frames() for one in tracks])
         assert np.concatenate([one.profile_nm for one in tracks]) == pytest.approx(truth, abs=0.01)
         fitted = recordings[0].torque_at_frames()[block.fitted[0]]
@@ -105,8 +113,9 @@ def test_the_stopwatch_knows_the_level_that_the_fit_does_not():
 def test_what_no_sensor_is_needed_for_is_said(sides, kind, said):
     played = twisting(cycles=2, tips=(1, 2)[:sides]) if kind == "raw" else sliced(2)
     track = off_by(played, 0.02)
-    assert re.search(said, no_better_than_clock([track]))
-    assert no_better_than_clock([off_by(played, 0.002)]) == ""
+    judge = no_better_than_clock if kind == "raw" else no_better_than_place
+    assert re.search(said, judge([track]))
+    assert judge([off_by(played, 0.002)]) == ""
 
 
 @pytest.mark.parametrize(("kind", "n_blocks"), [("twists", 3), ("grips", 2)])
@@ -125,7 +134,7 @@ def test_the_first_twist_adapts_and_is_neither_fitted_nor_judged(kind, n_blocks)
         fitted = block.fitted[adapted.recording][: adapted.stop]
         assert not fitted[torque_nm[: adapted.stop] > 0.0].any()
         assert all(span.first >= adapted.stop for span in block.judged)
-    result = judge_left_out(kind, RECIPE, recordings, names, SerialExecutor(), adapt_twists=1)
+    result = plan_left_out(kind, RECIPE, recordings, names, adapt_twists=1).judge(SerialExecutor())
     figures = result.figures()
     assert figures["before_adapting"]["n"] == figures["loaded"]["n"] > 0
     assert "Before adapting" in sentences_of(result)[-2]
@@ -163,15 +172,17 @@ def test_nothing_remains_after_as_many_twists_as_there_are():
         ("tools", lambda: [of_tool(10.0, 1)], "there is one tool, of 10 mm"),
         ("tools", lambda: [twisting(cycles=3, tips=(1,))], "name it with --tool-mm"),
         ("grips", lambda: [twisting(cycles=3, tips=(1,))], "one recording, and so one grip"),
-        ("levels", lambda: [twisting(cycles=3, tips=(1,))], "leave out grips, twists or tools"),
         ("twists", lambda: [sliced()], "use --leave-out levels"),
         ("levels", lambda: [sliced().between(0, 12)], "record 20 or more"),
     ],
 )
 def test_what_cannot_be_left_out_is_refused_in_one_sentence(kind, recordings, said):
     chosen = recordings()
+    names = ["a.mcap"] * len(chosen)
+    of_slices = isinstance(chosen[0], SliceSeries)
+    refuse = partial(plan_levels, kind, OF_SLICES, chosen) if of_slices else partial(find_blocks, kind, chosen, names)
     with pytest.raises(UserError, match=said) as refused:
-        find_blocks(kind, chosen, ["a.mcap"] * len(chosen))
+        refuse()
     assert "\n" not in str(refused.value)
 
 

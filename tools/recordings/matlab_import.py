@@ -381,7 +381,7 @@ def _loop_times(load: Stream, streams: dict[str, Stream], remarks: list[str]) ->
 def _series_of_side(side: str, stream: Stream, middles_ns: Sequence[int], load: Stream) -> FrameSeries:
     t_s = np.array(middles_ns) / 1e9
     channels = PAPER_TABLE.channels_of_line(stream.values)[:, None]
-    return FrameSeries("raw", (side,), t_s, channels, load.unix_s, load.values[:, 0], np.full(len(t_s), np.nan))
+    return FrameSeries((side,), t_s, channels, load.unix_s, load.values[:, 0], np.full(len(t_s), np.nan))
 
 
 def _valid_load(load: Stream, remarks: list[str]) -> Stream:

@@ -27,6 +27,7 @@ from shearloop.studies.charts.speed_accuracy import (
     often_valid,
     write,
 )
+from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.drawing import figure, frontier, lay_out, plain_log, write_names
 from shearloop.tools.parallel import SerialExecutor
 
@@ -58,7 +59,7 @@ def test_a_method_with_few_valid_frames_is_not_on_the_frontier(slices):
 
 def test_frames_without_load_do_not_flatter_a_method_that_says_0():
     t, torque_nm = np.arange(100.0), np.where(np.arange(100) < 4, 0.1, 0.001)
-    series = FrameSeries("raw", ("right",), t, np.zeros((100, 1, 896)), t, torque_nm, np.full(100, np.nan))
+    series = FrameSeries(("right",), t, np.zeros((100, 1, 896)), t, torque_nm, np.full(100, np.nan))
     estimated = np.where(np.arange(100) == 0, np.nan, 0.0)
     (found,) = measure([TorqueMethod("zero", "any", lambda: (estimated, np.ones(100)))], loaded_truth(series), 1)
     assert (found.rmse_nm, found.valid_fraction) == (pytest.approx(0.1), 0.75)
@@ -141,7 +142,7 @@ def test_an_unwritable_folder_is_reported_before_anything_is_measured(monkeypatc
 
 def test_doubts_about_a_design_are_printed_with_its_chart(monkeypatch, tmp_path, capsys):
     t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 0.01, (12, 1, PAPER_TABLE.n_channels))
-    series = FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan))
+    series = SliceSeries(("right",), t_s, frames, t_s, t_s, np.full(12, np.nan))
     parts = [Split(f"{name}, slices, first 60%", series, series, series) for name in ("good", "bad")]
     # One design per recording, with the attributes that the doubts need; no other is looked at.
     found = iter(

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from shearloop.errors import UserError
-from shearloop.estimation import Estimate, Physics, Session, fit
+from shearloop.estimation import Estimate, Physics, Session
 from shearloop.studies.charts import fault_sweeps, stability
 from shearloop.studies.charts.chart_data import Split, fitted
-from shearloop.tools.evaluate import estimate_series, figures_of
+from shearloop.studies.slices.evaluate import estimate_slices
+from shearloop.studies.slices.fitting import fit_slices
+from shearloop.tools.evaluate import figures_of
 from shearloop.tools.parallel import SerialExecutor
 
 
@@ -133,8 +135,8 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(sli
             (one.curve.levels[0], one.width_nm[0], known[:29], known[29:]),
             (one.curve.levels[1], one.width_nm[1], known[inside], known[~inside]),
         ):
-            track = estimate_series(
-                fit("regression", [stability.select_rows(some, past)], "", Physics()),
+            track = estimate_slices(
+                fit_slices("regression", [stability.select_rows(some, past)], "", Physics()),
                 stability.select_rows(some, future),
             )
             figures = figures_of([track])

@@ -46,7 +46,7 @@ def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder,
     recording, out, of_slices = cylinder("30mm_2"), ["--out", tmp_path / "new.cal"], tmp_path / "s.cal"
     assert "twist" in mistake("adapt", calibration, recording, "--time-range", "0:0.15", *out)
     ran("calibrate", slices_folder, "--estimator", "regression", "--out", of_slices)
-    assert "raw" in mistake("adapt", of_slices, recording, *out)
+    assert "calibration of slices" in mistake("adapt", of_slices, recording, *out)
 
 
 @pytest.mark.parametrize(

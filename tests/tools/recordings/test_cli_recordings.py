@@ -10,15 +10,19 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.cli import main
 from shearloop.cli.calibrate.recording import sentences_of
 from shearloop.cli.evaluate import _lines
-from shearloop.estimation import Calibration, Estimate, FrameSeries, fit
+from shearloop.estimation import Calibration, Estimate, FrameSeries
 from shearloop.estimation.estimator import Estimator, OutputModel, Reading, Regression
 from shearloop.estimation.estimator_names import ESTIMATORS
 from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.load_delay import LoadDelay, LoadTiming
 from shearloop.estimation.ridge import Ridge
 from shearloop.estimation.values import Measured
+from shearloop.studies.slices.calibration import SliceCalibration
+from shearloop.studies.slices.evaluate import draw_slices
+from shearloop.studies.slices.fitting import fit_slices
+from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.calibrate import CalibrationResult
-from shearloop.tools.evaluate import EstimateTrack, InvalidReason, draw_tracks, figures_of, invalid_reasons
+from shearloop.tools.evaluate import EstimateTrack, InvalidReason, draw_stream, draw_tracks, figures_of, invalid_reasons
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
 KEYS |= {"latency_ms_p50", "latency_ms_p99", "winkler_nm", "zero_rmse_nm", "loaded", "unloaded"}
@@ -85,37 +89,35 @@ def test_an_estimator_is_one_class_and_one_line(slices_folder, tmp_path, ran, mo
     calibration, slices = str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")
     calibrate = ["calibrate", slices, "--estimator", "bands", "--time-range", "0:0.6", "--out", calibration]
     assert "Estimator bands, torque from" in ran(*calibrate).out
-    assert Calibration.load(calibration).estimator.bands == 8
+    assert SliceCalibration.load(calibration).estimator.bands == 8
     assert result_of("evaluate", calibration, slices)["r"] > 0.9
     monkeypatch.undo()
     with pytest.raises(CalibrationError, match="the estimator is 'bands', which this version does not know"):
-        Calibration.load(calibration)
+        SliceCalibration.load(calibration)
 
 
 @pytest.mark.parametrize("misses_loads", [True, False])
-def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tmp_path, ran, monkeypatch, result_of):
-    def blind(*arguments, **options):
-        found = fit(*arguments, **options)
-        reader = replace(found.torque.regressor, misses_loads=misses_loads)
-        return replace(found, torque=replace(found.torque, regressor=reader))
-
-    monkeypatch.setattr("shearloop.tools.calibrate.fit", blind)
-    calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--estimator", "regression"]
-    calibrate += ["--out", str(tmp_path / "a.cal")]
-    printed = ran(*calibrate).out
+def test_calibrate_says_where_loads_are_not_seen(misses_loads):
+    ramp = np.linspace(0.01, 0.14, 20)
+    regressor = replace(fit_interval_regressor(ramp[:, None], ramp, Ridge.fit), misses_loads=misses_loads)
+    model = OutputModel(regressor, np.zeros(0))
+    calibration = Calibration(Regression(np.ones((1, 896))), ("right",), "ramp", "", torque=model)
+    result = CalibrationResult(calibration, 20)
+    printed = " ".join(sentences_of(result))
     assert ("It does not see the load: " in printed) == misses_loads
     useless = "every interval spans all calibrated torques, 0.01 to 0.14 N·m, and the torque is useless"
     assert (useless in printed) == misses_loads
     cure = "Calibrate with --estimator motion_regression or on both fingertips, or record a grip in which the tool"
     assert (cure in printed) == misses_loads
-    assert result_of(*calibrate)["sees_loads"] is not misses_loads
+    assert result.figures()["sees_loads"] is not misses_loads
 
 
 @pytest.mark.parametrize("slices_folder", [0.5], indirect=True)
 def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, tmp_path, ran, monkeypatch, result_of):
     fitted = []
     monkeypatch.setattr(
-        "shearloop.tools.calibrate.fit", lambda *a, **options: fitted.append(fit(*a, **options)) or fitted[-1]
+        "shearloop.studies.slices.calibrate.fit_slices",
+        lambda *a, **options: fitted.append(fit_slices(*a, **options)) or fitted[-1],
     )
     calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--out", str(tmp_path / "a.cal")]
     printed = ran(*calibrate).out
@@ -156,7 +158,7 @@ def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alon
         "outside the calibration: the frame lies 3.0 standard deviations from the calibrated ones",
     ]
     nothing = np.full(8, np.nan)
-    series = FrameSeries("raw", ("right",), np.arange(8.0), np.zeros((8, 1, 896)), nothing[:0], nothing[:0], nothing)
+    series = FrameSeries(("right",), np.arange(8.0), np.zeros((8, 1, 896)), nothing[:0], nothing[:0], nothing)
     track = EstimateTrack(series, tuple(Estimate(valid=False, reasons=(why,)) for why in said), np.zeros(8))
     assert invalid_reasons([track]) == [
         InvalidReason(3, said[2], differ=True),
@@ -252,7 +254,7 @@ def test_known_diameters_have_figures_of_their_own():
     cylinders = [Estimate(True, (), diameter_mm=19.0, diameter_low_mm=ends[0], diameter_high_mm=ends[1] + n) for n in t]
     refused = [Estimate(False, ("no grip",))]
     nothing = np.zeros(0)
-    series = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), nothing, nothing, np.full(4, 20.0))
+    series = SliceSeries(("right",), t, np.zeros((4, 1, 896)), nothing, nothing, np.full(4, 20.0))
     figures = figures_of([EstimateTrack(series, tuple(cylinders), np.ones(4))])
     assert figures["coverage_95"] == figures["diameter_coverage_95"] == figures["diameter_rmse_mm"] == 1.0
     assert figures["diameter_interval_mm"] == pytest.approx(11.5)
@@ -264,12 +266,12 @@ def test_known_diameters_have_figures_of_their_own():
 @pytest.mark.parametrize(("unsure_s", "delay_s", "when"), [(0.0, -0.16, "0.16 s before"), (0.4, 0.16, "0.16 s after")])
 def test_a_time_that_could_not_be_checked_is_called_probable(unsure_s, delay_s, when):
     t = np.arange(4.0)
-    series = FrameSeries("raw", ("right",), t, np.zeros((4, 1, 896)), t, np.zeros(4), np.full(4, np.nan))
+    series = FrameSeries(("right",), t, np.zeros((4, 1, 896)), t, np.zeros(4), np.full(4, np.nan))
     found = LoadDelay(delay_s=delay_s, error_s=0.2, explained=0.5)
     ramp = np.linspace(0.0, 1.0, 20)
     regressor = replace(fit_interval_regressor(ramp[:, None], ramp, Ridge.fit), timing_widening=1.9)
-    model = OutputModel(regressor, None, np.zeros(0))
-    calibration = Calibration(Regression(np.ones((1, 896))), "raw", ("right",), "ramp", "", torque=model)
+    model = OutputModel(regressor, np.zeros(0))
+    calibration = Calibration(Regression(np.ones((1, 896))), ("right",), "ramp", "", torque=model)
     result = CalibrationResult(calibration, 4, LoadTiming([series], [found], [""], unsure_s))
     _, late, *sentences, _ = sentences_of(result)
     assert late == f"The load is {'probably ' if unsure_s else ''}stamped {when} the frames move."
@@ -282,12 +284,16 @@ def test_a_time_that_could_not_be_checked_is_called_probable(unsure_s, delay_s, 
 
 @pytest.mark.usefixtures("fonts")
 @pytest.mark.parametrize(
-    ("kind", "estimated_nm", "drawn"),
-    [("raw", 0.1, "torque in N·m"), ("raw", 0.0, "torque in N·m"), ("difference", 0.1, "diameter in mm")],
+    ("kind", "draw", "estimated_nm", "drawn"),
+    [
+        (FrameSeries, draw_stream, 0.1, "torque in N·m"),
+        (FrameSeries, draw_stream, 0.0, "torque in N·m"),
+        (SliceSeries, draw_slices, 0.1, "diameter in mm"),
+    ],
 )
-def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, estimated_nm, drawn, tmp_path):
+def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, draw, estimated_nm, drawn, tmp_path):
     t, tool_mm = np.arange(4.0), np.full(4, 20.0)
-    series = FrameSeries(kind, ("right",), t, np.zeros((4, 1, 896)), t, np.full(4, 0.1), tool_mm)
+    series = kind(("right",), t, np.zeros((4, 1, 896)), t, np.full(4, 0.1), tool_mm)
     estimates = tuple(
         Estimate(
             valid=True,
@@ -301,11 +307,11 @@ def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, estim
         )
         for _ in t
     )
-    draw_tracks([EstimateTrack(series, estimates, np.ones(4))], ["one"], "title", tmp_path / "a.svg")
+    draw_tracks([EstimateTrack(series, estimates, np.ones(4))], ["one"], "title", tmp_path / "a.svg", draw)
     picture = (tmp_path / "a.svg").read_text()
     assert f"<!-- {drawn} -->" in picture
-    assert f"<!-- {'load cell' if kind == 'raw' else 'known diameter'} -->" in picture
+    assert f"<!-- {'load cell' if kind is FrameSeries else 'known diameter'} -->" in picture
     # An interval that extends the other way is explained.
     assert ("<!-- no load on a load cell" in picture) == (estimated_nm == 0)
     judged = f"one; 4 loaded frames: RMSE {0.1 - estimated_nm:g} N·m (always saying 0: 0.1)"
-    assert (f"<!-- {judged} -->" in picture) == (kind == "raw")
+    assert (f"<!-- {judged} -->" in picture) == (kind is FrameSeries)

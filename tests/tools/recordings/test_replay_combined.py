@@ -49,9 +49,7 @@ def twists(tmp_path_factory) -> Twists:
         lines = np.round(PAPER_TABLE.line_of_channels(steps * ADC_STEP_V), 4)
         channels.append([PAPER_TABLE.channels_of_line(line) for line in lines])
         sent[side] = ["".join(f"{value:.4f}, " for value in line).encode() + b"\r\n" for line in lines]
-    series = FrameSeries(
-        "raw", SIDES, t_s, np.array(channels).swapaxes(0, 1), t_s, TORQUE_NM, np.full(N_FRAMES, TOOL_MM)
-    )
+    series = FrameSeries(SIDES, t_s, np.array(channels).swapaxes(0, 1), t_s, TORQUE_NM, np.full(N_FRAMES, TOOL_MM))
     calibrations = {}
     for name, sides in (("both", SIDES), ("right", ("right",))):
         calibrations[name] = folder / f"{name}.cal"

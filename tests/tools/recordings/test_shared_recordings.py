@@ -18,12 +18,16 @@ from scipy.io import savemat
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import TRUSTED, Calibration, FrameSeries, fit, measure_timing
-from shearloop.estimation.curve import CurveMean
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
-from shearloop.estimation.novelty import NoveltyDetector
 from shearloop.studies.charts.fault_sweeps import balanced, judge_level
 from shearloop.studies.charts.stability import select_rows
+from shearloop.studies.slices.calibration import SliceCalibration
+from shearloop.studies.slices.curve import CurveMean
+from shearloop.studies.slices.evaluate import estimate_slices
+from shearloop.studies.slices.fitting import fit_slices
+from shearloop.studies.slices.novelty import NoveltyDetector
+from shearloop.studies.slices.series import SliceSeries, read_slices
 from shearloop.tools.evaluate import estimate_series, figures_by_load, figures_of
 from shearloop.tools.frame_series import part_of, read_series, series_of
 from shearloop.tools.recordings.frames import read_recording
@@ -58,16 +62,16 @@ def twists(twists_file) -> FrameSeries:
 
 
 @pytest.fixture(scope="module")
-def slices(shared) -> FrameSeries:
+def slices(shared) -> SliceSeries:
     """The forty-nine torque slices."""
-    (series,) = read_series(shared / "recordings/torque_slices")
+    (series,) = read_slices(shared / "recordings/torque_slices")
     return series
 
 
 @pytest.fixture(scope="module")
-def earlier(slices) -> Callable[[EstimatorName, int], Calibration]:
+def earlier(slices) -> Callable[[EstimatorName, int], SliceCalibration]:
     """Return what an estimator is calibrated to by the first n torque slices, which several tests judge."""
-    return cache(lambda name, n: fit(name, [slices.between(0, n)], "earlier"))
+    return cache(lambda name, n: fit_slices(name, [slices.between(0, n)], "earlier"))
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +152,7 @@ def test_idle_disturbed_and_foreign_frames_are_never_valid(twists, of_all_twists
         for layer in frame:
             layer[rng.choice(896, 224, replace=False)] = np.abs(rng.normal(0, 0.05, 224))
     for channels in (noisy, some.channels[:, ::-1]):
-        strange = FrameSeries("raw", some.sides, some.t_s, channels, some.torque_t_s, some.torque_nm, some.diameter_mm)
+        strange = FrameSeries(some.sides, some.t_s, channels, some.torque_t_s, some.torque_nm, some.diameter_mm)
         assert not any(one.valid for one in estimate_series(of_all_twists, strange).estimates)
 
 
@@ -162,7 +166,7 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
 def test_later_torque_slices(slices, earlier):
     """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
     for n, (rmse_nm, winkler_nm) in LATER_SLICES.items():
-        figures = figures_of([estimate_series(earlier("motion_regression", n), slices.between(n, 49))])
+        figures = figures_of([estimate_slices(earlier("motion_regression", n), slices.between(n, 49))])
         assert figures["r"] >= 0.96
         assert figures["rmse_nm"] <= rmse_nm
         assert figures["winkler_nm"] <= winkler_nm
@@ -170,8 +174,8 @@ def test_later_torque_slices(slices, earlier):
         assert figures["coverage_95"] >= 0.95
         assert figures["valid_fraction"] == 1
     # A line reads torques beyond the range as such, so that a guarantee narrows only few intervals.
-    vouched = fit("motion_regression", [slices.between(0, 29)], "earlier", full_range=True)
-    found = estimate_series(vouched, slices.between(29, 49)).estimates
+    vouched = fit_slices("motion_regression", [slices.between(0, 29)], "earlier", full_range=True)
+    found = estimate_slices(vouched, slices.between(29, 49)).estimates
     assert np.median([one.torque_high_nm - one.torque_low_nm for one in found]) <= 0.066
     without_ends = _without_ends(earlier("motion_regression", 29).torque.regressor)
     assert pickle.dumps(vouched.torque.regressor) == pickle.dumps(without_ends), "nothing else is another"
@@ -212,27 +216,27 @@ def _without_ends(regressor):
 def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_nm, high_nm, slices):
     """They are read within the range, and up to nine tenths of them false-valid; they lie up to 1.6 of it beyond."""
     inside = (low_nm <= slices.torque_nm) & (slices.torque_nm < high_nm)
-    calibration = fit(name, [select_rows(slices, inside)], "a part of the torques")
-    figures = figures_of([estimate_series(calibration, select_rows(slices, ~inside))])
+    calibration = fit_slices(name, [select_rows(slices, inside)], "a part of the torques")
+    figures = figures_of([estimate_slices(calibration, select_rows(slices, ~inside))])
     assert figures["valid_fraction"] > 0.9, "or nothing would be tested"
     assert figures["coverage_95"] >= 0.9
     # As where somebody has vouched that no other will come, which changes nothing else (test_later_torque_slices).
     reader = _without_ends(calibration.torque.regressor)
     vouched = replace(calibration, torque=replace(calibration.torque, regressor=reader))
-    vouched_for = figures_of([estimate_series(vouched, select_rows(slices, ~inside))])
+    vouched_for = figures_of([estimate_slices(vouched, select_rows(slices, ~inside))])
     assert vouched_for["coverage_95"] < 0.8, "or there was nothing to hold"
 
 
 @pytest.mark.parametrize("name", ["motion_regression", "regression"])
 def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_intervals(name, slices, earlier, shared):
-    (cylinders,) = read_series(shared / "recordings/diameter_slices")
+    (cylinders,) = read_slices(shared / "recordings/diameter_slices")
     missed = []
     for n in (19, 29, 39):
         calibration, later = earlier(name, n), slices.between(n, 49)
         for diameter_mm in (10, 20, 30, 40):
             foreign = cylinders.channels[cylinders.diameter_mm == diameter_mm].mean(axis=0)
             mixed = replace(later, channels=0.8 * later.channels + 0.2 * foreign)
-            figures = figures_of([estimate_series(calibration, mixed)])
+            figures = figures_of([estimate_slices(calibration, mixed)])
             assert figures["valid_fraction"] == 1
             missed.append(1 - figures["coverage_95"])
     assert max(missed) <= 0.2, "else it breaks silently"
@@ -240,9 +244,9 @@ def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_interval
 
 
 def test_later_slices_of_the_cylinders(shared):
-    (series,) = read_series(shared / "recordings/diameter_slices")
-    calibration = fit("motion_regression", [part_of(series, 0, 0.62)], "earlier")
-    figures = figures_of([estimate_series(calibration, part_of(series, 0.62, 1))])
+    (series,) = read_slices(shared / "recordings/diameter_slices")
+    calibration = fit_slices("motion_regression", [part_of(series, 0, 0.62)], "earlier")
+    figures = figures_of([estimate_slices(calibration, part_of(series, 0.62, 1))])
     assert figures["diameter_rmse_mm"] <= 5
     assert figures["coverage_95"] >= 0.9
 

@@ -7,18 +7,20 @@ import pytest
 from scipy.stats import chi2
 
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.estimation import FrameSeries, fit
 from shearloop.estimation.bank_match import BankMatch
-from shearloop.estimation.interval_fit import fit_interval_regressor
-from shearloop.estimation.interval_regressor import IntervalRegressor
-from shearloop.estimation.novelty import NoveltyDetector, ReciprocityCheck
+from shearloop.estimation.estimator import match_reasons
 from shearloop.estimation.ridge import Ridge
-from tests.estimation.conftest import follow, judged, mixed, sliced
+from shearloop.studies.slices.fitting import fit_slices
+from shearloop.studies.slices.novelty import NoveltyDetector, ReciprocityCheck
+from shearloop.studies.slices.regressor import SliceRegressor, fit_slice_regressor
+from shearloop.studies.slices.series import SliceSeries
+from tests.estimation.conftest import judged
+from tests.studies.slices.conftest import mixed, read, sliced
 
 ALL = np.ones(896, dtype=np.bool_)
 
 
-def beyond(series: FrameSeries, below_nm: float) -> np.ndarray:
+def beyond(series: SliceSeries, below_nm: float) -> np.ndarray:
     """Return what the slices' frames become at a torque so far below the least of them, along their own slope."""
     frames, torque = series.channels, series.torque_at_frames()
     slope = np.polyfit(torque, frames.reshape(len(torque), -1), 1)[0].reshape(frames.shape[1:])
@@ -38,8 +40,8 @@ def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused():
 @pytest.mark.parametrize("share", [0.35, 0.5, 1.0])
 def test_a_foreign_frame_mixed_in_is_refused(sliced_calibration, share):
     calibration, later = sliced_calibration, sliced(seed=3)
-    assert not any(one.valid for one in follow(calibration, mixed(later, share)))
-    assert all(one.valid for one in follow(calibration, later))
+    assert not any(one.valid for one in read(calibration, mixed(later, share)))
+    assert all(one.valid for one in read(calibration, later))
 
 
 def test_channels_that_vary_much_do_not_drown_the_others():
@@ -58,8 +60,8 @@ def saturating(value):
     return np.column_stack([np.maximum(value, 0.3), np.maximum(value, 0.3) ** 2])
 
 
-def reader_of(features, values, **options) -> IntervalRegressor:
-    return fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), fit_line=Ridge.fit, **options)
+def reader_of(features, values, **options) -> SliceRegressor:
+    return fit_slice_regressor(features, values, Ridge.fit, strengths=(1e-9,), fit_line=Ridge.fit, **options)
 
 
 def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it():
@@ -137,40 +139,6 @@ def test_where_values_beyond_are_read_as_such_intervals_reach_twice_as_far_beyon
     assert below < 0.01
 
 
-def loads(frames):
-    """Return torques (600,), loaded for so many frames in turn, and features that hardly and that clearly show them."""
-    rng = np.random.default_rng(3)
-    torque = np.where(np.arange(600) % 40 < frames, rng.uniform(0.02, 0.06, 600), 0.0)
-    blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
-    return torque, blind, np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
-
-
-def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
-    """Of a stream most is free of load: its small residuals must not stand for a load that leaves no trace."""
-    torque, blind, seeing = loads(frames=3)
-    reader = fit_interval_regressor(blind, torque, Ridge.fit)
-    loaded = np.flatnonzero(torque > 0.01)
-    read = np.array([reader.predict(blind[i]) for i in loaded])
-    assert (torque[loaded] - read[:, 0] <= read[:, 2]).mean() > 0.9
-    assert reader.misses_loads
-    # One that sees it pays nothing.
-    assert not fit_interval_regressor(seeing, torque, Ridge.fit).misses_loads
-
-
-def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
-    torque, blind, seeing = loads(frames=5)
-    beside = np.array([np.roll(torque, shift) for shift in range(-6, 7)])
-    reader = fit_interval_regressor(blind, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
-    assert reader.timing_widening > 1.2
-    loaded = torque > 0.01
-    read = np.array([reader.predict(one) for one in blind[loaded]])
-    half = np.array([reader.intervals.half_width(one) for one in read[:, 0]])
-    assert (np.abs(torque[loaded] - read[:, 0]) <= half).mean() > 0.75, "as wide as that they would hold these loads"
-    assert reader.misses_loads
-    sighted = fit_interval_regressor(seeing, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
-    assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
-
-
 def test_how_much_is_the_own_response_is_told_whatever_the_torque_does():
     frames = sliced().channels[:, 0]
     guard = NoveltyDetector.fit(frames, PAPER_TABLE)
@@ -211,27 +179,26 @@ def test_what_may_be_missing_widens_to_the_side_where_it_would_be_read(sign):
     assert (low, high) == (pytest.approx(plain[0]), pytest.approx(plain[1] + 0.2, abs=0.01))
 
 
-def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced_calibration):
-    task = replace(sliced_calibration.torque, k_range=np.array([3.12, 3.17]))
-    place = BankMatch(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
-    assert task.match_reasons(place) == ()
-    assert "another ridge" in task.match_reasons(replace(place, k=3.41))[0]
+def test_a_match_on_another_ridge_of_the_bank_is_refused():
+    k_range, place = np.array([3.12, 3.17]), BankMatch(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
+    assert match_reasons(k_range, place) == ()
+    assert "another ridge" in match_reasons(k_range, replace(place, k=3.41))[0]
 
 
 @pytest.mark.parametrize("name", ["motion_regression", "regression"])
 def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name, sliced_calibration):
     """It only makes the own response smaller, which is what another torque does: no misfit tells of it."""
-    calibration = sliced_calibration if name == "motion_regression" else fit(name, [sliced()], "all")
+    calibration = sliced_calibration if name == "motion_regression" else fit_slices(name, [sliced()], "all")
     later = sliced(seed=3)
     guard = calibration.torque.novelty
     blind = replace(calibration, torque=replace(calibration.torque, novelty=replace(guard, typical_response=0.0)))
     foreign = 0.2 * later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
     spoilt = replace(later, channels=0.8 * later.channels + 0.2 * foreign)
-    found = judged(follow(calibration, spoilt), later)
+    found = judged(read(calibration, spoilt), later)
     assert found.n > 45, "or nothing would be tested"
     assert found.coverage >= 0.95
-    assert judged(follow(blind, spoilt), later).coverage < 0.8, "or there was nothing to hold"
-    widths = [judged(follow(one, later), later).width for one in (calibration, blind)]
+    assert judged(read(blind, spoilt), later).coverage < 0.8, "or there was nothing to hold"
+    widths = [judged(read(one, later), later).width for one in (calibration, blind)]
     assert widths[0] < 1.2 * widths[1]
 
 

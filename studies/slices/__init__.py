@@ -1,0 +1,1 @@
+"""Slices: the papers' peak samples, their calibrations, estimates and figures."""

@@ -168,14 +168,27 @@ def _lost_text(lost: Mapping[str, int]) -> str:
     return ", ".join(f"{count} of {topic}" for topic, count in lost.items())
 
 
+def _destination(recording: Path, out: Path | None, form: str) -> Path:
+    """Return the file or the folder to write; a file has the ending by which programs know its format."""
+    stem = recording.name.partition(".mcap")[0]
+    if form not in _SINGLE_FILES:
+        return out or recording.with_name(f"{stem}_{form}")
+    if out is None:
+        return recording.with_name(f"{stem}.{form}")
+    if out.is_dir():
+        return out / f"{stem}.{form}"
+    # A pipe has no ending.
+    return out if out.suffix or out.exists() else out.with_name(f"{out.name}.{form}")
+
+
 def _export(args: argparse.Namespace) -> int:
     from shearloop.daemon.recorder.schema import INPUT
     from shearloop.tools.recordings.export import export
     from shearloop.tools.recordings.tables import RecordedTopics
 
     path, form = args.recording, args.format
-    stem, kind = path.name.partition(".mcap")[0], _SINGLE_FILES.get(form)
-    out = args.out or path.with_name(f"{stem}.{form}" if kind else f"{stem}_{form}")
+    kind = _SINGLE_FILES.get(form)
+    out = _destination(path, args.out, form)
     if kind:
         check_overwrite(out, *kind)
     counts = RecordedTopics(path).counts

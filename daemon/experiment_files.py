@@ -109,7 +109,7 @@ class ExperimentFiles:
         try:
             await asyncio.wait({result}, timeout=READ_WITHIN_S)
             if not result.done():
-                cure = "copy it to a local drive"
+                cure = "try again on a less busy computer; from a network drive, copy it to a local one"
                 raise UserError(f"{what}: the experiment was not read within {READ_WITHIN_S:g} s; {cure}")
         finally:
             # A later result has no receiver.

@@ -109,6 +109,8 @@ export class FingertipPanel {
     put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));
     warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : "");
     if (this.drawn.gel !== estimate || !estimate) this.drawGel(estimate);
+    // An empty picture would push all below it off a phone's screen.
+    this.part("map").closest("figure").hidden = !heatmap;
     if (this.drawn.map !== heatmap) this.drawMap(heatmap, link.unit("eit.heatmap", "sigma_high"));
     if (heatmap) this.mapText(heatmap, said);
   }

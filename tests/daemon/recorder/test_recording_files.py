@@ -131,6 +131,16 @@ def test_csv_parquet_and_matlab_exports_agree(recording, tmp_path, result_of):
     assert struct["load_torque"]["log_time_ns"].tolist() == [10**18 + i for i in range(4)]
 
 
+@pytest.mark.parametrize(
+    ("out", "written"), [("mine", "mine.mat"), ("mine.mat", "mine.mat"), ("folder", "folder/twist.mat")]
+)
+def test_a_matlab_export_has_the_ending_that_matlab_reads(out, written, recording, tmp_path, result_of):
+    (tmp_path / "folder").mkdir()
+    files = result_of("recording", "export", recording, "--format", "mat", "--out", tmp_path / out)["files"]
+    assert files == [str(tmp_path / written)]
+    assert "load_torque" in loadmat(files[0])
+
+
 def test_csv_is_refused_where_a_later_array_is_longer(tmp_path, mistake):
     with new_recording(tmp_path / "x.mcap", "a bench") as file:
         for length in (3, 4):

@@ -157,7 +157,7 @@ def _leave_out(args: argparse.Namespace) -> int:
         raise UserError(
             f"--nested is for recordings and the estimator {DEFAULT}: only its fit has settings; leave it out"
         )
-    if args.adapt_twists is not None and of_slices(paths):
+    if args.adapt_twists is not None and (args.leave_out == "levels" or of_slices(paths)):
         raise UserError("--adapt-twists is for recordings: slices have no gain to adapt; leave it out")
     if args.estimates is not None:
         check_overwrite(args.estimates, "a table")

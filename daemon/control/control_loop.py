@@ -313,7 +313,8 @@ class ControlLoop:
         )
         self.runs += 1
         # Until the first tick, the status must not show the end of the previous run.
-        self.status = LoopStatus(self.experiment.phase.value, "", WristCommand(), SafetyDecision(Response.NOTE))
+        phase, activity = self.experiment.phase.value, self.experiment.command.activity
+        self.status = LoopStatus(phase, activity, WristCommand(), SafetyDecision(Response.NOTE))
         return None
 
     def pause(self) -> str | None:

@@ -171,7 +171,12 @@ class ControlLoopRunner:
             return refusal
         if self.actions.unlocking:
             return UNLOCKING
-        return self._control_loop.start(file, self._clock.now_ns())
+        now_ns = self._clock.now_ns()
+        refusal = self._control_loop.start(file, now_ns)
+        if refusal is None:
+            # A step that cannot be done ends it within the first decision: every listener sees it begin.
+            self.states.publish_loop(self._sender.sent_rad_per_s, now_ns)
+        return refusal
 
     async def _enable(self) -> str | None:
         """Let the arm move after a power-up, and take a state that shows it; return None, or why not."""

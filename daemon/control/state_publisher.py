@@ -2,12 +2,13 @@
 
 import asyncio
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import structlog
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import Experiment
+from shearloop.daemon.control.safety import FaultCode, Response
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage, cause_of
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.ur.messages import RobotState
@@ -30,7 +31,7 @@ class StatePublisher:
     ended: Experiment | None = None
     _block: int = -1
     _key: tuple[object, ...] = ()
-    _hold: int = 0
+    _logged: "_LogKey | None" = None
     _published_ns: int = 0
 
     def publish_robot(self, state: RobotState) -> bool:
@@ -48,18 +49,19 @@ class StatePublisher:
         status, experiment = self.control_loop.status, self.control_loop.experiment
         key = (
             status.phase,
+            self.control_loop.runs,
             tuple(fault.code for fault in status.decision.faults),
             status.velocity.reasons,
             experiment and experiment.step_number,
+            experiment and experiment.command.hold_number,
         )
-        hold = experiment.command.hold_number if experiment is not None else 0
-        unchanged = (key, hold) == (self._key, self._hold)
-        if unchanged and now_ns - self._published_ns < LOOP_STATE_PERIOD_S * 1e9:
+        if key == self._key and now_ns - self._published_ns < LOOP_STATE_PERIOD_S * 1e9:
             return
         message = loop_state(self.control_loop, sent_rad_per_s, now_ns)
-        if key != self._key:
-            _log(message)
-        self._key, self._hold, self._published_ns = key, hold, now_ns
+        said = _LogKey.of(self.control_loop)
+        if said != self._logged:
+            _log(message, said, self._logged)
+        self._key, self._logged, self._published_ns = key, said, now_ns
         self.publisher.publish(message)
         if experiment is not None and not experiment.running:
             self.ended = experiment
@@ -77,13 +79,37 @@ class StatePublisher:
         self.changed.clear()
 
 
-def _log(message: LoopState) -> None:
+class _LogKey(NamedTuple):
+    """What a line of the log tells: a new line follows a change of it, and not of a number within a sentence."""
+
+    phase: str
+    run: int
+    step: int
+    faults: tuple[FaultCode, ...]
+
+    @classmethod
+    def of(cls, control_loop: ControlLoop) -> "_LogKey":
+        """Return the key of the present state."""
+        status, experiment = control_loop.status, control_loop.experiment
+        moves = control_loop.running is not None
+        # At rest, a fault that would only hold the wrist holds nothing, and comes and goes on a busy computer.
+        told = (one for one in status.decision.reported if moves or one.rule.response is not Response.HOLD)
+        step = experiment.step_number if experiment is not None else 0
+        return cls(status.phase, control_loop.runs, step, tuple(fault.code for fault in told))
+
+
+def _log(message: LoopState, now: _LogKey, before: _LogKey | None) -> None:
     """Log a change of the loop: the cause of a hold or a stop comes first, and once."""
+    log = structlog.get_logger().bind(phase=message.phase)
+    if before is not None and now[:3] == before[:3] and now.faults[:1] in (before.faults[:1], ()):
+        # The cause is known from an earlier line, or has gone.
+        log.info("loop", faults=", ".join(code.text for code in now.faults) or "none")
+        return
     cause = cause_of({"cause": message.cause, "faults": message.faults})
     # After a stop the activity is its reasons.
     activity = "" if message.phase == "stopped" and cause else message.activity
     said = {"cause": cause, "activity": activity}
-    structlog.get_logger().info("loop", phase=message.phase, **{key: text for key, text in said.items() if text})
+    log.info("loop", **{key: text for key, text in said.items() if text})
 
 
 def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) -> LoopState:

@@ -1,0 +1,79 @@
+"""What the loop publishes and logs of its states: every experiment's begin and end, and each change once."""
+
+import pytest
+from structlog.testing import capture_logs
+
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
+from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.samples import GripperStatus
+from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.messaging.messages import wire_map
+from shearloop.daemon.run_summary import RunSummary
+from tests.daemon.control.cell import Cell, driven
+from tests.drivers.ur.handler_bench import SETTINGS
+
+
+class DoubtfulCell(Cell):
+    """A rig whose gripper does not know whether it holds a tool, and may fall silent."""
+
+    def __init__(self) -> None:
+        sources = {WRENCH: wrench_source(SETTINGS.rate_hz)}
+        super().__init__(ControlLoop(LoopConfig(), sources, ("robot", "gripper")))
+        self.silent = False
+
+    def sense(self) -> None:
+        if not self.silent:
+            now_ns = self.robot.bench.now_ns
+            status = GripperStatus(now_ns, 63.5, holding=False, moving=False, uncertain=True)
+            self.control_loop.on_gripper(status)
+
+
+@pytest.mark.parametrize(
+    ("kind", "step"), [(DoubtfulCell, {"do": "tare"}), (Cell, {"do": "hold_torque", "torque_nm": 0.05})]
+)
+async def test_an_experiment_that_fails_in_its_first_decision_ended_by_a_fault(kind, step):
+    summary = RunSummary()
+    async with driven(cell=kind()) as cell:
+        for _ in range(2):
+            await cell.start(step)
+            await cell.until_ended(5)
+            for message in cell.published.messages:
+                summary(message.topic, wire_map(message, 0.0, 0))
+            cell.published.messages.clear()
+            assert not summary.ended_as_asked
+            assert "STOPPED before its end" in summary.text
+            assert f"step 1 of 1  {step['do']}" in summary.text
+            assert await cell.runner.unlock() is None
+            await cell.cycles(5)
+
+
+async def test_a_stop_is_logged_once_however_often_a_state_is_out_of_date():
+    async with driven(cell=DoubtfulCell()) as cell:
+        with capture_logs() as lines:
+            await cell.start({"do": "tare"})
+            await cell.until_ended(5)
+            for _ in range(3):
+                cell.silent = True
+                await cell.cycles(40)
+                assert FaultCode.STATE_STALE.text in cell.published.faults
+                cell.silent = False
+                await cell.cycles(40)
+            assert await cell.runner.unlock() is None
+            await cell.cycles(5)
+    began, stopped, unlocked = (line for line in lines if line["event"] == "loop")
+    assert (began["phase"], began["activity"]) == ("running", "taking the zero of every torque sensor")
+    assert "step 1 (tare) cannot be done" in stopped["cause"]
+    assert (unlocked["faults"], unlocked.get("cause"), unlocked.get("activity")) == ("none", None, None)
+
+
+async def test_a_further_fault_is_logged_by_its_code_alone():
+    async with driven(cell=DoubtfulCell()) as cell:
+        await cell.start({"do": "tare"})
+        await cell.until_ended(5)
+        with capture_logs() as lines:
+            cell.control_loop.on_link("gripper", "the cable is out", up=False)
+            await cell.cycles(5)
+    (line,) = (line for line in lines if line["event"] == "loop")
+    assert line["faults"] == f"{FaultCode.STEP_FAILED.text}, {FaultCode.DEVICE_LOST.text}"
+    assert "cause" not in line

@@ -60,7 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--leave-out", choices=("grips", "twists", "levels", "tools"), help=text)
     text = "with --leave-out: each fit chooses its settings too, so that no choice has seen the block that judges it"
     parser.add_argument("--nested", action="store_true", help=text)
-    text = "with --leave-out: adapt the gain to the first N twists of the judged recording, and judge the later ones"
+    text = "with --leave-out: adapt the gain to the first N twists of the judged grip, and judge the later ones"
     add_option(parser, "--adapt-twists", number(1, 100, int), "N", text)
     add_recipe(parser)
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")

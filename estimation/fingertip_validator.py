@@ -1,4 +1,4 @@
-"""Checks of raw frames: right fingertip, gripped, undisturbed; and the grip in a recording.
+"""Checks of raw frames: right fingertip, gripped, undisturbed.
 
 A fingertip is recognised by its pattern of voltages. From day to day the pattern changes by a common gain and a few
 per cent: the median deviation is 0.03 to 0.07 for the same fingertip and 0.15 to 0.19 for another one. A linear
@@ -15,7 +15,6 @@ from scipy import linalg
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.values import FrameSeries
 
 # One step of the board's converter, measured on recorded frames. Its rounding is the smallest noise.
 _CONVERTER_STEP_V = 0.00215
@@ -49,17 +48,6 @@ _LEAST_IDLE, _LEAST_GRIPPED = 5, 20
 _CLEARLY_NEARER, _SAME_SESSION, _GRIPPED_SCORE = 0.8, 0.01, 0.5
 # A grip ends when its score falls below this share of its mean over this many frames.
 _LOOSE_SHARE, _LEVEL_FRAMES = 0.4, 60
-# A large step exceeds the steps of twisting under load by this factor.
-_LARGE_STEP = 1.4
-# Frames below this share of the way from idle to loaded, in this running median, are idle. Gripped and not twisted they
-# are at 0.57 and more, in recovery from a touch or a release at 0.41 and less.
-_IDLE_SHARE, _MEDIAN_FRAMES = 0.45, 5
-# Fewer loaded frames have no second differences to show the noise.
-_LEAST_LOADED = 3
-# Fewer frames after a step are still its transient.
-_LEAST_RELEASED = 10
-
-
 # A channel that reads 0 in more of a part's frames is dead at calibration.
 _SILENT_SHARE = 0.05
 # The threshold's largest share of the way from idle to the weakest grip.
@@ -91,11 +79,8 @@ class FingertipValidator:
         Each recording is compared with its own idle frames, because the gel drifts between recordings.
         """
         n_idle, n_gripped = (min(len(one[i]) for one in recordings) for i in (0, 1))
-        if n_idle < _LEAST_IDLE or n_gripped < _LEAST_GRIPPED:
-            raise CalibrationError(
-                f"side {side}: {n_idle} idle and {n_gripped} gripped frames are too few to detect a grip; "
-                "start the recording some seconds before gripping"
-            )
+        if few := too_few_frames(n_idle, n_gripped):
+            raise CalibrationError(f"side {side}: {few}")
         bases = [np.median(idle, axis=0) for idle, _, _ in recordings]
         noise = np.sqrt(np.mean([channel_noise(gripped) ** 2 for _, gripped, _ in recordings], axis=0))
         silent = np.max([(part == 0.0).mean(axis=0) for one in recordings for part in one[:2]], axis=0)
@@ -161,6 +146,16 @@ class FingertipValidator:
             return None
         fall = self.grip_score(earlier, idle) - self.grip_score(frame, idle)
         return fall > 0 if abs(fall) > self.fall_limit else None
+
+
+def too_few_frames(n_idle: int, n_gripped: int) -> str:
+    """Return why so many frames before a grip and in it do not show what a grip is, empty where they do."""
+    if n_idle >= _LEAST_IDLE and n_gripped >= _LEAST_GRIPPED:
+        return ""
+    return (
+        f"{n_idle} idle and {n_gripped} gripped frames are too few to detect a grip; start the recording some seconds "
+        "before gripping"
+    )
 
 
 def compare_frames(
@@ -339,77 +334,3 @@ def _discriminant(parts: list[FloatArray]) -> FloatArray:
     q = np.linalg.qr(np.array(nuisance).T)[0]
     direction = step - q @ (q.T @ step)
     return np.asarray(direction / float(direction @ step))
-
-
-def segment_grip(series: FrameSeries) -> tuple[slice, slice, slice]:
-    """Return the frames before the grip, in it, and after it, from the torque, the steps, and the positions.
-
-    Loaded frames are gripped; frames before the first large step are not. The grip begins at the last large step before
-    the first torque, or later where the frames become more like the loaded ones than the idle ones. It ends likewise.
-    Frames of unknown torque belong to neither. Raises CalibrationError for a recording without torque.
-    """
-    known = series.torque_at_frames()
-    if len(known) == 0:
-        sides = f"the side {series.sides[0]}" if len(series.sides) == 1 else f"{' and '.join(series.sides)} together"
-        raise CalibrationError(f"the recording holds no frames of {sides}; record some frames")
-    if not np.isfinite(known).any():
-        raise CalibrationError("no torque is known for these frames; record the load cell with them")
-    torque = np.abs(np.nan_to_num(known))
-    loaded = np.flatnonzero(torque > 0.1 * torque.max(initial=np.finfo(np.float64).tiny))
-    if len(loaded) == 0:
-        raise CalibrationError("the torque is 0 at all of these frames; record twists that the load cell measures")
-    n, span = len(series.t_s), slice(int(loaded[0]), int(loaded[-1]) + 1)
-    if span.stop - span.start < _LEAST_LOADED:
-        raise CalibrationError(
-            f"from the first torque to the last there are {span.stop - span.start} frames, too few to detect a grip; "
-            "record several twists"
-        )
-    step = np.zeros(n)
-    for layer in range(len(series.sides)):
-        frames = series.channels[:, layer]
-        step[STEP_FRAMES:] = np.maximum(step[STEP_FRAMES:], frame_steps(frames, channel_noise(frames[span])))
-    large = np.flatnonzero(step > _LARGE_STEP * float(np.quantile(step[span], 0.99)))
-    before, after = large[large < loaded[0]], large[large > loaded[-1]]
-    begin = int(before[-1]) + 1 if len(before) else 0
-    end = int(after[0]) - 1 if len(after) else n
-    # The transients of closing and opening belong to neither side.
-    idle_end = int(before[0]) - 1 if len(before) else _idle_end_without_step(series.channels, span)
-    let_go = 0
-    for layer in range(len(series.sides)):
-        like_idle = _is_like_idle(series.channels[:, layer], slice(0, idle_end), span)
-        earlier, later = np.flatnonzero(like_idle[: loaded[0]]), np.flatnonzero(like_idle[loaded[-1] :])
-        let_go = max(let_go, int(np.flatnonzero(~like_idle)[-1]) + _MEDIAN_FRAMES // 2)
-        if len(earlier):
-            begin = max(begin, int(earlier[-1]) + _MEDIAN_FRAMES // 2)
-        if len(later):
-            end = min(end, int(loaded[-1] + later[0]) - _MEDIAN_FRAMES // 2)
-    end = min(end, int(np.flatnonzero(np.isfinite(known))[-1]) + 1)
-    released = int(after[-1]) + 1 if len(after) else let_go
-    if n - released < _LEAST_RELEASED:
-        released = n
-    return slice(0, idle_end), slice(begin, end), slice(released, n)
-
-
-def _idle_end_without_step(frames: FloatArray, loaded: slice) -> int:
-    """Return how many of (n, m, c) frames are like the first ones, where no step shows the grip.
-
-    0 where frames between the twists are like the first ones too: then the recording began gripped.
-    """
-    first = slice(0, min(_LEAST_RELEASED, loaded.start // 2))
-    like = np.all([_is_like_idle(frames[:, layer], first, loaded) for layer in range(frames.shape[1])], axis=0)
-    if like[: loaded.start].all() or like[loaded].any():
-        return 0
-    return max(int(np.argmin(like)) - _MEDIAN_FRAMES // 2, 0)
-
-
-def _is_like_idle(frames: FloatArray, idle: slice, loaded: slice) -> BoolArray:
-    """Return which (n, c) frames are nearer to the idle ones than to the loaded ones, along their difference."""
-    if idle.stop == 0:
-        return np.zeros(len(frames), dtype=np.bool_)
-    # Imported here because the daemon does not calibrate: it would slow its start.
-    from scipy.ndimage import median_filter
-
-    base, noise = np.median(frames[idle], axis=0), channel_noise(frames[loaded])
-    moved = (np.median(frames[loaded], axis=0) - base) / noise
-    along = median_filter((frames - base) / noise @ moved, _MEDIAN_FRAMES, mode="nearest")
-    return np.asarray(along < _IDLE_SHARE * float(moved @ moved))

@@ -25,8 +25,9 @@ from shearloop.estimation.estimator import (
     Reading,
 )
 from shearloop.estimation.estimator_names import EstimatorName, estimator_class
-from shearloop.estimation.fingertip_validator import FingertipValidator, segment_grip
+from shearloop.estimation.fingertip_validator import FingertipValidator, too_few_frames
 from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, first_twists, loaded_log_gain
+from shearloop.estimation.grips import Grip, find_grips
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.ridge import CensoredRidge
@@ -103,19 +104,26 @@ def _tools_of(recordings: Sequence[FrameSeries]) -> list[Measured]:
 
 def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
     """Return what an estimator is prepared from."""
-    parts = [segment_grip(one) for one in recordings]
+    grips = [
+        (one.channels, grip)
+        for number, one in enumerate(recordings, 1)
+        for grip in _clear_grips(one, number, len(recordings))
+    ]
     validators = tuple(
-        FingertipValidator.fit(
-            side,
-            *(
-                (one.channels[before, layer], one.channels[during, layer], one.channels[after, layer])
-                for one, (before, during, after) in zip(recordings, parts, strict=True)
-            ),
-        )
+        FingertipValidator.fit(side, *([frames[part, layer] for part in grip] for frames, grip in grips))
         for layer, side in enumerate(recordings[0].sides)
     )
-    grips = [one.channels[during] for one, (_, during, _) in zip(recordings, parts, strict=True)]
-    return Material(np.array([one.noise for one in validators]), physics, recordings[0].table, validators, grips)
+    gripped = [frames[grip.gripped] for frames, grip in grips]
+    return Material(np.array([one.noise for one in validators]), physics, recordings[0].table, validators, gripped)
+
+
+def _clear_grips(recording: FrameSeries, number: int, of: int) -> list[Grip]:
+    """Return the grips with enough frames; raises CalibrationError, naming the recording, where there is none."""
+    grips = find_grips(recording)
+    few = [too_few_frames(one.idle.stop - one.idle.start, one.gripped.stop - one.gripped.start) for one in grips]
+    if all(few):
+        raise CalibrationError(f"recording {number} of {of}: {few[0]}")
+    return [grip for grip, why in zip(grips, few, strict=True) if not why]
 
 
 def _fit_outputs(

@@ -17,7 +17,8 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation.fingertip_validator import channel_noise, segment_grip
+from shearloop.estimation.fingertip_validator import channel_noise
+from shearloop.estimation.grips import segment_grip
 from shearloop.estimation.left_out import left_out_blocks
 from shearloop.estimation.values import FrameSeries, check_finite
 

@@ -18,11 +18,11 @@ from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
 from shearloop.tools.frame_series import Series
-from shearloop.tools.left_out_blocks import Block, Kind, after_twists, find_blocks, kept, tools_of
+from shearloop.tools.left_out_blocks import Block, Kind, after_twists, find_blocks, kept, number_of_grips, tools_of
 from shearloop.tools.parallel import Executor
 from shearloop.words import counted
 
-# Recordings, and so grips, that show how the gain changes from one to the next.
+# Grips that show how the gain changes from one to the next.
 _ENOUGH_GRIPS = 3
 # A tool that is left out needs three others, which determine the gain over the diameter.
 _ENOUGH_TOOLS = 4
@@ -205,8 +205,8 @@ def advice_on(
         return "Another tool has a gain of its own: correct it with `shearloop adapt` on two twists of known torque."
     if against := no_better_than_clock(judged):
         return against
-    if len(recordings) < _ENOUGH_GRIPS:
-        grips = "One grip" if len(recordings) == 1 else "Two grips"
+    if (n_grips := number_of_grips(recordings)) < _ENOUGH_GRIPS:
+        grips = "One grip" if n_grips == 1 else "Two grips"
         return f"{grips} only: record three, because the gain changes from grip to grip."
     return advice_of_coverage(judged, kind)
 

@@ -10,8 +10,8 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
-from shearloop.estimation.fingertip_validator import segment_grip
 from shearloop.estimation.gain import find_twists
+from shearloop.estimation.grips import Grip, find_grips
 from shearloop.estimation.values import Measured, distinct
 from shearloop.tools.frame_series import Series
 from shearloop.words import counted
@@ -55,17 +55,28 @@ def usual_kind(recordings: Sequence[FrameSeries]) -> Kind:
     """Return the widest kind that recordings allow: tools, else grips, else twists."""
     if len(tools_of(recordings)) > 1 and all(one.tool_mm is not None for one in recordings):
         return "tools"
-    return "grips" if len(recordings) > 1 else "twists"
+    return "grips" if number_of_grips(recordings) > 1 else "twists"
+
+
+def number_of_grips(recordings: Sequence[FrameSeries]) -> int:
+    """Return how many grips the recordings hold together."""
+    return sum(len(find_grips(one)) for one in recordings)
 
 
 def _grips(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
-    """Return a block for each recording: one grip."""
-    if len(recordings) < 2:
-        raise UserError(
-            "there is one recording, and so one grip, which leaves nothing to fit; record three, or use --leave-out "
-            "twists"
-        )
-    return [_without_recordings(recordings, [number], name) for number, name in enumerate(names)]
+    """Return a block for each grip, with the idle frames around it: a recording, or a part of one."""
+    blocks: list[Block] = []
+    for number, (series, name) in enumerate(zip(recordings, names, strict=True)):
+        grips = find_grips(series)
+        if len(grips) == 1:
+            blocks.append(_without_recordings(recordings, [number], name))
+            continue
+        for nth, grip in enumerate(grips, 1):
+            span = Span(number, grip.idle.start, grip.released.stop)
+            blocks.append(_without_span(recordings, span, f"grip {nth} of {name}"))
+    if len(blocks) < 2:
+        raise UserError("there is one grip, which leaves nothing to fit; record three, or use --leave-out twists")
+    return blocks
 
 
 def _tools(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
@@ -99,32 +110,41 @@ def _without_recordings(recordings: Sequence[FrameSeries], left_out: Sequence[in
     return Block(name, fitted, tuple(Span(number, 0, len(recordings[number].t_s)) for number in left_out))
 
 
+def _without_span(recordings: Sequence[FrameSeries], span: Span, name: str) -> Block:
+    fitted = [np.ones(len(one.t_s), dtype=np.bool_) for one in recordings]
+    fitted[span.recording][span.first : span.stop] = False
+    return Block(name, tuple(fitted), (span,))
+
+
 def _twists(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
     """Return a block for each twist, from the middle between it and the one before to that between it and the next.
 
-    The first begins with the grip, the last ends with it. A recording of one twist is left out whole.
+    The first of a grip begins with the grip, the last ends with it. A grip of one twist is left out whole.
     """
     blocks: list[Block] = []
     for number, (series, name) in enumerate(zip(recordings, names, strict=True)):
-        edges = _twist_edges(series)
-        for nth, (first, stop) in enumerate(itertools.pairwise(edges), 1):
-            fitted = [np.ones(len(one.t_s), dtype=np.bool_) for one in recordings]
+        grips = find_grips(series)
+        each = [_twist_edges(series, grip) for grip in grips]
+        nth = itertools.count(1)
+        for grip, edges in zip(grips, each, strict=True):
             if len(edges) > 2:
-                fitted[number][first:stop] = False
-            else:
-                fitted[number][:] = False
-            blocks.append(Block(f"twist {nth} of {name}", tuple(fitted), (Span(number, first, stop),)))
+                spans = [Span(number, first, stop) for first, stop in itertools.pairwise(edges)]
+                blocks += [_without_span(recordings, span, f"twist {next(nth)} of {name}") for span in spans]
+                continue
+            rows = (grip.idle.start, grip.released.stop) if len(grips) > 1 else (0, len(series.t_s))
+            without = _without_span(recordings, Span(number, *rows), f"twist {next(nth)} of {name}")
+            blocks.append(replace(without, judged=(Span(number, edges[0], edges[1]),)))
     if len(blocks) < 2:
         raise UserError("there is one twist, which leaves nothing to fit; record ten")
     return blocks
 
 
-def _twist_edges(series: FrameSeries) -> list[int]:
-    """Return the rows between which the twists of a recording lie: the grip, the middles of the pauses, its end."""
-    grip = segment_grip(series)[1]
-    twists = find_twists(np.nan_to_num(series.torque_at_frames()))
+def _twist_edges(series: FrameSeries, grip: Grip) -> list[int]:
+    """Return the rows between which the twists of a grip lie: its begin, the middles of the pauses, its end."""
+    part, torque_nm = slice(grip.idle.start, grip.released.stop), np.nan_to_num(series.torque_at_frames())
+    twists = find_twists(torque_nm[part], float(np.abs(torque_nm).max(initial=0.0)))
     middles = [(int(before[-1]) + int(after[0]) + 1) // 2 for before, after in itertools.pairwise(twists)]
-    return [grip.start, *middles, grip.stop]
+    return [grip.gripped.start, *(part.start + middle for middle in middles), grip.gripped.stop]
 
 
 def kept(recordings: Sequence[Series], rows: Sequence[BoolArray]) -> list[Series]:
@@ -149,26 +169,25 @@ def kept(recordings: Sequence[Series], rows: Sequence[BoolArray]) -> list[Series
 
 
 def after_twists(blocks: Sequence[Block], recordings: Sequence[FrameSeries], n_twists: int) -> list[Block]:
-    """Return blocks that are judged after the gain is adapted to the first twists of their recording.
+    """Return blocks that are judged after the gain is adapted to the first twists of the grip where they begin.
 
     These twists are neither fitted nor judged. Raises UserError where nothing remains to be judged.
     """
-    edges = [_twist_edges(one) for one in recordings]
-    ends = [own[n_twists] if len(own) > n_twists + 1 else 0 for own in edges]
+    grips = [find_grips(one) for one in recordings]
     found: list[Block] = []
     for block in blocks:
-        numbers = {span.recording for span in block.judged}
-        spans = [replace(span, first=max(span.first, ends[span.recording])) for span in block.judged]
-        for number in sorted(numbers):
-            judged = tuple(one for one in spans if one.recording == number and one.first < one.stop)
-            if not judged or not ends[number]:
+        for span in block.judged:
+            series = recordings[span.recording]
+            grip = [one for one in grips[span.recording] if one.idle.start <= span.first][-1]
+            edges = _twist_edges(series, grip)
+            end = edges[n_twists] if len(edges) > n_twists + 1 else span.stop
+            if max(span.first, end) >= span.stop:
                 continue
             fitted = [rows.copy() for rows in block.fitted]
             # The idle frames before the grip hold no twist.
-            fitted[number][edges[number][0] : ends[number]] = False
-            found.append(replace(block, fitted=tuple(fitted), judged=judged, adapted=Span(number, 0, ends[number])))
+            fitted[span.recording][edges[0] : end] = False
+            judged, adapted = replace(span, first=max(span.first, end)), Span(span.recording, grip.idle.start, end)
+            found.append(replace(block, fitted=tuple(fitted), judged=(judged,), adapted=adapted))
     if not found:
-        raise UserError(
-            f"no recording has more than {counted(n_twists, 'twist')}: none remains to be judged; record ten"
-        )
+        raise UserError(f"no grip has more than {counted(n_twists, 'twist')}: none remains to be judged; record ten")
     return found

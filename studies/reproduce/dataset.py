@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.errors import UserError
-from shearloop.estimation.fingertip_validator import segment_grip
+from shearloop.estimation.grips import segment_grip
 from shearloop.studies.slices.curve import ranked_channels
 from shearloop.tools.drawing import figure
 from shearloop.tools.frame_series import series_of

@@ -70,6 +70,38 @@ def twisting(
     return FrameSeries(sides, t, channels, fine, torque, np.full(len(t), np.nan))
 
 
+# Frames of idle, of a twist up or down, and of a rest with the tool gripped.
+IDLE, TURN, REST = 20, 6, 5
+
+
+def elastic(
+    *grips: int, idle: int = IDLE, rest: int = REST, begins_gripped: bool = False, seed: int = 0
+) -> FrameSeries:
+    """Return grips of so many twists in turn, in both directions, with idle frames around each grip.
+
+    The torque follows the twist at once, as on a rig without a lever. With `rest` 0 each twist begins as the grip
+    closes, and the next one as the last ends.
+    """
+    angles = np.concatenate([np.linspace(0, 1, TURN), np.ones(TURN), np.linspace(1, 0, TURN), np.zeros(rest)])
+    closed: list[FloatArray] = []
+    for number, n_twists in enumerate(grips):
+        twists = [sign * angles for sign in np.resize([-1.0, 0.5, 1.0], n_twists)]
+        closed += [
+            np.full(0 if begins_gripped and not number else idle, np.nan),
+            np.concatenate([np.zeros(rest), *twists]),
+        ]
+    angle = np.concatenate([*closed, np.full(idle, np.nan)])
+    random = np.random.default_rng(seed)
+    grip, twist = np.isfinite(angle)[:, None], np.nan_to_num(angle)
+    tips = [tip(number) for number in (1, 2)]
+    clean = np.stack([one.idle + grip * one.grip + twist[:, None] * one.twist for one in tips], axis=1)
+    t_s = PERIOD_S * np.arange(len(angle))
+    fine_s = np.linspace(0.0, t_s[-1], 6 * len(t_s))
+    torque_nm = 0.1 * np.interp(fine_s, t_s, twist)
+    channels = clean + random.normal(0, 0.002, (len(angle), 2, PAPER_TABLE.n_channels))
+    return FrameSeries(("right", "left"), t_s, channels, fine_s, torque_nm, np.full(len(t_s), np.nan))
+
+
 def kept(whole: FrameSeries, rows: BoolArray) -> FrameSeries:
     """Return the frames of a series that are not lost."""
     return replace(whole, t_s=whole.t_s[rows], channels=whole.channels[rows], diameter_mm=whole.diameter_mm[rows])

@@ -14,8 +14,8 @@ from shearloop.estimation.fingertip_validator import (
     FingertipValidator,
     channel_noise,
     compare_frames,
-    segment_grip,
 )
+from shearloop.estimation.grips import segment_grip
 from tests.estimation.conftest import twisting
 
 ALL = np.ones((1, 896), dtype=bool)

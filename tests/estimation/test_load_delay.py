@@ -8,7 +8,7 @@ import pytest
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import TRUSTED, fit, load_delay
-from shearloop.estimation.fingertip_validator import segment_grip
+from shearloop.estimation.grips import segment_grip
 from shearloop.estimation.intervals import student_inflation
 from shearloop.estimation.load_delay import (
     LoadDelay,

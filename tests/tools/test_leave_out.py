@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from shearloop.errors import UserError
+from shearloop.estimation.grips import find_grips
 from shearloop.estimation.values import Estimate, FrameSeries
 from shearloop.studies.slices.evaluate import no_better_than_place
 from shearloop.studies.slices.leave_out import SliceRecipe, find_levels, plan_levels
 from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
 from shearloop.tools.leave_out import Recipe, advice_on, fit_without, plan_left_out, sentences_of
-from shearloop.tools.left_out_blocks import KINDS, after_twists, find_blocks, usual_kind
+from shearloop.tools.left_out_blocks import KINDS, Span, after_twists, find_blocks, usual_kind
 from shearloop.tools.parallel import SerialExecutor
-from tests.estimation.conftest import twisting
+from tests.estimation.conftest import elastic, twisting
 from tests.studies.slices.conftest import sliced
 
 RECIPE = Recipe("motion_regression")
@@ -159,9 +160,36 @@ def test_tools_are_advised_to_adapt_and_counted_by_the_recordings():
     assert "3 tools only: record four" in advice_on("tools", recordings[1:], tracks[1:], adapted=True)
 
 
+def test_each_grip_of_a_recording_is_left_out_in_turn():
+    series = elastic(6, 4)
+    grips = find_grips(series)
+    assert usual_kind([series]) == "grips"
+    blocks = find_blocks("grips", [series], ["a"])
+    assert [one.name for one in blocks] == ["grip 1 of a", "grip 2 of a"]
+    for block, own, other in zip(blocks, grips, grips[::-1], strict=True):
+        rows = block.fitted[0]
+        assert not rows[own.idle.start : own.released.stop].any()
+        assert rows[other.idle.start : other.released.stop].all()
+    result = plan_left_out("grips", RECIPE, [series], ["a"]).judge(SerialExecutor())
+    assert result.figures()["loaded"]["valid_fraction"] > 0.5
+    assert "Two grips only: record three" in sentences_of(result)[-1]
+
+
+def test_no_twist_reaches_from_one_grip_into_the_next():
+    series = elastic(6, 4)
+    grips = find_grips(series)
+    spans = [block.judged[0] for block in find_blocks("twists", [series], ["a"])]
+    assert len(spans) == 10
+    assert (spans[0].first, spans[5].stop) == (grips[0].gripped.start, grips[0].gripped.stop)
+    assert (spans[6].first, spans[9].stop) == (grips[1].gripped.start, grips[1].gripped.stop)
+    # The gain is adapted to the twists of the grip that is judged.
+    adapted = after_twists(find_blocks("grips", [series], ["a"]), [series], 2)
+    assert [one.adapted for one in adapted] == [Span(0, 0, spans[1].stop), Span(0, grips[1].idle.start, spans[7].stop)]
+
+
 def test_nothing_remains_after_as_many_twists_as_there_are():
     recordings = MATERIAL["grips"]()
-    with pytest.raises(UserError, match="no recording has more than 3 twists"):
+    with pytest.raises(UserError, match="no grip has more than 3 twists"):
         after_twists(find_blocks("grips", recordings, ["a", "b"]), recordings, 3)
 
 
@@ -171,7 +199,7 @@ def test_nothing_remains_after_as_many_twists_as_there_are():
         ("twists", lambda: [twisting(cycles=1, tips=(1,))], "there is one twist, which leaves nothing to fit"),
         ("tools", lambda: [of_tool(10.0, 1)], "there is one tool, of 10 mm"),
         ("tools", lambda: [twisting(cycles=3, tips=(1,))], "name it with --tool-mm"),
-        ("grips", lambda: [twisting(cycles=3, tips=(1,))], "one recording, and so one grip"),
+        ("grips", lambda: [twisting(cycles=3, tips=(1,))], "there is one grip, which leaves nothing to fit"),
         ("twists", lambda: [sliced()], "use --leave-out levels"),
         ("levels", lambda: [sliced().between(0, 12)], "record 20 or more"),
     ],

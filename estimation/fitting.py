@@ -110,7 +110,13 @@ def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
         for grip in _clear_grips(one, number, len(recordings))
     ]
     validators = tuple(
-        FingertipValidator.fit(side, *([frames[part, layer] for part in grip] for frames, grip in grips))
+        FingertipValidator.fit(
+            side,
+            *(
+                (frames[grip.idle, layer], frames[grip.gripped, layer], frames[grip.released, layer])
+                for frames, grip in grips
+            ),
+        )
         for layer, side in enumerate(recordings[0].sides)
     )
     gripped = [frames[grip.gripped] for frames, grip in grips]

@@ -125,7 +125,8 @@ def _find_openings(channels: FloatArray, is_loaded: BoolArray) -> list[int]:
     span = slice(int(loaded[0]), int(loaded[-1]) + 1)
     first = slice(0, min(_LEAST_RELEASED, span.start // 2))
     ways = np.array([_way_to_loaded(channels[:, layer], first, span) for layer in range(channels.shape[1])])
-    is_idle, way, half = (ways < _IDLE_SHARE).all(axis=0), ways.mean(axis=0), STEP_FRAMES // 2
+    is_idle: BoolArray = np.all(ways < _IDLE_SHARE, axis=0)
+    way, half = ways.mean(axis=0), STEP_FRAMES // 2
     # By how much each frame's surroundings move along the way.
     padded = np.pad(way, half, mode="edge")
     moved = np.abs(padded[2 * half :] - padded[: -2 * half])

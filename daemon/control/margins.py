@@ -37,6 +37,8 @@ _FREQUENCIES = 4000
 # Above this gain the loop follows single measurements rather than their mean.
 MOST_GAIN = 0.5
 LEAST_GAIN = 1e-3
+# An automatic gain without the required margins is lowered to this share, at most so many times.
+LOWERED_TO, MOST_LOWERINGS = 0.8, 3
 # The delay margin that a controller must have, in measurement periods.
 DELAY_MARGIN_PERIODS = 1.0
 
@@ -267,6 +269,21 @@ def passing_gain(model: LoopModel, config: LoopConfig) -> float | None:
     limit = _limit(passes, np.geomspace(LEAST_GAIN, MOST_GAIN, 25))
     # Rounded to three digits, it passes as well.
     return min(0.99 * limit, MOST_GAIN) if limit > LEAST_GAIN else None
+
+
+def with_margins(settings: ControllerSettings, found: ToolModel, config: LoopConfig) -> ControllerSettings:
+    """Return the settings with a gain that is lowered until it has the required margins, never raised.
+
+    After MOST_LOWERINGS without them the settings are returned as they are: the loop waits for the result.
+    """
+    model = loop_model(settings, found)
+    if _sees_its_own_correction(model):
+        return settings
+    for number in range(MOST_LOWERINGS + 1):
+        lowered = with_gain(model, settings.kp * LOWERED_TO**number)
+        if _passes(margins(lowered), config, found.sample_period_s):
+            return replace(settings, kp=lowered.kp, ki=lowered.ki)
+    return settings
 
 
 def margin_refusal(settings: ControllerSettings, found: ToolModel, config: LoopConfig) -> str | None:

@@ -6,7 +6,7 @@ from collections import deque
 from shearloop.daemon.control.experiment import ConstantVelocity, Hold, MoveToAngle, TrackTorque, WristSetpoint
 from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
-from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
+from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal, with_margins
 from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.control.torque_controller import (
     LONGEST_STEP_NS,
@@ -98,6 +98,9 @@ class WristController:
         if tool is None:
             return "the tool has not been identified; put an `identify` step before the first `hold_torque`"
         settings = controller_settings(self._config, tool, self.source, setpoint, torque_limit_nm)
+        if self._config.kp is None:
+            # A person's gain is refused rather than changed.
+            settings = with_margins(settings, tool, self._config)
         if refusal := margin_refusal(settings, tool, self._config):
             return refusal
         if self.controller is None:

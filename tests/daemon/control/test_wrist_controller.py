@@ -88,3 +88,20 @@ def test_each_torque_has_its_own_ramp_and_limit():
         one.sent(speed)
         angle_rad += speed * CYCLE_NS / 1e9
     assert 0.2 * angle_rad == pytest.approx(0.01 * 500 * CYCLE_NS / 1e9, rel=0.15)
+
+
+# A load cell after a `tighten`: the torque lags behind its stamps, and the noise alone would allow the greatest gain.
+LAGGING = ToolModel(
+    stiffness_nm_per_rad=0.768, stiffness_std=0.005, lag_s=0.06, lag_std_s=0.005, age_s=0.15, actuation_s=0.02,
+    noise_nm=0.0011, sample_period_s=0.156, angle_rad=0.0, torque_nm=0.16, torque_std_nm=0.0005,
+)  # fmt: skip
+
+
+def test_the_automatic_gain_is_lowered_until_its_margins_pass_and_a_persons_is_refused():
+    for kp in (None, 0.5):
+        one = wrist(LoopConfig(kp=kp, gain_margin=4.0))
+        one.tool = LAGGING
+        refusal = one.close_loop(TrackTorque(0.05, 0.04), 10**9, 0.0, torque_limit_nm=0.4)
+        assert (refusal is None) == (kp is None), refusal
+        if kp is None:
+            assert one.controller.settings.kp == pytest.approx(0.4)

@@ -81,8 +81,11 @@ class Plan:
         yield f"plan of {self.name!r}, driven by {self.torque_source}, about {_duration(self.duration_s)}:"
         for step in self.steps:
             yield from step.sentences()
+        torque = f"{self.torque_nm:g} N·m"
+        if any(step.do in ("twist", "identify") for step in self.steps):
+            torque += " where a torque is asked for, and a torque not known before where the tool turns by an angle"
         yield (
-            f"  at most {_angle(self.angle_rad)} in a step, {self.torque_nm:g} N·m, fingers "
+            f"  at most {_angle(self.angle_rad)} in a step, {torque}, fingers "
             f"{self.force_n:g} N; its limits stop it at {self.limit_nm:g} N·m and {_angle(self.limit_rad)} from "
             "the grip"
         )

@@ -67,6 +67,14 @@ def test_turns_that_add_up_to_more_than_the_limit_are_pointed_out(tmp_path, resu
     )
 
 
+def test_the_torque_of_a_twist_is_said_to_be_unknown(tmp_path, ran):
+    twist = {"do": "twist", "angles_rad": "-0.25:0.25:5"}
+    said = ran("check", written(tmp_path, GRIP, twist, limits={"torque_nm": 0.4})).out
+    assert "a torque not known before where the tool turns by an angle" in said
+    assert "its limits stop it at 0.4 N·m" in said
+    assert "not known before" not in ran("check", written(tmp_path, GRIP, TIGHTEN)).out
+
+
 OUTSIDE = [
     ({"do": "approach", "pose_m_rad": [0.4, 0.1, 1.2, 0, 3.1, 0]}, "approach ends at z = 1.2 m, outside the robot's"),
     ({"do": "retreat", "pose_m_rad": [0.4, -0.79, 0.2, 0, 3.1, 0]}, "retreat ends at y = -0.79 m, outside the robot's"),

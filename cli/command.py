@@ -118,7 +118,8 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
         from shearloop.tools.task_row import task_row
 
         rows = [task_row(task, facts) for task, facts in reply["tasks"].items()]
-        loop = [loop_line(reply["loop"]), ""] if "loop" in reply else []
+        # The cause has a line of its own; `--json` has every reason.
+        loop = [*loop_line(reply["loop"]).split("  ", 1), ""] if "loop" in reply else []
         cap = [f"{reply['cap'][0].upper()}{reply['cap'][1:]}.", ""] if reply.get("cap") else []
         return [*loop, *cap, *table(("task", "state", "rate", "notes"), rows)]
     if name == "experiments":

@@ -21,7 +21,10 @@ from shearloop.errors import UserError
 EXPERIMENTS = "experiments"
 STOP_DELAY_S = 0.05
 # What `status` shows of `loop.state`.
-LOOP_KEYS = ("phase", "run", "experiment", "step", "steps", "step_name", "activity", "progress", "reasons")
+LOOP_KEYS = (
+    *("phase", "run", "experiment", "step", "steps", "step_name", "activity", "progress"),
+    *("cause", "faults", "reasons"),
+)
 
 
 class Answered(NamedTuple):

@@ -23,10 +23,12 @@ import zmq.asyncio
 from shearloop.bank.models import MODELS
 from shearloop.cli import COMMANDS, GROUPS, OTHER_SPELLINGS, command_module, main
 from shearloop.cli.bank import MODEL_NAMES
+from shearloop.cli.command import _lines
 from shearloop.cli.completion import arguments_of, full_parser, parts_of
 from shearloop.cli.options import path_of
 from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
 from shearloop.daemon.app import Daemon
+from shearloop.daemon.commands import LOOP_KEYS
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.loop_runner import WRENCH
 from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
@@ -504,6 +506,20 @@ def test_the_status_line_is_redrawn_in_place(monkeypatch):
     assert loop_line(stopped) == "stopped: the operator stopped it  step 2 of 3 grip"
     held = {**state, "phase": "held", "activity": "closing", "reasons": "no estimate"}
     assert loop_line(held) == "held 50 %: no estimate  step 2 of 3 grip  closing", "what is cut matters less"
+
+
+def test_the_status_gives_the_cause_then_the_step():
+    assert {"cause", "faults"} <= set(LOOP_KEYS)
+    step = {"experiment": "one", "step": 2, "steps": 3, "step_name": "grip", "progress": 0.5, "activity": ""}
+    loop = {
+        **step,
+        "phase": "stopped",
+        "cause": "it slipped.",
+        "faults": "grip lost",
+        "reasons": "it slipped. And more.",
+    }
+    lines = _lines("status", {"tasks": {}, "loop": loop})
+    assert lines[:2] == ["stopped: it slipped.", "step 2 of 3 grip"]
 
 
 def test_a_second_daemon_is_refused_before_its_emulators_start(config, tmp_path, monkeypatch, mistake):

@@ -162,7 +162,7 @@ def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(motion_calibrati
 
 def test_the_tool_of_a_calibration_is_the_one_that_the_gripper_held(recorded, monkeypatch):
     """Two grips of one tool differ by less than the gripper can tell; two tools are not one."""
-    monkeypatch.setattr(fitting, "_fit_raw", lambda blank, *_: blank)
+    monkeypatch.setattr(fitting, "_fit_outputs", lambda blank, *_: blank)
 
     def named(*held):
         series = [replace(recorded, gripper_mm=tool) for tool in held]

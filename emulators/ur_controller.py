@@ -108,7 +108,7 @@ class Controller:
                     self._send(writer, session.data())
             for event in self.robot.take_events():
                 if event.name in _ERROR_CODES:
-                    self._report(*_ERROR_CODES[event.name])
+                    self.report_error(*_ERROR_CODES[event.name])
                 yield event
 
     def command(self, line: str) -> None:
@@ -231,7 +231,7 @@ class Controller:
             finally:
                 self._told.discard(writer)
 
-    def _report(self, code: int, argument: int, level: int) -> None:
+    def report_error(self, code: int, argument: int = 0, level: int = 2) -> None:
         """Send an error code to the clients of the Primary Client Interface."""
         content = struct.pack(
             ">QbBiiiII", round(self.robot.clock_s * 1e6), -2, _CODE_MESSAGE, code, argument, level, 0, 0
@@ -301,6 +301,7 @@ _WITH_NUMBER: dict[str, tuple[float, float, str, Callable[[Controller, float], N
         lambda one, x: setattr(one.robot.arm, "braking_rad_per_s2", x),
     ),
     "bias": (-100.0, 100.0, "not a force in N from -100 to 100", _set_bias),
+    "error-code": (1, 9999, "not a code from 1 to 9999", lambda one, code: one.report_error(int(code))),
     "hang": (0.0, 20.0, "not a mass in kg from 0 to 20", lambda one, x: setattr(one.robot.arm, "hung_kg", x)),
 }
 FAULTS = (

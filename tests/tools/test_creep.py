@@ -115,7 +115,8 @@ def test_a_grip_is_a_stretch_of_torques_and_single_frames_do_not_end_it():
 
 def played(monkeypatch: pytest.MonkeyPatch, found: EstimateTrack) -> None:
     """Have every recording and every calibration give these estimates."""
-    loaded = SimpleNamespace(sides=("right",), kind="raw")
+    loaded = SimpleNamespace(sides=("right",))
+    monkeypatch.setattr("shearloop.cli.calibrate.creep.judges_slices", lambda *_: False)
     monkeypatch.setattr("shearloop.estimation.Calibration.load", lambda _: loaded)
     monkeypatch.setattr("shearloop.tools.frame_series.read_series", lambda *_: [found.series])
     monkeypatch.setattr("shearloop.tools.evaluate.estimate_series", lambda *_: found)

@@ -16,7 +16,7 @@ from shearloop.errors import UserError
 from shearloop.tools.commission import boards, gripper, identity, motion, rtde, stops, tool, wrench
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.operator import Operator
-from shearloop.tools.commission.report import Measured, open_report, save_report
+from shearloop.tools.commission.report import Measured, earlier_report, report_for, save_report
 
 Measure = Callable[[Context], Measured]
 
@@ -48,23 +48,26 @@ def commission(
     settings = real_settings(config)
     if settings is None:
         raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
+    # Before any device is asked: it may be the name of another file.
+    earlier = earlier_report(out)
     with ExitStack() as opened:
         # A daemon would drive the robot at the same time.
         opened.enter_context(lock_robot(settings.host))
-        return _run(config, settings, out, operator, counts, only, opened)
+        return _run(config, settings, out, earlier, operator, counts, only, opened)
 
 
 def _run(
     config: DaemonConfig,
     settings: UrSettings,
     out: Path,
+    earlier: Report | None,
     operator: Operator,
     counts: Counts,
     only: Sequence[str],
     opened: ExitStack,
 ) -> tuple[Report, Path]:
     controller = query_controller(settings.host, settings.connect_timeout_s)
-    report = open_report(out, identity_of(config, controller.version, controller.serial_number))
+    report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)
     if config.emulated:
         operator.say("EMULATED: the report will say so.")
     name = operator.ask("Your name:")

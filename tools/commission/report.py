@@ -74,14 +74,15 @@ def _row(kind: str, cells: Iterable[str], verdict: str = "") -> str:
     return f"<tr class='{verdict}'>{''.join(f'<{kind}>{escape(cell)}</{kind}>' for cell in cells)}</tr>"
 
 
-def open_report(path: Path, rig: RigIdentity) -> Report:
-    """Return the report in a file, to continue it, or a new one of this rig if the file does not exist.
+def earlier_report(path: Path) -> Report | None:
+    """Return the report in a file, to continue it, or None if the file does not exist; UserError for another file."""
+    return load_report(path) if path.exists() else None
 
-    Raises UserError for a file that is no report, or one of another rig or of other settings.
-    """
-    if not path.exists():
+
+def report_for(rig: RigIdentity, found: Report | None, path: Path) -> Report:
+    """Return the report `found` in `path`, or a new one; UserError if it is of another rig or of other settings."""
+    if found is None:
         return Report(rig=rig)
-    found = load_report(path)
     if differs := list(found.rig.differences(rig)):
         raise UserError(
             f"{path}: {' and '.join(differs)} changed since this report was begun, and its results are of the old "

@@ -20,7 +20,7 @@ class Blank:
         ("explode", "'explode' is no command; there are kick NM"),
         ("kick hard", "'hard' is no torque in N·m"),
         ("kick 0.1", "kick needs a tool in the grip"),
-        ("joint loose", "there are kick NM, slip .NM., joint lever.tight"),
+        ("joint loose", "there are kick NM, slip .NM., weigh NM, flip load, joint lever.tight"),
         ("unplug toaster", "there is no device 'toaster'; there are right, left, load, gripper, robot"),
         ("right explode", "there is no fault 'explode'"),
         ("gripper fault 99", "'99' is not a fault code"),

@@ -385,7 +385,7 @@ def test_unusable_files_are_refused_by_name(mat_folder, tmp_path):
     ):
         with pytest.raises(UserError, match=why):
             import_mat(sources, tmp_path / "a.mcap")
-    with pytest.raises(UserError, match="without slices"):
+    with pytest.raises(UserError, match="is a folder; name a recording"):
         read_series(tmp_path / "empty")
 
 

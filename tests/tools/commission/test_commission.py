@@ -21,7 +21,7 @@ from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 from shearloop.tools.commission.identity import Identity, judge_identity
-from shearloop.tools.commission.report import open_report, save_report
+from shearloop.tools.commission.report import earlier_report, report_for, save_report
 from tests.emulator_process import EmulatorProcess
 
 SIX = (0.0,) * 6
@@ -83,10 +83,10 @@ def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
     )
     path = tmp_path / "report.yaml"
     save_report(path, begun.with_stage(bad))
-    found = open_report(path, RIG)
+    found = report_for(RIG, earlier_report(path), path)
     assert (found.stages, found.passed) == ((bad,), False)
     page = save_report(path, found.with_stage(good), ["4 stops"])
-    assert open_report(path, RIG).stages == (good,)
+    assert report_for(RIG, earlier_report(path), path).stages == (good,)
     text = page.read_text()
     HTMLParser().feed(text)
     assert "&lt;v&gt;" in text, "an operator's words are no markup"
@@ -100,7 +100,7 @@ def test_a_report_of_another_rig_is_not_continued(tmp_path, changed):
     save_report(path, Report(rig=RIG))
     other = RIG.model_copy(update={changed: True if changed == "emulated" else "other"})
     with pytest.raises(UserError, match="changed since this report was begun"):
-        open_report(path, other)
+        report_for(other, earlier_report(path), path)
 
 
 @pytest.mark.usefixtures("ur_rtde")

@@ -132,7 +132,7 @@ def check_tables(one: Recorded, out: Path, ran: Any) -> None:
     rows, columns = one.rows(), one.columns()
     for form in ("csv", "parquet", "mat"):
         ran("recording", "export", one.path, "--format", form, "--out", out / form)
-    structs = loadmat(out / "mat", squeeze_me=False)
+    structs = loadmat(out / "mat.mat", squeeze_me=False)
     read = shearloop.read(one.path)
     assert set(read) == set(rows)
     for topic, expected in rows.items():

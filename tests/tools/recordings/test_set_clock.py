@@ -239,7 +239,7 @@ def test_bunched_readings_keep_their_places_in_every_table(set_s, age, tmp_path,
         ran("recording", "export", path, "--format", form, "--topic", "load.torque", "--out", tmp_path / form)
     with (tmp_path / "csv" / "load.torque.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    struct = loadmat(tmp_path / "mat", squeeze_me=True)["load_torque"]
+    struct = loadmat(tmp_path / "mat.mat", squeeze_me=True)["load_torque"]
     tables = {
         "csv": {key: [row[key] for row in rows] for key in rows[0]},
         "parquet": parquet.read_table(tmp_path / "parquet" / "load.torque.parquet").to_pydict(),

@@ -48,7 +48,7 @@ def test_each_way_out_has_the_messages_units(tmp_path, ran):
         ran("recording", "export", one.path, "--format", form, "--out", tmp_path / form)
     assert csv_units(tmp_path / "csv" / "units.csv") == expected
     read = shearloop.read(one.path)
-    (structs,) = loadmat(tmp_path / "mat", squeeze_me=True)["units"].reshape(1)
+    (structs,) = loadmat(tmp_path / "mat.mat", squeeze_me=True)["units"].reshape(1)
     assert len(structs.dtype.names) == len(expected)
     for topic, units in expected.items():
         fields = parquet.read_schema(tmp_path / "parquet" / f"{topic}.parquet")

@@ -95,7 +95,7 @@ async def record(config: Path, lines: dict[str, list[bytes]], monkeypatch: pytes
     monkeypatch.setattr(SerialLink, "_connect", connect)
     async with asyncio.timeout(DEADLINE_S), running_daemon(config) as daemon:
         daemon.publisher.add_listener(listen)
-        right = daemon.sensors.tasks["right"].pipeline
+        right = daemon.sensors.tasks["right"]
         right.gripper = Gripper(right, Measured(OTHER_MM, 0.5), OTHER_TOOL)
         await all_done.wait()
     return published

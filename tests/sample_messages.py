@@ -1,7 +1,9 @@
 """A message of any topic with something in every key."""
 
 import dataclasses
+import functools
 import time
+from collections.abc import Mapping
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -9,11 +11,17 @@ import numpy as np
 from shearloop.daemon.messaging.messages import Message
 
 
+@functools.cache
+def hints_of(kind: type[Message]) -> Mapping[str, Any]:
+    """Return the types of a message's keys; to read them takes long."""
+    return get_type_hints(kind)
+
+
 def sample(kind: type[Message], **changes: Any) -> Message:
     """Return a message of this moment with something in every key."""
     values: dict[str, Any] = {}
     for item in dataclasses.fields(kind):
-        hint = str(get_type_hints(kind)[item.name])
+        hint = str(hints_of(kind)[item.name])
         # Of NumPy's array types: numpy.ndarray[…], or from 2.5 on numpy.typing.NDArray[…].
         if "ndarray" in hint.lower():
             values[item.name] = np.arange(6.0).reshape(2, 3)

@@ -4,7 +4,7 @@ import dataclasses
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 import numpy as np
 from mcap.reader import make_reader
@@ -14,7 +14,7 @@ from shearloop.daemon.messaging.messages import TOPICS, Message, wire_map
 from shearloop.daemon.recorder.recorder import Identity, Recorder
 from shearloop.daemon.recorder.schema import basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
-from tests.sample_messages import sample
+from tests.sample_messages import hints_of, sample
 
 Row = dict[str, Any]
 Published = list[tuple[str, Row]]
@@ -90,9 +90,9 @@ class Held(Clock):
 
 def distinct(kind: type[Message], number: int, source: str, t_ns: int) -> Message:
     """Return a message in which no two numbers are alike; every third one has nothing in each key that may be empty."""
-    changes, hints = Row(), get_type_hints(kind)
+    changes, hints, plain = Row(), hints_of(kind), sample(kind)
     for place, item in enumerate(dataclasses.fields(kind)):
-        value = getattr(sample(kind), item.name)
+        value = getattr(plain, item.name)
         own = 1000 * number + place + 0.125
         optional = type(None) in get_args(hints[item.name])
         if number % 3 == 1 and (optional or hints[item.name] is float) and item.name != "age_s":
@@ -113,7 +113,7 @@ def distinct(kind: type[Message], number: int, source: str, t_ns: int) -> Messag
         changes |= {"line": np.arange(1024) / 2048 + number, "channels": np.arange(896) / 2048, "age_s": 0.25}
         if number % 3 == 1:
             changes["line"] = np.where(np.arange(1024) % 7, changes["line"], np.nan)
-    return dataclasses.replace(sample(kind), **{**changes, "source": source, "t_mono_ns": t_ns})
+    return dataclasses.replace(plain, **{**changes, "source": source, "t_mono_ns": t_ns})
 
 
 def made(folder: Path, topics: Iterable[str] = TOPICS) -> Recorded:

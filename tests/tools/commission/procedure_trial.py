@@ -1,4 +1,8 @@
-"""The whole procedure on the emulated rig with scripted answers, and each seeded fault on its own line."""
+"""The whole procedure on the emulated rig with scripted answers, and each seeded fault on its own line.
+
+Its limits are a real rig's, so that it needs a quiet computer; `make test` does not select it. Run it alone:
+`.venv/bin/pytest tests/tools/commission/procedure_trial.py`.
+"""
 
 import json
 import subprocess

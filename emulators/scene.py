@@ -177,7 +177,7 @@ class Scene:
         self._speed = speed
         self._wrist_rad = 0.0
         self._slips_to_nm: float | None = None
-        # On the load cell alone: a torque beside the tool's, and the sign of a cell that is mounted the other way.
+        # On the load cell alone: a torque on top of the tool's, and the sign of a cell that is mounted the other way.
         self.load_nm, self.load_sign = 0.0, 1.0
         self._states = deque([(0.0, TwinState())])
 

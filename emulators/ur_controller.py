@@ -68,8 +68,7 @@ class Controller:
         self._silent_until_s = 0.0
         self._rtde: dict[asyncio.StreamWriter, RtdeSession] = {}
         self._connections: Connections = {}
-        # Those of the Primary Client Interface.
-        self._told: set[asyncio.StreamWriter] = set()
+        self._primary_clients: set[asyncio.StreamWriter] = set()
 
     @asynccontextmanager
     async def open(self) -> AsyncIterator[None]:
@@ -222,21 +221,21 @@ class Controller:
 
     async def _serve_primary(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with connected(writer, self._connections):
-            self._told.add(writer)
+            self._primary_clients.add(writer)
             try:
                 # The version comes first, and states ten times a second, which no client of ours reads.
                 self._send(writer, _package(_ROBOT_STATE, bytes(8)))
                 while await reader.read(4096):
                     pass
             finally:
-                self._told.discard(writer)
+                self._primary_clients.discard(writer)
 
     def report_error(self, code: int, argument: int = 0, level: int = 2) -> None:
         """Send an error code to the clients of the Primary Client Interface."""
         content = struct.pack(
             ">QbBiiiII", round(self.robot.clock_s * 1e6), -2, _CODE_MESSAGE, code, argument, level, 0, 0
         )
-        for writer in self._told:
+        for writer in self._primary_clients:
             self._send(writer, _package(_ROBOT_MESSAGE, content))
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

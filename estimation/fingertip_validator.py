@@ -149,7 +149,7 @@ class FingertipValidator:
 
 
 def too_few_frames(n_idle: int, n_gripped: int) -> str:
-    """Return why so many frames before a grip and in it do not show what a grip is, empty where they do."""
+    """Return why the frames before a grip and in it are too few to define a grip; empty if they are enough."""
     if n_idle >= _LEAST_IDLE and n_gripped >= _LEAST_GRIPPED:
         return ""
     return (

@@ -53,7 +53,7 @@ class Judge(Protocol):
 class Recipe:
     """How a calibration is made: estimator, files of bank and mesh, and the known facts of torques and their times.
 
-    With `nested` each fit chooses its settings too, which else are those of `shearloop calibrate`.
+    With `nested` each fit chooses its settings too; otherwise they are those of `shearloop calibrate`.
     """
 
     estimator: EstimatorName

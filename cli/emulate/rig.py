@@ -37,7 +37,7 @@ Commands, one a line on standard input:
   object MM | object none     put something of that width between the fingers, or take it away
   silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot
   unplug DEVICE [SECONDS]     disconnect a device, without a number until `replug DEVICE`
-  weigh NM                    put a torque on the load cell, beside the tool's
+  weigh NM                    add a torque to the load cell's, on top of the tool's
   flip load                   turn the load cell's sign
   right|left FAULT            any fault of `emulate eit-kit`, for instance right cut-line
   load FAULT                  any fault of `emulate hx711`, for instance load spike

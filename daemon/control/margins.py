@@ -37,7 +37,7 @@ _FREQUENCIES = 4000
 # Above this gain the loop follows single measurements rather than their mean.
 MOST_GAIN = 0.5
 LEAST_GAIN = 1e-3
-# An automatic gain without the required margins is lowered to this share, at most so many times.
+# An automatic gain without the required margins is lowered to this fraction, at most this number of times.
 LOWERED_TO, MOST_LOWERINGS = 0.8, 3
 # The delay margin that a controller must have, in measurement periods.
 DELAY_MARGIN_PERIODS = 1.0

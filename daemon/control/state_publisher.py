@@ -93,9 +93,9 @@ class _LogKey(NamedTuple):
         status, experiment = control_loop.status, control_loop.experiment
         moves = control_loop.running is not None
         # At rest, a fault that would only hold the wrist holds nothing, and comes and goes on a busy computer.
-        told = (one for one in status.decision.reported if moves or one.rule.response is not Response.HOLD)
+        shown = (one for one in status.decision.reported if moves or one.rule.response is not Response.HOLD)
         step = experiment.step_number if experiment is not None else 0
-        return cls(status.phase, control_loop.runs, step, tuple(fault.code for fault in told))
+        return cls(status.phase, control_loop.runs, step, tuple(fault.code for fault in shown))
 
 
 def _log(message: LoopState, now: _LogKey, before: _LogKey | None) -> None:

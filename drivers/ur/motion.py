@@ -42,8 +42,8 @@ ACCELERATION_S = 0.04
 PAYLOAD_KG, TOOL_M_RAD = 0.01, 1e-3
 # A motion has ended after this number of successive samples at rest.
 REST_SAMPLES = 3
-# The time allowed for a motion to end: nominal time × factor + constant. The constant is at least so many silences: an
-# emulated robot's time stands still while its computer is busy.
+# The time allowed for a motion to end: nominal time × factor + constant. The constant is at least this number of
+# silences: an emulated robot's time stands still while its computer is busy.
 MOVE_SLACK_S, STOP_SLACK_S, SLACK = 2.0, 1.0, 1.5
 MOVE_SILENCES, STOP_SILENCES = 6.0, 3.0
 # The controller rounds its factors on speeds; the slider's steps are 1 %.

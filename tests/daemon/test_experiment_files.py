@@ -125,7 +125,7 @@ async def test_the_event_loop_goes_on_while_a_large_file_is_read(folder):
 
 
 class SlowDrive:
-    """A drive that is asked for a file and does not answer until it is told to."""
+    """A drive that is asked for a file and answers only when the test lets it."""
 
     def __init__(self) -> None:
         self.asked, self.answers = threading.Event(), threading.Event()

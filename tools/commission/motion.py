@@ -28,7 +28,7 @@ _COMES_TO_REST_S: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One turn: when it was sent, what was asked, and its samples."""
+    """One turn: the time of its command, the commanded speed, and its samples."""
 
     sent_ns: int
     asked_rad_per_s: float

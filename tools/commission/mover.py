@@ -106,7 +106,7 @@ class Mover:
         self._process = self._reader = None
 
     def stop_worker(self) -> int:
-        """Stop the worker process by SIGSTOP, so that nobody feeds the robot's watchdog; return when."""
+        """Stop the worker process by SIGSTOP, so that the robot's watchdog gets no commands; return the time."""
         stopped_ns = time.monotonic_ns()
         os.kill(self._worker, signal.SIGSTOP)
         return stopped_ns

@@ -1,4 +1,4 @@
-"""What a commissioning asks of the person beside the robot."""
+"""The questions of a commissioning to the person at the robot."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

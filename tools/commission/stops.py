@@ -151,7 +151,7 @@ def judge_stops(stops: Sequence[Stop], speed: float) -> list[Line]:
 
 
 def _watchdog(context: Context) -> Line:
-    """Return the line on the robot's watchdog alone: a program that nobody feeds ends, here while the arm stands."""
+    """Return the line on the robot's watchdog alone: a program without commands ends, here while the arm stands."""
     mover, observer, settings = context.ready(), context.observer, context.settings
     longest_s = 1.0 / settings.watchdog_hz + 2 / settings.rate_hz + _RESOLUTION_S
     times = []

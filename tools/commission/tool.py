@@ -100,7 +100,7 @@ async def _grips(context: Context, config: GripperConfig) -> list[Line]:
 
 
 def _hold(context: Context, load: LoadCellListener) -> Held:
-    """Return what is measured while the wrist stands."""
+    """Return the measurements at a wrist that stands."""
     load_nm = load.mean_nm(_HELD_S)
     outputs = context.observer.latest().outputs
     reading = read(context)
@@ -198,7 +198,7 @@ def judge_twists(held: Sequence[Held], spring: float) -> list[Line]:
     ]
     found = abs(statistics.fmean(stiffnesses))
     largest_nm = max(abs(one.load_nm - first.load_nm) for one in twisted)
-    # What the last angle, a little beside the first, explains is no slip.
+    # The last angle differs a little from the first, and explains a part of the torque; the rest is slip.
     expected_nm = statistics.fmean(stiffnesses) * (last.wrist_rad - first.wrist_rad)
     slip = abs(last.load_nm - first.load_nm - expected_nm) / largest_nm if largest_nm else 1.0
     return [

@@ -112,7 +112,7 @@ def table_of(config: FingertipConfig) -> ChannelTable:
     try:
         return fingertip_table(config)
     except BankError:
-        # Among the files this is a finding of its own, and the board can be heard all the same.
+        # Among the files this is a finding of its own, and the board is read all the same.
         return PAPER_TABLE
 
 

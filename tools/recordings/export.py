@@ -26,7 +26,7 @@ _BATCH = 200_000
 _MAT_SIZE, _KEY_SIZE = 12_000_000, 10
 # MATLAB takes 63 characters.
 _LONGEST_NAME = 59
-# The variable of a MATLAB file, and the table beside CSV files, with the units of all columns.
+# The variable of a MATLAB file, and the table next to the CSV files, with the units of all columns.
 _UNITS = "units"
 # A cell with one of these stands in quotes.
 _QUOTED = re.compile(r'[",\r\n]')

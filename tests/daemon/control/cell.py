@@ -22,7 +22,7 @@ from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, Move
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS, FakeArm, HandlerBench
 
 SPEED_M_PER_S = 0.1
-# A state is read, decided on and answered, and an action goes on, within so many turns of the event loop.
+# A state is read, decided on and answered, and an action goes on, within this number of turns of the event loop.
 TURNS = 20
 # Steps of experiments.
 MOVE = {"do": "approach", "along_tool_m": 0.1, "speed_m_per_s": SPEED_M_PER_S}

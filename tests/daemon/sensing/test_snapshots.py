@@ -1,4 +1,4 @@
-"""The states of parsers: what is restored goes on as what was stored."""
+"""The states of parsers: a restored parser continues like the stored one."""
 
 import pytest
 

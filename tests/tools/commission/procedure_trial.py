@@ -46,7 +46,7 @@ SPRING_NM_PER_RAD = 1.0 / (1.0 / 0.8 + 1.0 / 20.0)
 
 
 class EmulatedLab:
-    """The emulated rig, and the operator beside it: each question has its action and its answer."""
+    """The emulated rig and its operator: each question has its action and its answer."""
 
     def __init__(self, folder: Path) -> None:
         write_random_bank(folder / "rig.bank")

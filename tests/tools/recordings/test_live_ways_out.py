@@ -19,7 +19,7 @@ PAGED = {"eit.estimate", "eit.heatmap", "load.torque", "health", "daemon.end"}
 LISTENED = {*PAGED, "eit.frame"}
 
 
-class Heard:
+class Received:
     """What one way out gave, and a wait for a message of it."""
 
     def __init__(self) -> None:
@@ -40,23 +40,23 @@ class Heard:
             await self._more.wait()
 
 
-async def read_lines(listen: asyncio.subprocess.Process, heard: Heard) -> None:
+async def read_lines(listen: asyncio.subprocess.Process, received: Received) -> None:
     async for line in listen.stdout:
         content = json.loads(line, parse_constant=no_json)
-        heard.add(content.pop("topic"), content)
+        received.add(content.pop("topic"), content)
 
 
-async def read_batches(stream: aiohttp.ClientWebSocketResponse, heard: Heard, history: Published) -> None:
+async def read_batches(stream: aiohttp.ClientWebSocketResponse, received: Received, history: Published) -> None:
     async for message in stream:
         batch = json.loads(message.data, parse_constant=no_json)
         history += [(one["topic"], one["content"]) for one in batch["history"]]
         for paged in batch["messages"]:
-            heard.add(paged["topic"], page_content(paged))
+            received.add(paged["topic"], page_content(paged))
 
 
-async def watched(config: Path, folder: Path) -> tuple[Published, Heard, Heard, Published]:
+async def watched(config: Path, folder: Path) -> tuple[Published, Received, Received, Published]:
     """Return what a daemon of two emulated boards published, what was listened to, the page's part, and its history."""
-    published, listened, paged, history = Published(), Heard(), Heard(), Published()
+    published, listened, paged, history = Published(), Received(), Received(), Published()
     addresses = ("--connect", f"ipc://{folder}/publish")
     viewing = ("--commands", f"ipc://{folder}/commands", "--port", "0", "--token-file", str(folder / "token"))
     async with AsyncExitStack() as opened:
@@ -81,7 +81,7 @@ async def watched(config: Path, folder: Path) -> tuple[Published, Heard, Heard, 
             # A page that is opened later begins with the last minute.
             await paged.until("eit.estimate", frame=LAST_FRAME)
             async with http.ws_connect(f"{url}stream", max_msg_size=0) as second:
-                later = Heard()
+                later = Received()
                 reading = group.create_task(read_batches(second, later, history))
                 await later.until("eit.estimate", frame=LAST_FRAME)
                 reading.cancel()
@@ -93,11 +93,11 @@ async def watched(config: Path, folder: Path) -> tuple[Published, Heard, Heard, 
 
 def test_listen_and_the_page_give_what_was_recorded(config, tmp_path):
     path = config(load_cell={"device": {"path": "load-cell"}}, recording={"folder": str(tmp_path / "recordings")})
-    told, listened, paged, history = asyncio.run(watched(path, tmp_path))
-    published = by_stream(told)
-    recorded = Recorded(latest_recording(tmp_path / "recordings"), told).by_stream()
-    for heard, topics in ((listened, LISTENED), (paged, PAGED)):
-        found = by_stream(heard.messages)
+    sent, listened, paged, history = asyncio.run(watched(path, tmp_path))
+    published = by_stream(sent)
+    recorded = Recorded(latest_recording(tmp_path / "recordings"), sent).by_stream()
+    for received, topics in ((listened, LISTENED), (paged, PAGED)):
+        found = by_stream(received.messages)
         assert {topic for topic, _, _ in found} == topics
         for stream, content in found.items():
             # The recording ends before the daemon says so.
@@ -110,7 +110,7 @@ def test_listen_and_the_page_give_what_was_recorded(config, tmp_path):
     for (topic, source), found in numbers.items():
         assert found == [seq for name, other, seq in published if (name, other) == (topic, source) and seq >= found[0]]
     assert numbers["eit.estimate", "right"] == [*range(LAST_FRAME + 1)]
-    charted = {(topic, one["source"], one["timestamp"]): one for topic, one in told}
+    charted = {(topic, one["source"], one["timestamp"]): one for topic, one in sent}
     assert {topic for topic, _ in history} == {"eit.estimate", "load.torque"}
     for topic, sample in history:
         keys = ("source", "timestamp", *CHARTED[topic])

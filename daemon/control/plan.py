@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 from shearloop.daemon.control import experiment_schema as steps
@@ -16,7 +17,7 @@ from shearloop.drivers.ur.settings import UrLimits
 class StepPlan:
     """One step: its action in words, its largest values, and its limits, reversals and refusals.
 
-    `reverses` says whether it turns a held tool against the turn before.
+    `reverses` says whether it turns a held tool against the turn before, `turns_back` whether it turns both ways.
     """
 
     number: int
@@ -29,6 +30,7 @@ class StepPlan:
     force_n: float = 0.0
     timeout_s: float | None = None
     reverses: bool = False
+    turns_back: bool = False
     notes: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
 
@@ -90,7 +92,10 @@ class Plan:
             "the grip"
         )
         turned_back = sum(step.reverses for step in self.steps)
-        yield f"  {turned_back or 'no'} reversal{'s' if turned_back != 1 else ''} of a held tool"
+        yield f"  {turned_back or 'no'} reversal{'s' if turned_back != 1 else ''} of a held tool between steps"
+        both_ways = [f"{step.number} ({step.do})" for step in self.steps if step.turns_back]
+        if both_ways:
+            yield f"  turning back within themselves: step {', '.join(both_ways)}"
         yield "  clockwise and counterclockwise are for an eye that faces the gripper"
         if self.unknown:
             yield f"  {self.unknown}"
@@ -111,6 +116,7 @@ def plan_of(
     planned: list[StepPlan] = []
     # Whether the next step that twists waits for the first torques of a grip or a tare.
     waits = False
+    opened = False
     for number, (step, turn) in enumerate(zip(file.steps, turns(file), strict=True), 1):
         needs = demand(step)
         duration_s = needs.stands_s + needs.moves_s
@@ -123,6 +129,9 @@ def plan_of(
             waits = False
         if number in back:
             notes.insert(0, back[number])
+        opened = opened or isinstance(step, steps.ReleaseStep)
+        if gripper is not None and isinstance(step, steps.TareStep) and not opened:
+            notes.append("it is refused unless the gripper knows that it holds nothing: put a `release` before it")
         planned.append(
             StepPlan(
                 number,
@@ -135,6 +144,7 @@ def plan_of(
                 step.force_n if isinstance(step, steps.GripStep) else 0.0,
                 step.timeout_s,
                 number in back,
+                _turns_back(step),
                 tuple(notes),
                 (refused or {}).get(number - 1, ()),
             )
@@ -188,6 +198,19 @@ def _twist(step: steps.TwistStep) -> str:
     then = f"holds each for {step.hold_s:g} s" + (" and returns" if step.return_to_start else "")
     times = f", {step.repeats} times" if step.repeats > 1 else ""
     return f"twists to {places} {since}{way}, {then}{times}, at {step.speed_rad_per_s:g} rad/s"
+
+
+def _turns_back(step: Step) -> bool:
+    """Return whether a step turns the tool both ways; `hold_torque` does so only to correct."""
+    match step:
+        case steps.IdentifyStep():
+            return True
+        case steps.TwistStep(return_to_start=True):
+            return True
+        case steps.TwistStep(angles_rad=angles_rad):
+            rounds = angles_rad * min(step.repeats, 2)
+            return len({later > earlier for earlier, later in pairwise(rounds) if later != earlier}) > 1
+    return False
 
 
 def _ways(angles_rad: tuple[float, ...]) -> list[str]:

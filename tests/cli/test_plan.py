@@ -60,6 +60,28 @@ def test_a_reversal_is_pointed_out_at_its_step(tmp_path, result_of, ran):
     assert "1 reversal of a held tool" in ran("check", path).out
 
 
+@pytest.mark.parametrize(
+    ("twist", "turns_back"),
+    [
+        ({"angles_rad": "-0.25:0.25:5"}, True),
+        ({"angles_rad": [0.1, 0.2], "return_to_start": False}, False),
+        ({"angles_rad": [0.2, 0.1, 0.3], "return_to_start": False}, True),
+        ({"angles_rad": [0.1, 0.2], "return_to_start": False, "repeats": 2}, True),
+    ],
+)
+def test_a_twist_that_turns_both_ways_is_pointed_out(twist, turns_back, tmp_path, ran, result_of):
+    path = written(tmp_path, GRIP, {"do": "twist", **twist}, limits={"angle_rad": 1.0})
+    assert [step["turns_back"] for step in result_of("check", path)["plan"]["steps"]] == [False, turns_back]
+    assert ("turning back within themselves: step 2 (twist)" in ran("check", path).out) is turns_back
+
+
+@pytest.mark.parametrize(("before", "warned"), [((), True), (({"do": "release"},), False)])
+def test_a_tare_before_any_release_is_pointed_out(before, warned, tmp_path, capsys):
+    path = written(tmp_path, *before, {"do": "tare"}, GRIP)
+    main(["check", str(path), "--config", str(rig(tmp_path))])
+    assert ("put a `release` before it" in capsys.readouterr().out) is warned
+
+
 def test_turns_that_add_up_to_more_than_the_limit_are_pointed_out(tmp_path, result_of):
     path = written(tmp_path, GRIP, TIGHTEN, TIGHTEN, limits={"angle_rad": 3.0})
     assert "4 rad (229°) from the grip: the limit stops it at 3 rad" in "".join(

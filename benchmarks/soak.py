@@ -18,7 +18,7 @@ from statistics import median
 from typing import Any
 
 from benchmarks.common import parser_of, table_head, table_row, write_figures
-from benchmarks.stop_times import CAUSES, RunningRig
+from benchmarks.stop_times import CAUSES, DEADLINE_S, RunningRig
 from shearloop.tools.recordings.frames import read_recording
 
 FAULTS = [cause for cause in CAUSES if cause.command and not cause.straight]
@@ -48,8 +48,9 @@ def soak(speed: int, seed: int, goes_on: Callable[[int], bool]) -> dict[str, Any
             rig.stood_ns(rig.cause(cause))
             rig.recover(cause)
             counts[cause.name] += 1
-        rig.send("stop")
-        rig.daemon.wait()
+        # A command to stop leaves a daemon running whose fingers hold a tool; the signal of a service's end does not.
+        rig.daemon.terminate()
+        rig.daemon.wait(DEADLINE_S)
         recordings = sorted((folder / "recordings").iterdir())
         torques = sum(len(read_recording(path).torque_nm) for path in recordings if path.suffix == ".mcap")
     quarter = max(1, len(used) // 4)

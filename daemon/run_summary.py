@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.daemon.messaging.messages import with_unit
+from shearloop.daemon.messaging.messages import stop_times, with_unit
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.printable import printable
 from shearloop.words import counted, times
@@ -125,7 +125,7 @@ class RunSummary:
         if topic == "loop.state":
             self._on_loop_state(content)
         elif topic == "loop.stop":
-            self.add(stop_sentence(content))
+            self.add(f"The stop, from its cause: {stop_times(content)}.")
         elif self._run is not None:
             _on_sample(self._run, topic, content)
 
@@ -163,15 +163,6 @@ def _was_asked_for(content: Mapping[str, Any]) -> bool:
 def _codes(content: Mapping[str, Any]) -> list[str]:
     """Return the codes of the faults of a `loop.state`, the cause's first."""
     return list(filter(None, content["faults"].split(", ")))
-
-
-def stop_sentence(content: Mapping[str, Any]) -> str:
-    """Return the times of a `loop.stop` message in words."""
-    decided, sent, stands = (
-        "an unknown time" if content[key] is None else with_unit("loop.stop", key, content[key], ".3f")
-        for key in ("decided_after_s", "sent_after_s", "stands_after_s")
-    )
-    return f"The stop, from its cause: decided after {decided}, sent after {sent}, standstill after {stands}."
 
 
 def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:

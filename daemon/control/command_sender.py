@@ -2,6 +2,7 @@
 
 import asyncio
 from dataclasses import dataclass
+from functools import partial
 
 import structlog
 
@@ -45,12 +46,12 @@ class CommandSender:
     def _send(self, command: WristSpeed | Stop) -> None:
         self.unanswered += 1
         try:
-            self.robot.send(command).add_done_callback(self._on_reply)
+            self.robot.send(command).add_done_callback(partial(self._on_reply, command))
         except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
             self.unanswered -= 1
             self._fail(error)
 
-    def _on_reply(self, replied: asyncio.Future[CommandReply]) -> None:
+    def _on_reply(self, command: WristSpeed | Stop, replied: asyncio.Future[CommandReply]) -> None:
         self.unanswered -= 1
         try:
             reply = replied.result()
@@ -58,8 +59,11 @@ class CommandSender:
                 unanswered = self.robot.state is None
                 code = FaultCode.COMMAND_UNANSWERED if unanswered else FaultCode.COMMAND_REFUSED
                 self.control_loop.on_fault(code, reply.refusal)
-            if isinstance(reply.sent, Stop):
-                self.stops.on_sent(self.clock.now_ns())
+            if isinstance(command, Stop):
+                if reply.accepted:
+                    self.stops.on_sent(self.clock.now_ns())
+                else:
+                    self.stops.on_refused(reply.refusal)
             self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
         except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
             self._fail(error)

@@ -23,6 +23,8 @@ class StopTimeline:
         # When the reply came, and the first measurement of the present standstill.
         self._sent_ns: int | None = None
         self._stands_ns: int | None = None
+        # Since when the robot takes no command, by its states.
+        self._blocked_ns: int | None = None
 
     @property
     def pending(self) -> bool:
@@ -49,6 +51,8 @@ class StopTimeline:
             decided_after_s=(now_ns - cause_ns) / 1e9,
             sent_after_s=None,
             stands_after_s=None,
+            refusal="",
+            blocked_after_s=None,
         )
 
     def on_sent(self, now_ns: int) -> None:
@@ -58,25 +62,38 @@ class StopTimeline:
             self._sent_ns, self._stands_ns = now_ns, None
             self._stop = replace(stop, sent_after_s=(now_ns - stop.t_mono_ns) / 1e9)
 
+    def on_refused(self, refusal: str) -> None:
+        """Take the refusal of the stop: nothing can be sent to the robot, and it stops by itself."""
+        if self._stop is not None and self._sent_ns is None:
+            self._stop = replace(self._stop, refusal=refusal)
+
     def update(self, robot: RobotState | None, now_ns: int) -> LoopStop | None:
         """Return the whole stop once, when a state after the command shows the arm at rest, or after `LONGEST_NS`.
 
-        Without a reply to the command, a state after the decision counts.
+        Without a command that was sent, a state after the decision counts.
         """
+        measured_ns = now_ns if robot is None else robot.t_mono_ns - robot.age_ns
+        if robot is not None:
+            self._blocked_ns = (self._blocked_ns or measured_ns) if robot.blocked else None
         stop, self._requested_ns = self._stop, None
         if stop is None:
             return None
-        measured_ns = now_ns if robot is None else robot.t_mono_ns - robot.age_ns
         since_ns = self._decided_ns if self._sent_ns is None else self._sent_ns
         if robot is not None and measured_ns >= since_ns:
             self._stands_ns = (self._stands_ns or measured_ns) if robot.rests else None
-        awaits_reply = self._sent_ns is None and now_ns - self._decided_ns <= REPLY_NS
+        answered = self._sent_ns is not None or stop.refusal != ""
+        awaits_reply = not answered and now_ns - self._decided_ns <= REPLY_NS
         known = self._stands_ns is not None and not awaits_reply
         return self.end() if known or now_ns - self._decided_ns > LONGEST_NS else None
 
     def end(self) -> LoopStop | None:
         """Return the known times of a stop after the wait for its standstill."""
         stop, self._stop = self._stop, None
-        if stop is None or self._stands_ns is None:
-            return stop
-        return replace(stop, stands_after_s=(self._stands_ns - stop.t_mono_ns) / 1e9)
+        if stop is None:
+            return None
+        blocked_after_s = self._after_cause_s(stop, self._blocked_ns) if stop.refusal else None
+        return replace(stop, stands_after_s=self._after_cause_s(stop, self._stands_ns), blocked_after_s=blocked_after_s)
+
+    @staticmethod
+    def _after_cause_s(stop: LoopStop, t_ns: int | None) -> float | None:
+        return None if t_ns is None else max(0, t_ns - stop.t_mono_ns) / 1e9

@@ -243,6 +243,10 @@ class LoopStop(Message):
     decided_after_s: float = column("s", "from the measurement or request that caused it to the decision")
     sent_after_s: float | None = column("s", "until the robot's process had sent the stop; nil if it did not answer")
     stands_after_s: float | None = column("s", "until the robot measured a standstill; nil if it did not within 5 s")
+    refusal: str = column("", "why the robot's process did not send the stop, in sentences; empty when it did")
+    blocked_after_s: float | None = column(
+        "s", "until the robot's state showed that it takes no command; nil unless the stop was refused"
+    )
 
 
 @message("daemon.command", rate_hz=None)
@@ -305,6 +309,22 @@ def cause_of(loop_state: Mapping[str, Any]) -> str:
     first, *others = str(loop_state.get("faults") or "").split(", ")
     further = ", ".join(dict.fromkeys(code for code in others if code != first))
     return f"{cause} Also: {further}." if further else cause
+
+
+def stop_times(loop_stop: Mapping[str, Any]) -> str:
+    """Return the times of a `loop.stop`, from the stop's cause, in words."""
+
+    def after(key: str) -> str | None:
+        value = loop_stop.get(key)
+        return None if value is None else f"after {with_unit(LoopStop.topic, key, value, '.3f')}"
+
+    sent = f"sent {after('sent_after_s')}" if after("sent_after_s") else "no reply of the robot's process"
+    stands = f"standstill {after('stands_after_s')}" if after("stands_after_s") else "no standstill measured"
+    if loop_stop.get("refusal"):
+        blocked = after("blocked_after_s")
+        sent = f"not sent, because the robot was blocked {blocked}" if blocked else "refused by the robot's process"
+        stands += ", by the robot's own stop" if after("stands_after_s") else ""
+    return f"decided {after('decided_after_s')}, {sent}, {stands}"
 
 
 def stale_after_s(topic: str) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.daemon.messaging.messages import DaemonEnd, LoopStop, cause_of, with_unit
+from shearloop.daemon.messaging.messages import DaemonEnd, cause_of, stop_times
 
 # The page shows at most this many.
 MAX_EVENTS = 200
@@ -72,16 +72,9 @@ def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
 def _stop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
     if before and all(before.get(key) == now.get(key) for key in ("experiment", "decided_after_s", "stands_after_s")):
         return
-
-    def after(key: str) -> str:
-        value = now.get(key)
-        return with_unit(LoopStop.topic, key, value, ".3f") if isinstance(value, float) else "unknown"
-
-    yield (
-        "stop",
-        f"times of the stop, from its cause: decided {after('decided_after_s')}, confirmed by the robot's process "
-        f"{after('sent_after_s')}, arm at rest {after('stands_after_s')}",
-    )
+    yield "stop", f"the stop, from its cause: {stop_times(now)}"
+    if now.get("refusal"):
+        yield "fault", f"the stop was not sent: {now['refusal']}"
 
 
 def _command(_before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:

@@ -11,7 +11,15 @@ from pydantic_core import to_json
 from shearloop.bank.errors import MatchingError
 from shearloop.bank.matching import best_match
 from shearloop.bank.models import MODELS
-from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, DaemonEnd, EitEstimate, EitHeatmap
+from shearloop.daemon.messaging.messages import (
+    ENVELOPE,
+    TOPICS,
+    DaemonEnd,
+    EitEstimate,
+    EitHeatmap,
+    LoopStop,
+    stop_times,
+)
 from shearloop.daemon.web.event_log import EventLog
 
 # Pairs of topic and source. A rig has nine topics and two fingertips.
@@ -122,6 +130,8 @@ class MessageStore:
             self._models[source] = str(content.get("model", ""))
             known = MODELS.get(self._models[source])
             return {"peaks": _peaks(content.get("scores")), "k_unit": known.k_unit if known is not None else ""}
+        if topic == LoopStop.topic:
+            return {"times": stop_times(content)}
         k, sigma = content.get("k"), content.get("sigma")
         if topic == EitEstimate.topic and isinstance(k, float) and isinstance(sigma, float):
             model = self._models.get(source, "")

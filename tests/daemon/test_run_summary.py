@@ -206,7 +206,7 @@ def test_the_times_of_a_stop_follow_the_summary():
     times = {"decided_after_s": 0.004, "sent_after_s": 0.006, "stands_after_s": None}
     stop = {"source": "stop", "t_mono_ns": 5 * S, **times}
     text = summary_of(loop_state(0), loop_state(5, phase="stopped"), stop)
-    sentence = "The stop, from its cause: decided after 0.004 s, sent after 0.006 s, standstill after an unknown time."
+    sentence = "The stop, from its cause: decided after 0.004 s, sent after 0.006 s, no standstill measured."
     assert text.index("STOPPED before its end") < text.index(sentence)
 
 

@@ -326,6 +326,5 @@ export function loopPanel(link) {
 function stopTimes(link, current) {
   const stop = link.get("loop.stop");
   if (stop?.content.experiment !== current.experiment) return "";
-  const after = (key) => (stop.content[key] === null ? "unknown" : link.number(stop, key, 3));
-  return `After its cause: decided ${after("decided_after_s")}, confirmed by the robot's process ${after("sent_after_s")}, arm at rest ${after("stands_after_s")}.`;
+  return `From its cause: ${stop.times}.`;
 }

@@ -342,6 +342,19 @@ async def test_cause_of_a_requested_stop_is_the_request():
         assert stop.decided_after_s <= 0.02
 
 
+async def test_stop_that_a_blocked_robot_refuses_tells_since_when_it_is_blocked_and_stands():
+    async with driven(TWIST, cycles=50) as cell:
+        cell.robot.bench.arm.accepts = False
+        await cell.until_ended(20)
+        assert not stops(cell), "the wrist still turns"
+        await cell.cycles(60)
+        (stop,) = stops(cell)
+        assert stop.sent_after_s is None
+        assert stop.blocked_after_s == pytest.approx(0.0, abs=0.02)
+        assert stop.blocked_after_s < stop.stands_after_s <= 0.3
+        assert "The robot did not accept the wrist speed" in stop.refusal
+
+
 async def test_standstill_that_nothing_measures_is_unknown():
     async with driven(TWIST, cycles=50) as cell:
         cell.robot.dies_of = ValueError("not a float")

@@ -12,9 +12,9 @@ from shearloop.drivers.ur.messages import RobotState
 MS = 1_000_000
 
 
-def state(at_ms: float, *, rests: bool) -> RobotState:
+def state(at_ms: float, *, rests: bool, blocked: str = "") -> RobotState:
     """Return a state that was measured at this time."""
-    return cast(RobotState, SimpleNamespace(t_mono_ns=round(at_ms * MS), age_ns=0, rests=rests))
+    return cast(RobotState, SimpleNamespace(t_mono_ns=round(at_ms * MS), age_ns=0, rests=rests, blocked=blocked))
 
 
 def begun() -> StopTimeline:
@@ -38,6 +38,16 @@ def test_a_reply_after_the_standstill_is_awaited_and_no_reply_is_not_awaited_for
     assert timeline.update(state(30, rests=True), 30 * MS) is None
     stop = timeline.update(state(600, rests=True), 11 * MS + REPLY_NS)
     assert (stop.sent_after_s, stop.stands_after_s) == (None, pytest.approx(0.020))
+
+
+def test_a_refusal_is_an_answer_and_comes_with_the_first_state_of_the_block():
+    timeline = begun()
+    assert timeline.update(state(11, rests=False, blocked="protective stop"), 12 * MS) is None
+    timeline.on_refused("nothing can be sent")
+    assert timeline.update(state(19, rests=False, blocked="protective stop"), 20 * MS) is None
+    stop = timeline.update(state(27, rests=True, blocked="protective stop"), 28 * MS)
+    assert (stop.refusal, stop.sent_after_s) == ("nothing can be sent", None)
+    assert (stop.blocked_after_s, stop.stands_after_s) == (pytest.approx(0.001), pytest.approx(0.017))
 
 
 def test_an_arm_that_moves_again_does_not_stand():

@@ -79,12 +79,21 @@ def test_faults_of_tasks_and_devices_and_the_end_are_told():
         ("step", "loop runs again"),
         ("fault", "it is in a protective stop"),
         ("fault", "no current"),
+        ("stop", "the stop, from its cause: decided after 0.004 s, sent after 0.006 s, no standstill measured"),
+        ("stop", "the daemon has ended"),
+    ]
+
+
+def test_a_stop_that_was_not_sent_tells_why():
+    times = {"experiment": "hold", "decided_after_s": 0.0, "sent_after_s": None, "stands_after_s": 0.096}
+    times |= {"refusal": "Nothing can be sent.", "blocked_after_s": 0.004}
+    assert lines(("loop.stop", times)) == [
         (
             "stop",
-            "times of the stop, from its cause: decided 0.004 s, confirmed by the robot's process 0.006 s, "
-            "arm at rest unknown",
+            "the stop, from its cause: decided after 0.000 s, not sent, because the robot was blocked after 0.004 s, "
+            "standstill after 0.096 s, by the robot's own stop",
         ),
-        ("stop", "the daemon has ended"),
+        ("fault", "the stop was not sent: Nothing can be sent."),
     ]
 
 

@@ -24,6 +24,8 @@ class FrameTimer:
         self._period_s = period_s
         self._t_s = -np.inf
         self._steps_s: deque[float] = deque(maxlen=_STEPS)
+        # What happened before the latest frame, if that was a gap.
+        self.gap = ""
 
     def missing_before(self, t_s: float) -> int | None:
         """Return how many frames are missing before the next one, None after a gap."""
@@ -32,7 +34,15 @@ class FrameTimer:
         period_s = min(learned_s, self._period_s)
         if 0 < step_s <= _LARGEST_GAP_S:
             self._steps_s.append(step_s)
+        self.gap = ""
         if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_SHARE * period_s):
+            if np.isfinite(step_s):
+                happened = (
+                    f"no frame came for {step_s:.1f} s (a loose cable or a busy computer)"
+                    if step_s > 0
+                    else "the frames' times step back"
+                )
+                self.gap = f"{happened}, and the gel's motion in between is not known"
             return None
         return int(step_s > _MISSING_SHARE * period_s)
 

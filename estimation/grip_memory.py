@@ -61,9 +61,11 @@ class GripMemory:
         # Over the last valid frames, and their number.
         self.mean_difference: FloatArray = np.zeros(shape)
         self.held_frames = 0
+        self._why = ""
 
-    def forget(self) -> None:
-        """Forget the grip."""
+    def forget(self, why: str = "") -> None:
+        """Forget the grip; `why` is the reason against an estimate until there are enough frames again."""
+        self._why = why
         self.positions.clear()
         self._bridged.clear()
         self._skipped_in_a_row, self.held_frames = 0, 0
@@ -73,7 +75,7 @@ class GripMemory:
         """Leave a frame out; after too many in a row the last position is too old."""
         self._skipped_in_a_row += 1
         if self._skipped_in_a_row > _LARGEST_BRIDGED:
-            self.forget()
+            self.forget("too many frames in a row were disturbed or are missing")
         elif self.positions:
             self._repeat_position(1 + missing)
 
@@ -93,14 +95,24 @@ class GripMemory:
                 self.positions[i - 1 - between] = begin + i / (between + 1) * (position - begin)
         self.positions.append(position)
         self._bridged.append(False)
-        if (wanted := self._motion.n_needed - len(self.positions)) > 0:
-            return f"gripped too recently: {counted(wanted, 'more frame is', 'more frames are')} needed"
+        if len(self.positions) < self._motion.n_needed:
+            return self.waits()
         if sum(self._bridged) > max(_LARGEST_BRIDGED, _LARGEST_BRIDGED_SHARE * (len(self.positions) - 1)):
             return "too many of the last frames were disturbed or are missing"
         self.held_frames = min(self.held_frames + 1, _HELD_FRAMES)
         self.mean_difference = self.mean_difference + (difference - self.mean_difference) / self.held_frames
         self.features = self._motion.features(self.positions, from_idle)
         return ""
+
+    def waits(self) -> str:
+        """Return the reason against an estimate while frames are missing."""
+        wanted = self._motion.n_needed - len(self.positions)
+        return f"{self._why or 'gripped too recently'}: {counted(wanted, 'more frame is', 'more frames are')} needed"
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether something else than a new grip has ended the memory."""
+        return self._why != ""
 
     def _repeat_position(self, times: int) -> None:
         """Repeat the last position for missing frames until the next frame allows interpolation."""

@@ -97,5 +97,5 @@ class ValueRange:
             return ()
         return (
             f"the {quantity} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to {self.high:.3g} "
-            f"{unit}",
+            f"{unit}; tare with nothing gripped, or calibrate further",
         )

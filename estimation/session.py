@@ -178,7 +178,7 @@ class Session:
         if missing is None:
             # The last frames do not show how the gel has moved. In a tare, compare with its last frame: a tool may
             # have been gripped or released in the gap.
-            self._memory.forget()
+            self._memory.forget(self._timer.gap)
             for grip in self._grips:
                 grip.forget_steps()
             checks.restart(idle.last_tare_frame())
@@ -199,7 +199,8 @@ class Session:
         if idle.taring:
             return ProcessedFrame.refused(usable, idle.add_to_tare(channels))
         if is_first:
-            return ProcessedFrame.refused(usable, "there is no earlier frame to compare with")
+            first = "there is no earlier frame to compare with"
+            return ProcessedFrame.refused(usable, self._memory.waits() if self._memory.interrupted else first)
         if not self._memory.positions:
             # Follow the idle frame while nothing is gripped; a session that begins gripped keeps the calibration's.
             for layer in idle.idle_sides(channels):

@@ -60,7 +60,7 @@ class FaultCode(Enum):
     ESTIMATE_INVALID = Rule(
         _HOLD,
         "the torque estimate is not valid: {detail}.",
-        "Wait for the next valid estimate, or tare with nothing gripped and start again.",
+        "It resumes with the next valid torque; if it stopped, clear the cause, then `shearloop command unlock`.",
         hold_at_most_s=5.0,
     )
     ESTIMATE_JUMPED = Rule(

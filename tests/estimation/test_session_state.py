@@ -1,5 +1,7 @@
 """What a session keeps of its frames, where what it keeps would say something of another time."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -121,7 +123,8 @@ def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(
             frame = TactileFrame.of(frame.t_s, frame.channels, rng.random(frame.channels.shape) > 0.4)
         assert "fingertip" in tracker.estimate(frame).reasons[0]
     after = tracker.estimate(like(0.5 * (len(shares) + spoilt), 1.0))
-    assert after.reasons == (() if spoilt <= 3 else (f"gripped too recently: {n_lags} more frames are needed",))
+    many = f"too many frames in a row were disturbed or are missing: {n_lags} more frames are needed"
+    assert after.reasons == (() if spoilt <= 3 else (many,))
 
 
 @pytest.mark.parametrize("lost", [2, 3, 4])
@@ -132,8 +135,19 @@ def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(motion_c
     shares = [*np.zeros(12), *UP, *np.ones(n_lags + 2)]
     assert not process(tracker, shares, step_s=0.27)[-1].reasons
     after = [one.reasons for one in process(tracker, [1.0, 1.0], 0.27 * (len(shares) + lost), 0.27)]
-    assert after[0] == ("there is no earlier frame to compare with",)
-    assert after[1] == (f"gripped too recently: {n_lags} more frames are needed",)
+    for (reason,), wanted in zip(after, (n_lags + 1, n_lags), strict=True):
+        found = re.fullmatch(r"no frame came for (\S+) s .* is not known: (\d+) more frames are needed", reason)
+        assert float(found[1]) == pytest.approx(0.27 * (lost + 1), abs=0.051)
+        assert int(found[2]) == wanted
+
+
+def test_a_new_grip_after_a_gap_waits_for_the_grip_alone(motion_calibration, process):
+    tracker = Session(motion_calibration)
+    process(tracker, [*np.zeros(12), *UP])
+    process(tracker, [0.0, 0.0], 60.0)
+    reasons = " ".join(why for one in process(tracker, UP, 61.0) for why in one.reasons)
+    assert "gripped too recently: " in reasons
+    assert "no frame came" not in reasons
 
 
 def test_a_board_that_turns_out_slower_than_its_first_frames_is_followed(motion_calibration, like):

@@ -7,6 +7,9 @@ import { age, array, byId, interval, number, put, show, warn } from "./text.js";
 const ROBOT_MODES = { "-1": "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off", 4: "power on", 5: "idle", 6: "backdrive", 7: "running", 8: "updating" };
 const SAFETY_MODES = { 1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop", 6: "system emergency stop", 7: "robot emergency stop", 8: "violation", 9: "fault", 10: "validate joint", 11: "undefined", 12: "automatic mode safeguard stop", 13: "three-position enabling stop" };
 const MARK_OLD_AFTER_S = 1;
+// Topics with a `torque_nm`, and the source of the robot's own torque.
+const TORQUES = ["eit.estimate", "load.torque", "skin.shear"];
+const WRENCH = "wrench";
 const SIGNED = { signed: true };
 
 // Phases with a set point.
@@ -37,36 +40,61 @@ export function isFingertip(link, source) {
   return source !== "combined" || link.get("eit.heatmap", source) !== undefined;
 }
 
-// Torque, set point, load cell and diameter, with the estimate that drives the loop.
+// The latest message with a torque on the tool, its name on the page, and the torque.
+function torqueOf(link, topic, source) {
+  const message = link.get(topic, source);
+  if (!message) return undefined;
+  const said = message.content;
+  const name = { "eit.estimate": `estimate of ${said.source}`, "load.torque": "load cell", "skin.shear": "shear skin" }[topic];
+  return { message, name, value: said.torque_nm, valid: said.valid, reason: said.reason };
+}
+
+// The wrench on the wrist is opposite to the torque on the tool.
+function wrenchTorque(link) {
+  const message = link.get("robot.state");
+  return message && { message, name: "robot's wrench", value: -message.content.wrist_torque_nm, valid: true, reason: "" };
+}
+
+// The torque that drives the loop; before the first experiment, an estimate, the skin or the load cell.
+function drivingTorque(link) {
+  const named = link.get("loop.state")?.content.torque_source;
+  if (named === WRENCH) return wrenchTorque(link);
+  if (named) return TORQUES.map((topic) => torqueOf(link, topic, named)).find(Boolean);
+  const [first] = estimatesFirst(link);
+  return (first && torqueOf(link, "eit.estimate", first)) ?? torqueOf(link, "skin.shear") ?? torqueOf(link, "load.torque");
+}
+
+// The driving torque, the set point, another torque to compare with, and the diameter.
 export function torquePanel(link) {
   const loop = link.get("loop.state");
-  const driving = loop?.content.torque_source;
-  const estimate = link.get("eit.estimate", estimatesFirst(link)[0]);
-  const skin = link.get("skin.shear");
-  const shown = estimate ?? skin;
-  markAge(byId("torque"), link, shown);
-  const said = shown?.content;
-  put(byId("torque-source"), said ? `estimate of ${said.source}${said.source === driving ? ", drives the loop" : ""}` : "estimate");
-  const valid = said?.valid ?? false;
-  put(byId("torque-now"), valid ? link.number(shown, "torque_nm", 4, SIGNED) : "–");
-  put(byId("torque-interval"), valid && said.torque_low_nm !== undefined ? `${interval(said.torque_low_nm, said.torque_high_nm, 4)} (95 %)` : "");
-  const load = link.get("load.torque");
-  const silent = load && !load.content.valid && !link.isOld(load) ? `load cell: ${load.content.reason}` : "";
-  warn(byId("torque-reason"), [said && !valid ? `no estimate: ${said.reason}` : "", silent].filter(Boolean).join("; "));
+  const named = loop?.content.torque_source;
+  const [first] = estimatesFirst(link);
+  const estimate = link.get("eit.estimate", first);
+  const driving = drivingTorque(link);
+  markAge(byId("torque"), link, driving?.message);
+  put(byId("torque-source"), driving ? `${driving.name}${named ? ", drives the loop" : ""}` : named ? `${named}, drives the loop` : "torque");
+  const said = driving?.message.content;
+  put(byId("torque-now"), driving?.valid ? number(driving.value, 4, link.unit("loop.state", "torque_nm"), SIGNED) : "–");
+  put(byId("torque-interval"), driving?.valid && said.torque_low_nm != null ? `${interval(said.torque_low_nm, said.torque_high_nm, 4)} (95 %)` : "");
+  const load = torqueOf(link, "load.torque");
+  const other = load && driving?.message === load.message ? first && torqueOf(link, "eit.estimate", first) : load;
+  const against = (torque) => (torque && !torque.valid && !link.isOld(torque.message) ? `${torque.name}: ${torque.reason}` : "");
+  const none = driving && !driving.valid ? `no torque from the ${driving.name}: ${driving.reason}` : "";
+  warn(byId("torque-reason"), [none, against(other)].filter(Boolean).join("; "));
   const wanted = loop && !link.isOld(loop) && ACTIVE.has(loop.content.phase) ? loop : undefined;
   put(byId("wanted"), link.number(wanted, "ramp_nm", 4, SIGNED));
   put(byId("set-point"), wanted?.content.set_point_nm == null ? "" : `final ${number(wanted.content.set_point_nm, 3, "", SIGNED)}`);
-  loadFigure(link, load);
+  otherFigure(link, other);
   diameterFigure(link, estimate);
 }
 
-function loadFigure(link, load) {
-  show(byId("load"), load !== undefined);
-  if (!load) return;
-  const old = link.isOld(load);
-  const { valid } = load.content;
-  put(byId("load-torque"), old || !valid ? "–" : link.number(load, "torque_nm", 4, SIGNED));
-  put(byId("load-note"), old ? `OLD, ${age(link.ageOf(load))}` : valid ? "" : "not valid");
+function otherFigure(link, other) {
+  show(byId("other"), other !== undefined);
+  if (!other) return;
+  const old = link.isOld(other.message);
+  put(byId("other-source"), other.name);
+  put(byId("other-torque"), old || !other.valid ? "–" : link.number(other.message, "torque_nm", 4, SIGNED));
+  put(byId("other-note"), old ? `OLD, ${age(link.ageOf(other.message))}` : other.valid ? "" : "not valid");
 }
 
 function diameterFigure(link, estimate) {
@@ -233,9 +261,11 @@ function stateWord(link) {
 export function healthPanel(link, drawn) {
   const message = link.get("health");
   markAge(byId("health"), link, message);
-  if (message === drawn.health) return;
-  drawn.health = message;
   const said = message?.content;
+  const old = oldSources(link);
+  const key = `${message?.content.seq} ${message?.at} ${link.state()} ${old}`;
+  if (key === drawn.health) return;
+  drawn.health = key;
   const tasks = Object.entries(said?.tasks ?? {}).map(([name, facts]) => taskOf(name, facts));
   const chips = byId("tasks");
   while (chips.children.length > tasks.length) chips.lastElementChild.remove();
@@ -243,11 +273,18 @@ export function healthPanel(link, drawn) {
   const named = (state) => tasks.filter((task) => task.state === state).map((task) => task.name).join(", ");
   const [dead, warned] = [named("dead"), named("warned")];
   const trouble = [dead && `✗ DEAD: ${dead}`, warned && `! errors: ${warned}`].filter(Boolean).join("; ");
-  byId("health").dataset.state = dead ? "dead" : warned ? "warned" : "alive";
-  put(byId("tasks-line"), said ? trouble || `✓ all ${tasks.length} are well` : "–");
+  byId("health").dataset.state = dead ? "dead" : warned || old ? "warned" : "alive";
+  const lateOnes = old && `! old data: ${old}`;
+  put(byId("tasks-line"), !said || link.isOld(message) ? "not known" : trouble || lateOnes || `✓ all ${tasks.length} are well`);
   put(byId("trouble"), trouble);
   show(byId("trouble"), trouble !== "");
   put(byId("process"), said ? `${link.number(message, "memory_mb", 0)}, ${link.number(message, "cpu_percent", 1)} of a core, event loop ${number(1000 * said.loop_lag_s, 1, "ms")} late` : "");
+}
+
+// The sources whose latest message is old.
+function oldSources(link) {
+  const regular = [...link.latest.values()].filter(({ topic }) => topic in link.settings.stale_after_s);
+  return [...new Set(regular.filter((message) => link.isOld(message)).map((message) => message.content.source))].sort().join(", ");
 }
 
 function newChip() {

@@ -63,7 +63,7 @@ def test_the_page_shows_the_messages_numbers(browsed):
         "#torque-interval": interval,
         "#wanted": f"{signed(said['loop']['ramp_nm'], 4)} N·m",
         "#set-point": f"final {signed(said['loop']['set_point_nm'], 3)}",
-        "#load-torque": f"{signed(load['torque_nm'], 4)} N·m",
+        "#other-torque": f"{signed(load['torque_nm'], 4)} N·m",
         "#diameter": f"{estimate['diameter_mm']:.1f} mm",
         "#diameter-note": "18.2 to 22.6, gripper 19.7 mm",
         ".fingertip .score": f"{estimate['score']:.4f}",
@@ -220,15 +220,15 @@ def test_a_hold_shows_its_cause_then_the_codes_of_others_and_their_sentences_on_
         (
             {"load": {"valid": False, "reason": "the reading is the same for two seconds"}},
             {
-                "#load-torque": "–",
-                "#load-note": "not valid",
+                "#other-torque": "–",
+                "#other-note": "not valid",
                 "#torque-reason": "load cell: the reading is the same for two seconds",
             },
         ),
         (
             {"estimate": {**NO_ESTIMATE, "valid": False, "reason": "no signal above the noise"}},
             {
-                "#torque-reason": "no estimate: no signal above the noise",
+                "#torque-reason": "no torque from the estimate of right: no signal above the noise",
                 ".fingertip .invalid": "not valid: no signal above the noise",
                 "#torque-now": "–",
                 "#torque-interval": "",
@@ -277,12 +277,39 @@ def test_what_is_normal_before_the_first_torque_is_no_warning(reason, waits, bro
     assert browsed.page.evaluate("document.getElementById('torque-reason').classList.contains('waiting')") == waits
 
 
+@pytest.mark.parametrize(
+    ("source", "name", "torque", "other"),
+    [
+        ("load_cell", "load cell", "+0.1012 N·m", "estimate of right"),
+        ("wrench", "robot's wrench", "+0.1023 N·m", "load cell"),
+        ("left", "left", "–", "load cell"),
+    ],
+)
+def test_the_large_figure_is_the_torque_that_drives(source, name, torque, other, browsed):
+    browsed.daemon.say(loop={"torque_source": source})
+    browsed.open()
+    browsed.until_shown({"#torque-source": f"{name}, drives the loop", "#torque-now": torque, "#torque-interval": ""})
+    browsed.until_shown({"#other-source": other})
+
+
+def test_tasks_are_not_well_while_their_data_are_old(browsed):
+    alive = {"alive": True, "restarts": 0, "last_error": ""}
+    health = {"tasks": {"right": alive, "loop": alive}}
+    browsed.daemon.say(health=health)
+    browsed.open()
+    browsed.until_shown({"#tasks-line": "✓ all 2 are well"})
+    browsed.daemon.say(health=health, robot=None, estimate=None)
+    browsed.until_shown({"#tasks-line": "! old data: right, robot"})
+    browsed.daemon.say(health=None)
+    browsed.until_shown({"#tasks-line": "not known"})
+
+
 def test_silent_sources_are_marked_old(browsed):
     browsed.open()
     browsed.daemon.say(robot=None, load=None)
     browsed.until("#robot .age", "OLD")
-    browsed.until("#load-note", "OLD")
-    browsed.until_shown({"#load-torque": "–", "#link-state": "● live", "#torque .age": "", "#gripper .age": ""})
+    browsed.until("#other-note", "OLD")
+    browsed.until_shown({"#other-torque": "–", "#link-state": "● live", "#torque .age": "", "#gripper .age": ""})
     browsed.until_old(1)
 
 
@@ -293,7 +320,7 @@ def test_a_slow_load_cell_is_not_marked_old(browsed):
     browsed.until("#tasks", "load_cell")
     browsed.daemon.say(health={"tasks": slow}, robot=None, load=None)
     browsed.until("#robot .age", "OLD, 2")
-    browsed.until_shown({"#load-torque": "+0.1012 N·m", "#load-note": ""})
+    browsed.until_shown({"#other-torque": "+0.1012 N·m", "#other-note": ""})
 
 
 def test_the_page_is_redrawn_thirty_times_a_second(browsed):

@@ -46,9 +46,16 @@ def run(args: argparse.Namespace) -> int:
         print(line, file=sys.stderr)
     if args.json:
         counts = {"compared": comparison.compared, "different": comparison.different}
-        others = {"unrecorded": comparison.unrecorded, "examples": comparison.examples, "same_code": same_code}
+        before_state = {f"{topic}.{source}": count for (topic, source), count in comparison.before_state.items()}
+        others = {
+            "before_state": before_state,
+            "without_state": comparison.without_state,
+            "unrecorded": comparison.unrecorded,
+            "examples": comparison.examples,
+            "same_code": same_code,
+        }
         print_result(counts | others, (), as_json=True)
-    return 1 if args.check and (comparison.different or not comparison.compared) else 0
+    return 1 if args.check and not comparison.passed else 0
 
 
 def _speed(text: str) -> float:
@@ -83,9 +90,14 @@ async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Nam
 
 
 def _comparison_text(comparison: "ReplayComparison", same_code: bool) -> list[str]:
+    lines = [
+        f"Nothing of {source} was compared: the recording has no state of it." for source in comparison.without_state
+    ]
     if not comparison.compared:
-        return ["Nothing was compared: the recording has no estimates with raw input."]
-    lines = []
+        return lines or ["Nothing was compared: the recording has no estimates with raw input."]
+    if comparison.before_state and not lines:
+        early = counted(comparison.before_state.total(), "message follows", "messages follow")
+        lines.append(f"{early} from inputs before this recording, and were not compared.")
     for topic, count in sorted(comparison.compared.items()):
         different = comparison.different[topic]
         lines.append(f"{topic}: {count - different} of {count} equal the recorded ones, bit for bit")

@@ -22,7 +22,7 @@ from shearloop.daemon.messaging.addresses import is_loopback_host
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.rig_memory import RigMemory, memory_path
-from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, FingertipStates
+from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, torque_sources
@@ -257,20 +257,18 @@ def build_sensors(
         period_s = config.fingertips[sides[0]].frame_period_s
         pairs = CombinedTask(
             COMBINED, combined, publisher, clock, loop, gripper, inputs(COMBINED),
-            period_s=period_s, pairing=FramePairing(sides, period_s),
+            period_s=period_s, pairing=FramePairing(sides, period_s), sides=[inputs(side) for side in sides],
         )  # fmt: skip
     tasks: dict[str, Task] = {}
     tareable: dict[str, Tareable] = {}
-    states = FingertipStates(clock, pairs)
     for name, session in sessions.items():
         own = config.fingertips[name]
         zero_slots = session.calibration.table.zero_slots
         board = EitKit(link(name, own.device), zero_slots, own.frame_period_s, inputs(name), patience)
         task = BoardTask(
             name, session, publisher, clock, loop, gripper, inputs(name),
-            board=board, states=states, combined=pairs, always_heatmap=own.heatmap == "always",
+            board=board, combined=pairs, always_heatmap=own.heatmap == "always",
         )  # fmt: skip
-        states.add(task)
         tasks[name] = tareable[name] = task
     if pairs is not None:
         tareable[COMBINED] = pairs

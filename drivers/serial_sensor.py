@@ -291,8 +291,9 @@ class SerialSensor(Generic[ValueT]):
     async def batches(self) -> AsyncGenerator[Sequence[ValueT]]:
         """Yield the values that each read completes, in order and without end; reconnects when the board disappears.
 
-        Nothing is lost while the receiver is busy: the bytes wait in the kernel, then on the board. Iterate within
-        `contextlib.aclosing`, which closes the port at the end.
+        An empty batch means that all bytes so far are processed. One comes before a read of which a recording needs the
+        state before it. Nothing is lost while the receiver is busy: the bytes wait in the kernel, then on the board.
+        Iterate within `contextlib.aclosing`, which closes the port at the end.
         """
         with self._link:
             while True:
@@ -304,6 +305,8 @@ class SerialSensor(Generic[ValueT]):
                         raise DeviceLostError(
                             f"{port.path} is open but has sent nothing for {self._silence_s:.1f} s; {self.silence_hint}"
                         )
+                    if self._inputs is not None and self._inputs.wants_state:
+                        yield ()
                     values = self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
                     self._check_use(port, received.t_arrival_ns, useful=bool(values))
                 except DriverError as error:
@@ -313,10 +316,9 @@ class SerialSensor(Generic[ValueT]):
                 yield values
 
     @property
-    def state_recorder(self) -> InputRecorder | None:
-        """The recorder, if it wants the state, and everything that was read has been yielded."""
-        wanted = self._inputs is not None and self._inputs.wants_state and not self.unread
-        return self._inputs if wanted else None
+    def inputs(self) -> InputRecorder | None:
+        """The recorder of its inputs, where there is one."""
+        return self._inputs
 
     @property
     def parser(self) -> Parser[ValueT]:

@@ -222,10 +222,11 @@ class Recorder:
 
     def record_input(self, source: str, event: RawEvent) -> None:
         """Queue a raw input."""
-        if event.kind is InputKind.STATE:
-            self._carried.missing.discard(source)
         add = partial(self._add_input, source, event, self._clock.reading)
-        self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
+        queued = self._enqueue(_OVERHEAD_BYTES + len(event.data), add)
+        # A state that the full queue drops is still wanted.
+        if queued and event.kind is InputKind.STATE:
+            self._carried.missing.discard(source)
 
     def record_experiment(
         self, name: str, attached: tuple[AttachedFile, ...] = (), tool_mm: float | None = None
@@ -282,12 +283,14 @@ class Recorder:
     def _waiting_bytes(self) -> int:
         return self._counts.queued_bytes - self._counts.written_bytes + self._current.file.bytes_waiting
 
-    def _enqueue(self, size: int, add: Callable[[], None], *, begins_experiment: bool = False) -> None:
+    def _enqueue(self, size: int, add: Callable[[], None], *, begins_experiment: bool = False) -> bool:
+        """Add an item to the queue; return whether there was room."""
         if self._waiting_bytes + size > MAX_WAITING_BYTES:
             self._counts.dropped += 1
-            return
+            return False
         self._counts.queued_bytes += size
         self._queue.append(_Item(add, size, self._counts.dropped, begins_experiment))
+        return True
 
     def _write(self) -> None:
         self.failure = ""

@@ -3,28 +3,32 @@
 import asyncio
 import contextlib
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import structlog
 
 from shearloop.bank.arrays import BoolArray
 from shearloop.bank.channels import ChannelTable
-from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import EitHeatmap
 from shearloop.daemon.sensing.fingertip_messages import frame_message
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.serial_sensor import InputRecorder
 
 
 @dataclass(slots=True, kw_only=True)
 class CombinedTask(FingertipTask):
-    """Pairs the frames of several fingertips, which their boards' tasks add, and estimates from each pair."""
+    """Pairs the frames of several fingertips, which their boards' tasks add, and estimates from each pair.
+
+    `sides` are the recorders of the boards' inputs.
+    """
 
     period_s: float
     pairing: FramePairing
+    sides: Sequence[InputRecorder | None] = ()
     _pairs: deque[tuple[Frame, ...]] = field(default_factory=deque)
     _in_order: asyncio.Lock = field(default_factory=asyncio.Lock)
 
@@ -39,11 +43,17 @@ class CombinedTask(FingertipTask):
         async with self._in_order:
             while self._pairs:
                 await self.process(*self._pairs.popleft())
+                self._record_own_state()
 
-    @property
-    def has_waiting_pairs(self) -> bool:
-        """Whether a pair waits for its estimate."""
-        return bool(self._pairs)
+    def record_own_state(self) -> None:
+        """Keep the state for a recording that begins here, once it has the boards' states and no estimate is made."""
+        if not self._in_order.locked():
+            self._record_own_state()
+
+    def _record_own_state(self) -> None:
+        # A pair has frames of several boards: the replay of all of them must have begun.
+        if self.wants_state and not any(side is not None and side.wants_state for side in self.sides):
+            self.record_state({"pairing": self.pairing, "pairs": self._pairs})
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
@@ -69,13 +79,9 @@ class DeadElectrodes:
 
 @dataclass(slots=True, kw_only=True)
 class BoardTask(FingertipTask):
-    """Reads one board, estimates from each frame, and publishes both; `combined` also needs the frames.
-
-    `states` keeps what a recording that begins later needs.
-    """
+    """Reads one board, estimates from each frame, and publishes both; `combined` also needs the frames."""
 
     board: EitKit
-    states: "FingertipStates"
     combined: CombinedTask | None = None
     always_heatmap: bool = False
     dead_electrodes: DeadElectrodes = field(default_factory=DeadElectrodes)
@@ -84,11 +90,20 @@ class BoardTask(FingertipTask):
         """Process every frame until cancelled."""
         async with contextlib.aclosing(self.board.batches()) as batches:
             async for frames in batches:
-                with self.states.processing():
-                    if self.combined is not None:
-                        self.combined.add(self.name, frames)
-                    for frame in frames:
-                        await self.process_frame(frame)
+                if not frames:
+                    self._record_states()
+                    continue
+                if self.combined is not None:
+                    self.combined.add(self.name, frames)
+                for frame in frames:
+                    await self.process_frame(frame)
+
+    def _record_states(self) -> None:
+        """Keep the states for a recording that begins here: no frame of this board is being processed."""
+        if self.wants_state:
+            self.record_state({"parser": self.board.parser})
+        if self.combined is not None:
+            self.combined.record_own_state()
 
     async def process_frame(self, frame: Frame) -> None:
         """Estimate from a frame and from the pairs that wait; publish the estimates, then the frame."""
@@ -129,43 +144,3 @@ class BoardTask(FingertipTask):
                 frame=frame.seq,
             )
         )
-
-
-class FingertipStates:
-    """Keeps the states of all fingertips for a recording that begins in the middle of a run.
-
-    They belong together, because a pair has frames of several boards. So they are taken between frames of all boards.
-    """
-
-    def __init__(self, clock: Clock, combined: CombinedTask | None = None) -> None:
-        """Begin without a board; the fingertips of a pair are in `combined`."""
-        self._clock = clock
-        self._combined = combined
-        self._boards: list[BoardTask] = []
-        self._busy = 0
-
-    def add(self, board: BoardTask) -> None:
-        """Take the task of a board."""
-        self._boards.append(board)
-
-    @contextlib.contextmanager
-    def processing(self) -> Iterator[None]:
-        """Hold the states back while the block processes a board's frames."""
-        self._busy += 1
-        try:
-            yield
-        finally:
-            self._busy -= 1
-        if not self._busy:
-            self._record()
-
-    def _record(self) -> None:
-        if not any(one.wants_state for one in self._boards):
-            return
-        if self._combined is not None and self._combined.has_waiting_pairs:
-            return
-        now_ns = self._clock.now_ns()
-        for one in self._boards:
-            one.record_state({"parser": one.board.parser}, now_ns)
-        if self._combined is not None:
-            self._combined.record_state({"pairing": self._combined.pairing}, now_ns)

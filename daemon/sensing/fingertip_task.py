@@ -167,10 +167,11 @@ class FingertipTask:
         """Whether a recording needs the state."""
         return self.inputs is not None and self.inputs.wants_state
 
-    def record_state(self, others: Mapping[str, object], now_ns: int) -> None:
+    def record_state(self, others: Mapping[str, object]) -> None:
         """Keep the state of the session, and of the others that belong to it."""
         if self.inputs is not None:
-            record_state(self.inputs, {**others, "session": self.session}, self.session.fixed, now_ns)
+            state = {**others, "session": self.session}
+            record_state(self.inputs, state, self.session.fixed, self.clock.now_ns())
 
     def _record(self, kind: InputKind, t_ns: int, data: bytes) -> None:
         if self.inputs is not None:

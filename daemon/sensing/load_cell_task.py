@@ -44,19 +44,24 @@ class LoadCellTask:
 
     async def run(self) -> None:
         """Publish every sample and pass it on, until cancelled."""
-        async with contextlib.aclosing(self._board.readings()) as samples:
-            async for sample in samples:
-                message = load_message(sample)
-                self._publisher.publish(message)
-                self._latest = sample
-                if self._loop is not None:
-                    torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
-                    self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, message.reason, sample.t_mid_ns, now_ns))
-                self._take_zero(sample)
-                if (inputs := self._board.state_recorder) is not None:
+        async with contextlib.aclosing(self._board.batches()) as batches:
+            async for samples in batches:
+                inputs = self._board.inputs
+                if not samples and inputs is not None and inputs.wants_state:
                     record_state(inputs, {"parser": self._board.parser}, {}, self._clock.now_ns())
-                self._sampled.set()
-                self._sampled.clear()
+                for sample in samples:
+                    self._process(sample)
+
+    def _process(self, sample: LoadSample) -> None:
+        message = load_message(sample)
+        self._publisher.publish(message)
+        self._latest = sample
+        if self._loop is not None:
+            torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
+            self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, message.reason, sample.t_mid_ns, now_ns))
+        self._take_zero(sample)
+        self._sampled.set()
+        self._sampled.clear()
 
     def tare(self) -> None:
         """Make the mean of samples measured from now on the zero; samples under way belong to the load before."""

@@ -189,8 +189,10 @@ class ReplayComparison:
     compared: Counter[str] = field(default_factory=Counter)
     different: Counter[str] = field(default_factory=Counter)
     examples: list[str] = field(default_factory=list)
-    # Sources that continue from a state which has not come yet: their messages are sent as they were recorded.
+    # Sources that continue from a state which has not come yet: their messages are sent as they were recorded, and
+    # counted here by topic and source.
     awaited: set[str] = field(default_factory=set)
+    before_state: Counter[tuple[str, str]] = field(default_factory=Counter)
     _foreign: int = 0
     waiting: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
 
@@ -221,6 +223,16 @@ class ReplayComparison:
         if keys:
             changes = (f"{key} was {_short(event.content[key])}, is {_short(computed.get(key))}" for key in keys)
             self._add_difference(event, ", ".join(changes))
+
+    @property
+    def without_state(self) -> list[str]:
+        """The sources whose messages could not be compared, because the recording has no state of theirs."""
+        return sorted({source for _, source in self.before_state if source in self.awaited})
+
+    @property
+    def passed(self) -> bool:
+        """Whether something was compared, nothing differs, and no source was left out."""
+        return bool(self.compared) and not self.different and not self.without_state
 
     @property
     def unrecorded(self) -> int:
@@ -301,6 +313,9 @@ class Replay:
             await self._process_input(event.source, event.raw)
         elif self._is_compared(event):
             self.comparison.compare(event)
+        elif self._run.has_inputs and event.topic in COMPUTED_TOPICS and event.source in self.comparison.awaited:
+            self.comparison.before_state[event.topic, event.source] += 1
+            self._publisher.forward(event.topic, messages.with_packed_arrays(event.content))
         elif event.topic != messages.EitHeatmap.topic:
             self._publisher.forward(event.topic, messages.with_packed_arrays(event.content))
 
@@ -312,7 +327,8 @@ class Replay:
         """Publish the messages that follow from a raw input; an input of another source is ignored."""
         if event.kind is InputKind.STATE:
             if source in self.comparison.awaited:
-                self._restore(source, event.data)
+                for waiting in self._restore(source, event.data):
+                    await self._estimate(COMBINED, *waiting)
         elif source in self.comparison.awaited:
             # Its state, which comes soon, includes what follows from this.
             return
@@ -320,8 +336,9 @@ class Replay:
             for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
-                pair = self._pairing.add(source, frame) if self._pairing is not None else None
-                if pair is not None:
+                if self._pairing is None or COMBINED in self.comparison.awaited:
+                    continue
+                if (pair := self._pairing.add(source, frame)) is not None:
                     await self._estimate(COMBINED, *pair)
         elif source == LOAD_CELL and self._load_parser is not None:
             for sample in self._load_parser.handle(event):
@@ -332,8 +349,12 @@ class Replay:
                 if SKIN not in self.comparison.awaited:
                     self._publisher.publish(self._continued(message))
 
-    def _restore(self, source: str, text: bytes) -> None:
-        """Continue a source from its recorded state; raises UserError for one that does not fit."""
+    def _restore(self, source: str, text: bytes) -> list[tuple[Frame, ...]]:
+        """Continue a source from its recorded state, and return the pairs of frames that waited then.
+
+        Raises UserError for a state that does not fit.
+        """
+        pairs: list[tuple[Frame, ...]] = []
         try:
             if source in self._sessions:
                 state = restored(text, self._sessions[source].fixed)
@@ -342,6 +363,7 @@ class Replay:
                     self._frame_parsers[source] = state["parser"]
                 else:
                     self._pairing = state["pairing"]
+                    pairs += state["pairs"]
             elif source == LOAD_CELL:
                 self._load_parser = restored(text, {})["parser"]
             elif self._skin is not None:
@@ -350,6 +372,7 @@ class Replay:
             raise UserError(f"{self._run.path}: the state of {source} cannot be used: {error}") from error
         self.comparison.restart(source)
         self._number_offset[source] = 0
+        return pairs
 
     def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:
         """Return frames with their recorded numbers: a later file of a run continues to count."""

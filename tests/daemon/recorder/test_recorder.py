@@ -376,6 +376,23 @@ def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path, 
     assert [one["frame"] for one in kept] == list(range(20 - dropped))
 
 
+def test_a_state_that_the_full_queue_drops_is_wanted_again(tmp_path, monkeypatch):
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
+    inputs = recorder.input_recorder("right")
+    for name in ("one", "two"):
+        recorder.record_experiment(name)
+    assert inputs.wants_state
+    monkeypatch.setattr(recorder_module, "MAX_WAITING_BYTES", 2000)
+    inputs.record(RawEvent(InputKind.STATE, 0, bytes(4000)))
+    assert inputs.wants_state
+    recorder.write()
+    inputs.record(RawEvent(InputKind.STATE, 0, b"{}"))
+    assert not inputs.wants_state
+    recorder.close()
+    (kept,) = topics(recorder.closed_files[1])["input.right"]
+    assert kept["data"] == "{}"
+
+
 def test_an_unwritable_folder_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot record there"):

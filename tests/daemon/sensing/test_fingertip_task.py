@@ -2,8 +2,8 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncGenerator
-from types import SimpleNamespace
+from collections.abc import AsyncGenerator, Mapping
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes, FingertipStates
+from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.sessions import COMBINED
@@ -62,6 +62,7 @@ class FakeSession:
     reason = "nothing"
     why_no_torque = ""
     calibration = SimpleNamespace(sides=("right", "left"), table=PAPER_TABLE)
+    fixed: Mapping[str, object] = MappingProxyType({})
 
     def __init__(self, fails: int = -1, waits: int = -1) -> None:
         self.fails, self.waits = fails, waits
@@ -131,9 +132,7 @@ def pairs(publisher: RecordingPublisher) -> CombinedTask:
 def fingertip(
     publisher: RecordingPublisher, session: FakeSession, combined: CombinedTask | None = None, in_one_read: int = 1
 ) -> BoardTask:
-    states = FingertipStates(Clock(), combined)
-    board = Board(in_one_read)
-    return BoardTask("right", session, publisher, Clock(), board=board, states=states, combined=combined)
+    return BoardTask("right", session, publisher, Clock(), board=Board(in_one_read), combined=combined)
 
 
 async def test_each_frame_is_estimated_and_then_published_in_order():
@@ -171,6 +170,79 @@ async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free(
         await combined.process_pairs()
         assert publisher.numbers("eit.estimate", COMBINED) == [1], "its partner has arrived in the same read"
         slow.go_on.set()
+
+
+class Reads:
+    """A board whose reads complete these frames; `ended` is set after the last."""
+
+    parser = None
+
+    def __init__(self, *reads: list[Frame]) -> None:
+        self._reads = reads
+        self.ended = asyncio.Event()
+
+    async def batches(self) -> AsyncGenerator[list[Frame]]:
+        for frames in self._reads:
+            yield frames
+        self.ended.set()
+        await asyncio.Event().wait()
+
+
+class Inputs:
+    """The recorder of one source, in a file that began in the middle of a run."""
+
+    wants_state = True
+
+
+@pytest.fixture
+def states(monkeypatch) -> list[dict[str, Any]]:
+    """The recorded states, with the recorder as `of`."""
+    kept: list[dict[str, Any]] = []
+
+    def keep(inputs: Inputs, state: dict[str, Any], _fixed: object, _now_ns: int) -> None:
+        inputs.wants_state = False
+        kept.append({**state, "of": inputs})
+
+    monkeypatch.setattr("shearloop.daemon.sensing.fingertip_task.record_state", keep)
+    return kept
+
+
+async def test_a_busy_fingertip_keeps_no_other_state_from_a_recording(states):
+    publisher, slow, combined = RecordingPublisher(3), FakeSession(waits=0), pairs(RecordingPublisher())
+    right, left, both = Inputs(), Inputs(), Inputs()
+    combined.inputs, combined.sides = both, (right, left)
+    # A read that completes no frame comes before the first one that a file has.
+    busy = BoardTask("right", slow, publisher, Clock(), inputs=right, board=Reads([frame(0)], []), combined=combined)
+    idle = BoardTask("left", FakeSession(), publisher, Clock(), inputs=left, board=Reads([]), combined=combined)
+    async with running(busy.run()):
+        await asyncio.to_thread(slow.begun.wait)
+        async with running(idle.run()):
+            await idle.board.ended.wait()
+        assert [one["of"] for one in states] == [left], "a pair needs the states of both boards"
+        slow.go_on.set()
+        await busy.board.ended.wait()
+    assert [one["of"] for one in states] == [left, right, both]
+
+
+async def test_pairs_that_wait_are_a_part_of_the_state(states):
+    combined = pairs(RecordingPublisher())
+    combined.inputs = Inputs()
+    for number in range(2):
+        for side in ("right", "left"):
+            combined.add(side, [frame(number)])
+    combined.record_own_state()
+    (state,) = states
+    assert [[one.seq for one in pair] for pair in state["pairs"]] == [[0, 0], [1, 1]]
+    # None is recorded while an estimate is made; the next one is after it.
+    combined.inputs = Inputs()
+    combined.session = slow = FakeSession(waits=0)
+    async with running(combined.process_pairs()) as (processing,):
+        await asyncio.to_thread(slow.begun.wait)
+        combined.record_own_state()
+        assert len(states) == 1
+        slow.go_on.set()
+        await processing
+    assert len(states) == 2
 
 
 @pytest.mark.parametrize("since_ms", [1, 100, 540, 621])

@@ -27,11 +27,11 @@ class Board:
         self._seq = Clock().now_ns() + 10**9
 
     # Nothing is recorded.
-    state_recorder = None
+    inputs = None
 
-    async def readings(self) -> AsyncGenerator[LoadSample]:
+    async def batches(self) -> AsyncGenerator[list[LoadSample]]:
         while True:
-            yield await self.sent.get()
+            yield [await self.sent.get()]
             self.sent.task_done()
 
     def tare(self, raw_at_rest: float) -> None:

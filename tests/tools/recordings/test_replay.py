@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 import yaml
 import zmq.asyncio
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
@@ -313,3 +315,41 @@ def test_each_of_a_daemons_recordings_replays_bit_for_bit(config, tmp_path, ran)
         frames, estimates = (re.search(rf"{topic}: (\d+) of \1 equal", said) for topic in ("eit.frame", "eit.estimate"))
         assert int(frames[1]) > 8, path
         assert int(estimates[1]) > 8, path
+
+
+def without_states(path: Path) -> Path:
+    """Return a copy of a recording without the states that it begins with."""
+    copy = path.with_name("without.mcap")
+    with path.open("rb") as source, copy.open("wb") as target:
+        reader, writer = make_reader(source), McapWriter(target)
+        writer.start()
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        for own, channel, message in reader.iter_messages(log_time_order=False):
+            if own.id not in schemas:
+                schemas[own.id] = writer.register_schema(own.name, own.encoding, own.data)
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas[own.id], channel.metadata
+                )
+            if json.loads(message.data).get("kind") != InputKind.STATE.value:
+                writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        for one in reader.iter_attachments():
+            writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
+        for one in reader.iter_metadata():
+            writer.add_metadata(one.name, one.metadata)
+        writer.finish()
+    return copy
+
+
+def test_a_check_fails_for_a_source_whose_state_is_missing(config, tmp_path, ran):
+    """A daemon that was killed too soon leaves such a file."""
+    asyncio.run(record_experiments(config(recording={"folder": "recordings"})))
+    (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
+    publish = ("--publish", f"ipc://{tmp_path}/replay")
+    out, said = ran("replay", without_states(later), "--speed", "max", *publish, "--check", "--json", status=1)
+    assert "Nothing of right was compared: the recording has no state of it" in said
+    result = json.loads(out.splitlines()[-1])
+    assert result["without_state"] == ["right"]
+    assert result["before_state"]["eit.frame.right"] > ENOUGH - BEGUN - 10
+    assert result["different"] == {}

@@ -29,7 +29,7 @@ from shearloop.drivers.hosts import why_no_host
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.yaml_files import shown
+from shearloop.mistakes import shown
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {

@@ -21,7 +21,8 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, 
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.errors import UserError
 from shearloop.files import read_file
-from shearloop.yaml_files import MOST_BYTES, Document, shown
+from shearloop.mistakes import shown
+from shearloop.yaml_files import MOST_BYTES, Document
 
 # A file on a network drive may never answer.
 READ_WITHIN_S = 5.0

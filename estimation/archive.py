@@ -22,7 +22,8 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.estimator import Estimator
 from shearloop.estimation.values import INLINE
 from shearloop.files import open_file, refusing_damage, replace_file
-from shearloop.yaml_files import parse_yaml, shown
+from shearloop.mistakes import shown
+from shearloop.yaml_files import parse_yaml
 
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"

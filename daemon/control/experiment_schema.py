@@ -12,7 +12,7 @@ from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
 from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S
-from shearloop.yaml_files import shown
+from shearloop.mistakes import shown
 
 MOST_ANGLES = 1000
 # Larger numbers have no differences.

@@ -5,29 +5,22 @@ allowed: …; did you mean …?`.
 """
 
 import copy
-import math
 import re
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails
 
 from shearloop.files import read_file, replace_file
-from shearloop.units import unit_hint, unit_of
-from shearloop.words import counted
+from shearloop.mistakes import Model, as_model, mistake_lines, place_of, shown
 
-Model = TypeVar("Model")
-
-_LONGEST_VALUE = 60
 # Of Linux.
 _LONGEST_NAME, _LONGEST_PATH = 255, 4096
-# Bounds on what a file may cost: its bytes, its values with every alias written out, and its mistakes that are shown.
-MOST_BYTES, _MOST_VALUES, _MOST_MISTAKES = 1 << 17, 20_000, 100
+# Bounds on what a file may cost: its bytes, and its values with every alias written out.
+MOST_BYTES, _MOST_VALUES = 1 << 17, 20_000
 
 
 class _Loader(yaml.SafeLoader):
@@ -140,11 +133,13 @@ class Document:
             example = next(iter(TypeAdapter(model).json_schema()["properties"]), "key")
             raise self.raises(f"{self.path}: expected keys and values such as `{example}: …`")
         try:
-            return _validated(self.content, model, self.path.resolve().parent)
+            return as_model(self.content, model, self.path.resolve().parent)
         except ValidationError as error:
             if texts := self._expected_texts(error):
                 return self._with_texts(texts).model(model)
-            raise self.raises("\n".join(_mistakes(error, model, self.content, str(self.path), self._root))) from error
+            raise self.raises(
+                "\n".join(mistake_lines(error, model, self.content, str(self.path), self._root))
+            ) from error
 
     def _expected_texts(self, error: ValidationError) -> dict[tuple[int | str, ...], str]:
         """Return the given values, as they were written, where a text or a path is expected."""
@@ -205,7 +200,7 @@ class Document:
         """Return `file:line: key: sentence` for each mistake, given by its location in the content."""
         found = []
         for location, sentence in mistakes:
-            key, line = _place(location, self.content, self._root, missing=True)
+            key, line = place_of(location, self.content, self._root, missing=True)
             found.append((line, f"{self.path}:{line}: {key}: {sentence}"))
         return [text for _, text in sorted(found)]
 
@@ -229,18 +224,6 @@ def load_model(
     return Document.read(path, raises, what, cure).model(model)
 
 
-def validated(content: object, model: type[Model], where: str, raises: type[Exception], *, cure: str = "") -> Model:
-    """Return the content as a model; each line of the message begins with `where`, and the last ends with `cure`."""
-    try:
-        return _validated(content, model)
-    except ValidationError as error:
-        raise raises("\n".join(_mistakes(error, model, content, where)) + cure) from error
-
-
-def _validated(content: object, model: type[Model], folder: Path | None = None) -> Model:
-    return TypeAdapter(model).validate_python(content, context=folder and {"folder": folder})
-
-
 def save_yaml(path: Path, content: Mapping[str, Any], raises: type[Exception]) -> None:
     """Write the content atomically: a reader sees the old file or the new one."""
     try:
@@ -250,7 +233,7 @@ def save_yaml(path: Path, content: Mapping[str, Any], raises: type[Exception]) -
         raise raises(f"{path}: the calibration cannot be written: {error.strerror}") from error
 
 
-# The libraries' words for frequent mistakes, and ours.
+# The library's words for frequent mistakes, and ours.
 _SYNTAX = (
     ("found character '\\t'", "a tab indents this line; use spaces"),
     ("mapping values are not allowed", "a second `:` stands in this line, or the line before is indented otherwise"),
@@ -263,200 +246,8 @@ _SYNTAX = (
     ("but found another document", "a second document begins here; a file has one"),
     ("found undefined alias", "an alias `*name` without its anchor `&name`"),
 )
-_WRONG = (
-    ("finite_number", "is not a finite number"),
-    ("float_", "is not a number"),
-    ("int_", "is not a whole number"),
-    ("bool_", "is neither true nor false"),
-    ("string_pattern", "is not such a name"),
-    ("string_too_short", "is empty"),
-    ("too_short", "has too few entries"),
-    ("string_too_long", "is too long"),
-    ("too_long", "has too many entries"),
-    ("string_", "is not text"),
-    ("tuple_", "is not a list"),
-    ("list_", "is not a list"),
-    ("dict_", "is not a section with keys"),
-    ("model_", "is not a section with keys"),
-    ("dataclass_", "is not a section with keys"),
-    ("path_", "is not the path of a file"),
-    ("literal_error", "does not exist"),
-    ("enum", "does not exist"),
-    ("greater_than", "is too small"),
-    ("less_than", "is too large"),
-)
 
 
 def _syntax(error: yaml.MarkedYAMLError) -> str:
     problem = str(error.problem or error.context)
     return next((words for begin, words in _SYNTAX if problem.startswith(begin)), problem)
-
-
-def _mistakes(
-    error: ValidationError, model: type, content: object, where: str, root: yaml.Node | None = None
-) -> list[str]:
-    """Return a line for each mistake, in the order of the file; `root` is its content with line numbers.
-
-    Only the first are shown of very many: each takes a search through the file.
-    """
-    schema = TypeAdapter(model).json_schema()
-    found: dict[str, int] = {}
-    every = error.errors(include_url=False)
-    first, more = every[:_MOST_MISTAKES], every[_MOST_MISTAKES:]
-    for details in first:
-        location = details["loc"]
-        # A list counts only its valid entries, so that mistakes within it make it too short as well.
-        if details["type"] == "too_short" and any(one["loc"][:-1][: len(location)] == location for one in first):
-            continue
-        kind = details["type"]
-        key, line = _place(location, content, root, missing=kind == "missing")
-        wrong_key = kind == "invalid_key" or location[-1:] == ("[key]",)
-        if wrong_key:
-            # Only the key's section has a name.
-            section = location[:-2] if location[-1] == "[key]" else location[:-1]
-            key, _ = _place(section, content, root, missing=False)
-        if kind.startswith("union_tag"):
-            key += "." + details["ctx"]["discriminator"].strip("'")
-        subject = f"{key}: " if key else ""
-        sentence = _sentence(details, schema, _written(location, content, root, key=wrong_key))
-        found[f"{where}{f':{line}' if root is not None else ''}: {subject}{sentence}"] = line
-    return sorted(found, key=lambda text: found[text]) + (
-        [f"{where}: {counted(len(more), 'more mistake')}"] if more else []
-    )
-
-
-def _place(location: Sequence[int | str], content: object, node: yaml.Node | None, *, missing: bool) -> tuple[str, int]:
-    """Return a location's key, without the names of alternatives, and its line; its last part may be `missing`."""
-    key, line, last = "", 1, len(location) - 1
-    for number, part in enumerate(location):
-        child: yaml.Node | None = None
-        if isinstance(content, Mapping) and part in content:
-            if isinstance(node, yaml.MappingNode):
-                name, child = _pair(content, part, node)
-                line = name.start_mark.line + 1
-            content = content[part]
-        elif isinstance(content, list | tuple) and isinstance(part, int) and part < len(content):
-            content = content[part]
-            if isinstance(node, yaml.SequenceNode):
-                child = node.value[part]
-                line = child.start_mark.line + 1
-        elif not (missing and number == last):
-            continue
-        node = child
-        key += f"[{part}]" if isinstance(part, int) else f".{part}"
-    return key.lstrip("."), line
-
-
-def _pair(content: Mapping[Any, object], key: int | str, node: yaml.MappingNode) -> tuple[yaml.Node, yaml.Node]:
-    """Return the nodes of a key and of its value; keys are unique, so that they stand in the content's order."""
-    name, value = node.value[list(content).index(key)]
-    return name, value
-
-
-def _written(location: Sequence[int | str], content: object, node: yaml.Node | None, *, key: bool) -> str:
-    """Return the value at a location as it is written in the file, or its key; else an empty text."""
-    name = node
-    for part in location:
-        if isinstance(content, Mapping) and part in content and isinstance(node, yaml.MappingNode):
-            name, node = _pair(content, part, node)
-            content = content[part]
-        elif isinstance(content, list) and isinstance(part, int) and isinstance(node, yaml.SequenceNode):
-            name = node = node.value[part]
-            content = content[part]
-    wrong = name if key else node
-    return str(wrong.value) if isinstance(wrong, yaml.ScalarNode) else ""
-
-
-def _unquoted(found: object, written: str, what: str) -> str:
-    """Return a sentence on a text that YAML reads as something else, and its cure."""
-    read_as = "true or false" if isinstance(found, bool) else "a number"
-    return f"{what}{written or shown(found)} without quotes is {read_as}, and no text; put it in quotes"
-
-
-def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str = "") -> str:
-    location, kind, found = details["loc"], details["type"], details["input"]
-    if kind == "invalid_key" or (kind == "string_type" and location[-1:] == ("[key]",)):
-        if isinstance(found, bool):
-            return _unquoted(found, written, "the key ")
-        return f"the key {written or shown(found)} is a number; a name is expected"
-    if kind == "string_type" and isinstance(found, bool | int | float):
-        return f'{_unquoted(found, written, "")}: "{written or found}"'
-    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"is not a known key{_known_keys(str(location[-1]), _schema_at(schema, location[:-1], schema))}"
-    if kind in ("value_error", "assertion_error"):
-        return details["msg"].split(", ", 1)[1]
-    here = _schema_at(schema, location, schema)
-    choices, allowed = list(map(str, here.get("enum", ()))), _allowed(here)
-    if kind.startswith("union_tag"):
-        choices = [tag.strip("'") for tag in details["ctx"].get("expected_tags", "").split(", ") if tag]
-        found, allowed = details["ctx"].get("tag"), ", ".join(choices)
-    if kind in ("missing", "union_tag_not_found"):
-        sentence = "is missing"
-    elif kind == "union_tag_invalid":
-        sentence = f"{shown(found)} does not exist"
-    else:
-        wrong = (words for begin, words in _WRONG if kind.startswith(begin))
-        sentence = f"{shown(found)} {next(wrong, details['msg'])}"
-    near = get_close_matches(str(found), choices, 1)
-    hint = f"did you mean {near[0]}?" if near else _unit_hint(location, found, here)
-    return "; ".join(filter(None, (sentence, f"allowed: {allowed}" if allowed else "", hint)))
-
-
-def _unit_hint(location: Sequence[int | str], found: object, schema: Mapping[str, Any]) -> str:
-    """Return a question where a number would fit in another unit."""
-    if not isinstance(found, int | float) or isinstance(found, bool) or not _allowed(schema):
-        return ""
-    low = schema.get("minimum", schema.get("exclusiveMinimum", -math.inf))
-    high = schema.get("maximum", schema.get("exclusiveMaximum", math.inf))
-    key = next((part for part in reversed(location) if isinstance(part, str)), "")
-    return unit_hint(found, schema.get("unit") or unit_of(key), low, high)
-
-
-def _known_keys(wrong: str, schema: Mapping[str, Any]) -> str:
-    known = list(schema.get("properties", {}))
-    # Often the unit is missing: `speed` for `speed_rad_per_s`.
-    near = get_close_matches(wrong, known, n=1) or [name for name in known if name.startswith(f"{wrong}_")]
-    if near:
-        return f"; did you mean {near[0]}?"
-    return f"; allowed: {', '.join(known)}" if known else ""
-
-
-def _schema_at(schema: Mapping[str, Any], location: Sequence[int | str], root: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the JSON schema of a location in the document, or an empty one if it is ambiguous."""
-    if "$ref" in schema:
-        return _schema_at(root["$defs"][schema["$ref"].rsplit("/", 1)[-1]], location, root)
-    if "anyOf" in schema:
-        candidates = [part for part in schema["anyOf"] if part.get("type") != "null"]
-        if location and isinstance(location[0], int):
-            candidates = [part for part in candidates if part.get("type") == "array"]
-        return _schema_at(candidates[0], location, root) if len(candidates) == 1 else {}
-    if not location:
-        return schema
-    if "oneOf" in schema:
-        kind = schema.get("discriminator", {}).get("mapping", {}).get(location[0])
-        return _schema_at({"$ref": kind}, location[1:], root) if kind else {}
-    step, rest = location[0], location[1:]
-    if isinstance(step, int):
-        each = schema.get("prefixItems", ())
-        inside = each[step] if step < len(each) else schema.get("items")
-    else:
-        named = schema.get("properties", {}).get(step)
-        inside = (
-            named
-            or schema.get("additionalProperties")
-            or next(iter(schema.get("patternProperties", {}).values()), None)
-        )
-    return _schema_at(inside, rest, root) if isinstance(inside, Mapping) else {}
-
-
-def _allowed(schema: Mapping[str, Any]) -> str:
-    if "enum" in schema:
-        return ", ".join(map(str, schema["enum"]))
-    bounds = {"exclusiveMinimum": "above", "minimum": "from", "exclusiveMaximum": "below", "maximum": "to"}
-    return " ".join(f"{word} {schema[name]:g}" for name, word in bounds.items() if name in schema)
-
-
-def shown(value: object) -> str:
-    """Return a value of a file for a message, at most 60 characters."""
-    text = repr(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"

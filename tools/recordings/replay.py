@@ -43,9 +43,9 @@ from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.estimation import Session
+from shearloop.mistakes import validated
 from shearloop.tools.recordings.message_content import ContentError
 from shearloop.tools.recordings.reader import open_recording, reading
-from shearloop.yaml_files import validated
 
 # Topics that a replay computes. All others are sent as they were recorded.
 _COMPUTED = messages.EitFrame, messages.EitEstimate, messages.EitAdapted, messages.LoadTorque, messages.SkinShear

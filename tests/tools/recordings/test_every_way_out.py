@@ -1,7 +1,6 @@
 """Every topic, column and row of every way out of a recording equals the recorded messages, read independently."""
 
 import asyncio
-import base64
 import csv
 import json
 import math
@@ -35,11 +34,17 @@ from tests.tools.recordings.every_message import (
     value_of,
 )
 from tests.tools.recordings.test_replay import replayed
+from tests.tools.recordings.watching import Watched, check_message, no_json, page_content, same, watching
 
 __all__ = ["rig_config"]
 pytestmark = pytest.mark.usefixtures("rerun_runtime")
 MONOTONIC = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
 SCALARS = ("number", "integer", "boolean")
+# What the daemon of a rig with one fingertip publishes in an experiment that is done.
+ON_THE_RIG = {
+    *("eit.frame", "eit.estimate", "eit.heatmap", "load.torque", "robot.state", "gripper.state"),
+    *("loop.state", "daemon.command", "daemon.end", "health"),
+}
 NOT_IN_RERUN = ("timestamp", "t_mono_ns", "seq", "scores", "scores_shape")
 # Of a LeRobot dataset, by topic.
 FEATURES = {
@@ -56,21 +61,6 @@ FEATURES = {
         "width_mm diameter_mm diameter_std_mm tool_diameter_mm tool_diameter_std_mm current_ma",
     ),
 }
-
-
-def no_json(text: str) -> None:
-    pytest.fail(f"{text} is no JSON")
-
-
-def same(found: Any, expected: Any) -> bool:
-    """Return whether two values are equal, with NaN and None for nothing."""
-    if isinstance(expected, list):
-        return len(found) == len(expected) and all(map(same, found, expected))
-    if expected is None or found is None:
-        return expected is None and (found is None or found == "" or math.isnan(found))
-    if isinstance(expected, dict):
-        return bool(json.loads(found) == expected) if isinstance(found, str) else bool(found == expected)
-    return type(found) in (type(expected), float, int, np.bool_) and bool(found == expected)
 
 
 def check_rows(what: str, found: list[Row], expected: list[Row], columns: dict[str, str]) -> None:
@@ -248,28 +238,6 @@ def channel_slots() -> np.ndarray:
     return slots
 
 
-def page_content(paged: Row) -> Row:
-    """Return a message's content of a batch for the page, with its arrays as lists."""
-    return {
-        key: np.frombuffer(base64.b64decode(value["float32"]), "<f4").reshape(value["shape"]).tolist()
-        if isinstance(value, dict) and "float32" in value
-        else value
-        for key, value in paged["content"].items()
-    }
-
-
-def check_message(topic: str, shown: Row, published: Row, row: Row | None) -> None:
-    """Hold what is shown of a message to be all that was published, and the recorded row too, if there is one."""
-    assert shown.keys() == {key for key in published if not key.endswith("_shape")}, topic
-    for key, value in shown.items():
-        truth = value_of(published, key)
-        flat = np.array(value, float).round(6).ravel().tolist() if isinstance(truth, list) else value
-        assert same(flat, truth), f"{topic} {key}: {value} is not {truth}"
-        # Unix times of a recording have one offset for the file.
-        kept = row["log_time_ns"] / 1e9 if row is not None and key == "timestamp" else truth
-        assert row is None or same(row.get(key), kept), f"recorded {topic} {key}"
-
-
 def check_live(one: Recorded) -> None:
     """Compare what `listen`, the page and the recording make of each published message."""
     recorded = one.by_stream()
@@ -384,15 +352,15 @@ def test_with_absent_devices(config, tmp_path, ran, mistake):
     check(Recorded(latest_recording(tmp_path / "recordings"), published), tmp_path / "out", ran, mistake)
 
 
-async def twisted(config: Path, bank: Path, path: Path) -> Published:
-    """Return what the daemon of an emulated rig publishes during an experiment."""
-    async with running_rig(config, bank) as (daemon, watcher, _fault, command):
-        published: Published = []
-        daemon.publisher.add_listener(lambda topic, content: published.append((topic, content)))
-        await started(command, str(path))
-        state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
-        assert state["phase"] == "done", state["activity"]
-    return published
+async def twisted(config: Path, bank: Path, path: Path) -> tuple[Published, Watched]:
+    """Return what the daemon of an emulated rig publishes during an experiment, and what is heard of it."""
+    async with watching(config.parent) as watched:
+        async with running_rig(config, bank) as (_, watcher, _fault, command):
+            await started(command, str(path))
+            state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
+            assert state["phase"] == "done", state["activity"]
+        await watched.until_ended()
+    return [(topic, content) for topic, contents in watcher.seen.items() for content in contents], watched
 
 
 @pytest.mark.real_time
@@ -402,7 +370,8 @@ def test_of_the_whole_rig(rig_config, tiny_bank, tmp_path, ran, mistake):
     twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.3, "hold_s": 1.5}
     path = Path(experiment(tmp_path, twist, {"do": "release"}))
     path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), "slices": "torque"}))
-    published = asyncio.run(twisted(rig_config, tiny_bank, path))
+    published, watched = asyncio.run(twisted(rig_config, tiny_bank, path))
     one = Recorded(latest_recording(tmp_path / "recordings"), published)
+    watched.check(one, ON_THE_RIG, {"eit.frame"})
     check(one, tmp_path / "out", ran, mistake)
     check_slices(one, tmp_path / "out", ran)

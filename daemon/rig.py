@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 
+import structlog
+
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, commissioning_of, measured_widths
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
@@ -286,12 +288,20 @@ def build_sensors(
     return Sensors(tasks, tareable, pairs)
 
 
+def log_assumptions(sessions: Mapping[str, Session]) -> None:
+    """Log what the estimates of each session rest on that nothing checks."""
+    for name, session in sessions.items():
+        if assumed := session.calibration.assumption_text:
+            structlog.get_logger().warning(f"the calibration of {name} assumes that {assumed}")
+
+
 def build_rig(
     config: DaemonConfig, publisher: Publisher, clock: Clock, recorder: Recorder | None, supervisor: Supervisor
 ) -> tuple[Sensors, Rig | None]:
     """Return all sensors, and robot, gripper and control loop, if there is a robot."""
     sessions = {name: open_session(fingertip, name) for name, fingertip in config.fingertips.items()}
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
+    log_assumptions(sessions if combined is None else {**sessions, COMBINED: combined})
     sources = torque_sources(config, sessions, combined)
     settings = open_settings(config)
     commissioning = commissioning_of(config, settings) if settings is not None else None

@@ -27,6 +27,10 @@ _FORMAT = Format("estimator calibration", FORMAT_VERSION, estimator_class)
 # What the user guarantees, with the end of a sentence that says so.
 Assumption = Literal["load timing"]
 _ASSUMPTION_TEXTS: dict[Assumption, str] = {"load timing": "the load cell's delay is as given (--load-cell-delay-s)"}
+_UNKNOWN_STRENGTH = (
+    "every grip is about as strong as in the calibration, because the file does not hold that strength (calibrate "
+    "again to have it checked)"
+)
 # Tools differ if their diameters differ by a larger share.
 LARGEST_TOOL_SHARE = 0.15
 
@@ -123,8 +127,11 @@ class Calibration:
 
     @property
     def assumption_text(self) -> str:
-        """The user's guarantees as part of a sentence, empty without any."""
-        return " and ".join(_ASSUMPTION_TEXTS[one] for one in self.assumptions)
+        """The user's guarantees, and what this file cannot check, as part of a sentence; empty without any."""
+        texts = [_ASSUMPTION_TEXTS[one] for one in self.assumptions]
+        if any(one.strength is None for one in self.validators):
+            texts.append(_UNKNOWN_STRENGTH)
+        return " and ".join(texts)
 
     def save(self, path: str | Path) -> None:
         """Write the file, the same bytes for the same calibration; CalibrationError where that fails."""
@@ -143,6 +150,7 @@ class Calibration:
         """Raise ValueError where arrays do not fit together, as in a file that another program wrote."""
         c, m = self.estimator.table.n_channels, max(len(self.sides), 1)
         rows = [a for one in self.validators for a in (one.idle, one.gripped, one.noise, one.grip_weights)]
+        rows += [one.strength.weights for one in self.validators if one.strength is not None]
         whole = self.estimator.scale.shape == (m, c) and all(row.shape == (c,) for row in rows)
         if not whole or len(self.validators) not in (0, len(self.sides)):
             raise ValueError(f"it is of {len(self.sides)} sides of {c} channels, and its arrays have other shapes")

@@ -7,6 +7,7 @@ discriminant detects the grip. It ignores the motion of a frame by twisting and 
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -15,6 +16,7 @@ from scipy import linalg
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.grip_strength import CalibratedStrength, GripStrength
 
 # One step of the board's converter, measured on recorded frames. Its rounding is the smallest noise.
 _CONVERTER_STEP_V = 0.00215
@@ -61,6 +63,7 @@ class FingertipValidator:
     Channels that were dead at calibration have infinite noise. If the calibration has no frames after a release, the
     gel's slow recovery could pass for a grip. A release is then detected as a step: further than step_limit (in
     noises) within STEP_FRAMES frames, while the grip score falls by more than fall_limit. Otherwise both are infinite.
+    `strength` compares the strength of a grip, None in a file that does not hold it.
     """
 
     side: str
@@ -71,6 +74,7 @@ class FingertipValidator:
     grip_threshold: float
     step_limit: float
     fall_limit: float
+    strength: CalibratedStrength | None = None
 
     @classmethod
     def fit(cls, side: str, *recordings: tuple[FloatArray, FloatArray, FloatArray]) -> Self:
@@ -120,7 +124,8 @@ class FingertipValidator:
             step_limit = _STEP_MARGIN * max(float(frame_steps(frames, noise).max()) for frames in gripped)
             fall_limit = _STEP_MARGIN * max(float((one[:-STEP_FRAMES] - one[STEP_FRAMES:]).max()) for one in score)
         mean = np.concatenate([gripped for _, gripped, _ in recordings]).mean(axis=0)
-        return cls(side, base, mean, noise, weights, threshold, step_limit, fall_limit)
+        strength = CalibratedStrength.fit(_strength_weights(relative, scale), [one[1] for one in relative])
+        return cls(side, base, mean, noise, weights, threshold, step_limit, fall_limit, strength)
 
     def looks_idle(self, frame: FloatArray) -> bool:
         """Return whether a session's first frame is idle: not clearly nearer to the calibrated grip."""
@@ -247,6 +252,7 @@ class GripDetector:
     def __init__(self, side: FingertipValidator) -> None:
         """Start without a grip."""
         self._side = side
+        self.strength = GripStrength(side.strength)
         self._floor = 0.0
         self._level: float | None = None
         self._frames = 0
@@ -275,7 +281,12 @@ class GripDetector:
         else:
             self._frames = min(self._frames + 1, _LEVEL_FRAMES)
             self._level += (score - self._level) / self._frames
-        return self._level is not None and not self._released
+        gripped = self._level is not None and not self._released
+        if gripped:
+            self.strength.add(relative_change(frame, idle))
+        else:
+            self.strength.forget()
+        return gripped
 
 
 def relative_change(frame: FloatArray, idle: FloatArray) -> FloatArray:
@@ -315,13 +326,26 @@ def _medians(rows: FloatArray, counts: IntArray) -> FloatArray:
     return np.where(counts > 0, halves / 2, 0.0)
 
 
-def _discriminant(parts: list[FloatArray]) -> FloatArray:
+def _strength_weights(relative: Sequence[tuple[FloatArray, ...]], scale: FloatArray) -> FloatArray:
+    """Return the grip's discriminant of recordings with (n, c) relative changes idle, gripped and perhaps released.
+
+    It ignores motion within each grip. A discriminant of all of them together would ignore how strong they are too.
+    """
+    scaled = [[part / scale for part in one] for one in relative]
+    within = np.vstack([part - part.mean(axis=0) for one in scaled for part in one if len(part)])
+    parts = [np.concatenate([one[i] for one in scaled]) for i in range(3)]
+    return _discriminant([part for part in parts if len(part)], within) / scale
+
+
+def _discriminant(parts: list[FloatArray], within: FloatArray | None = None) -> FloatArray:
     """Return weights of idle, gripped and perhaps released frames: 0 for the mean idle frame, 1 for the gripped one.
 
-    Directions of variation within the parts, and the one from idle to released, have no weight.
+    Directions of variation within the parts, and the one from idle to released, have no weight. `within` (n, c) is the
+    variation, by default the frames' differences to the mean of their part.
     """
     means = [part.mean(axis=0) for part in parts]
-    within = np.vstack([part - mean for part, mean in zip(parts, means, strict=True)])
+    if within is None:
+        within = np.vstack([part - mean for part, mean in zip(parts, means, strict=True)])
     # The first right singular vectors, by the smaller of the two Gram matrices: np.linalg.svd would find all.
     few = len(within) < within.shape[1]
     gram = within @ within.T if few else within.T @ within

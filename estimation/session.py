@@ -29,6 +29,7 @@ from shearloop.estimation.fingertip_validator import (
 )
 from shearloop.estimation.frame_checks import ChannelChecks, FrameTimer
 from shearloop.estimation.grip_memory import GripMemory
+from shearloop.estimation.grip_strength import strength_reasons
 from shearloop.estimation.idle_frames import IdleFrames
 from shearloop.estimation.values import Estimate, Measured, ProcessedFrame, TactileFrame
 from shearloop.words import counted
@@ -95,6 +96,8 @@ class Session:
         self.difference: FloatArray | None = None
         self._latest: FloatArray = np.full(self.calibration.estimator.scale.shape, np.nan)
         self._gain = GripGain()
+        # Why the calibration does not hold for the strength of the last grip, none if it does.
+        self._strength_reasons: tuple[str, ...] = ()
 
     def _begin(self, idle_frames: int) -> None:
         """Forget all frames."""
@@ -131,10 +134,13 @@ class Session:
     def adapt(self, torque_nm: FloatArray) -> Adaptation:
         """Correct the gain until the next grip or tare, by torques (n,) measured at `grip_t_s`, NaN where unknown.
 
-        Raises CalibrationError as `GripGain.correct` does, and for a tool without a torque.
+        Raises CalibrationError as `GripGain.correct` does, for a tool without a torque, and for a grip of a strength
+        that the calibration does not hold for: twists do not cure that.
         """
         if self._tool_reasons:
             raise CalibrationError(self._tool_reasons[0])
+        if self._strength_reasons:
+            raise CalibrationError(self._strength_reasons[0])
         return self._gain.correct(self._calibration, self._tool, self.calibration, torque_nm)
 
     def heatmap(self) -> FloatArray | None:
@@ -235,8 +241,11 @@ class Session:
             return ProcessedFrame(difference, (reason,), usable, held_frames=0)
         memory = self._memory
         # Motion is read in volts: after a release a gel's idle voltages recover for minutes, which is no gain.
-        if reason := memory.remember(channels, from_idle, difference, missing):
-            return ProcessedFrame(difference, (reason,), usable)
+        recent = memory.remember(channels, from_idle, difference, missing)
+        ratios = {one.side: grip.strength.ratio for one, grip in zip(sides, self._grips, strict=True)}
+        self._strength_reasons = strength_reasons(ratios)
+        if reasons := (recent,) if recent else self._strength_reasons:
+            return ProcessedFrame(difference, reasons, usable)
         return ProcessedFrame(
             difference, (), usable, memory.mean_difference, memory.features, memory.held_frames, idle.complete
         )

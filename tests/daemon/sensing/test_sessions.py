@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from structlog.testing import capture_logs
 
 from shearloop.bank.errors import BankError
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
+from shearloop.daemon.rig import log_assumptions
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
 from shearloop.daemon.sensing.sessions import open_combined, open_session
 from shearloop.drivers.eit_kit import Frame
@@ -132,6 +134,20 @@ def test_check_shows_the_assumptions(calibration, files, tmp_path):
     ends = ", assuming that the load cell's delay is as given (--load-cell-delay-s)"
     for file, said in ((path, f"with torque{ends}"), (files["combined"], "with torque")):
         assert _torque(open_combined(CombinedConfig(calibration=file), tips).calibration) == said
+
+
+def test_check_and_log_say_where_the_strength_of_a_grip_is_not_checked(calibration, tmp_path):
+    """A calibration's file of version 0.3.0 does not hold it."""
+    path, tips = tmp_path / "combined.cal", {"right": fingertip(), "left": fingertip()}
+    replace(calibration, validators=tuple(replace(one, strength=None) for one in calibration.validators)).save(path)
+    session = open_combined(CombinedConfig(calibration=path), tips)
+    assumed = "assuming that every grip is about as strong as in the calibration, because the file does not hold"
+    assert assumed in _torque(session.calibration)
+    with capture_logs() as logs:
+        log_assumptions({"combined": session})
+    (line,) = logs
+    assert line["log_level"] == "warning"
+    assert "the calibration of combined assumes that every grip is about as strong" in line["event"]
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from shearloop.studies.slices.evaluate import estimate_slices
 from shearloop.studies.slices.fitting import fit_slices
 from shearloop.studies.slices.novelty import NoveltyDetector
 from shearloop.studies.slices.series import SliceSeries, read_slices
-from shearloop.tools.evaluate import estimate_series, figures_by_load, figures_of
+from shearloop.tools.evaluate import estimate_series, figures_by_load, figures_of, invalid_reasons
 from shearloop.tools.frame_series import part_of, read_series, series_of
 from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import find_streams, import_mat, read_stream
@@ -161,6 +161,26 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
     assert "46 s in all" in imported.remarks[0]
     other = series_of(read_recording(tmp_path / "other.mcap"))
     assert figures_of([estimate_series(of_all_twists, other)])["valid_fraction"] == 0
+
+
+def test_a_grip_much_stronger_than_the_calibrated_one_is_refused_and_evaluate_says_so(twists, shared, tmp_path, ran):
+    """The stronger grip's gain is off by a factor of 5: 2 % of the intervals would hold the truth."""
+    streams = shared / "recordings/streams"
+    weak, same = (imported(tmp_path / f"{day}.mcap", streams / day) for day in ("20241202_153632", "20241202_171704"))
+    calibration = fit("motion_regression", [weak], "a weaker grip")
+    exchanged = replace(twists, channels=twists.channels[:, ::-1].copy())
+    strong = estimate_series(calibration, exchanged)
+    assert not any(one.valid for one in strong.estimates)
+    refused = [one for one in invalid_reasons([strong]) if "is too strong: " in one.sentence]
+    assert "at the right and left fingertip is too strong: 3." in refused[0].sentence
+    assert sum(one.frames for one in refused) > 400
+    unchecked = replace(calibration, validators=tuple(replace(one, strength=None) for one in calibration.validators))
+    figures = figures_by_load([estimate_series(unchecked, exchanged)])["loaded"]
+    assert figures["coverage_95"] < 0.1, "or there would be nothing to refuse"
+    assert estimate_series(calibration, same).estimates == estimate_series(unchecked, same).estimates
+    unchecked.save(tmp_path / "older.cal")
+    said = ran("evaluate", tmp_path / "older.cal", tmp_path / "20241202_171704.mcap").err
+    assert "older.cal assumes that every grip is about as strong as in the calibration" in said
 
 
 def test_later_torque_slices(slices, earlier):

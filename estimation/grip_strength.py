@@ -1,0 +1,90 @@
+"""How strong a grip is against the grips of the calibration: beyond limits the calibration does not hold for it.
+
+The same twist of a stronger grip moves the gel less, by an unknown factor. Intervals expect another grip of about the
+same strength, so they miss the truth of a much stronger or weaker one. The strength is measured along the grip's
+discriminant, which ignores twists.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Self
+
+from shearloop.bank.arrays import FloatArray
+
+# On the pairs of recorded grips with a calibration that carries over, the strengths are 0.39 to 1.97 of the calibrated
+# one; on those with a calibration that does not, at most 0.17 or at least 2.5. The limits are between these
+# (docs/decisions/0048).
+WEAKEST_RATIO, STRONGEST_RATIO = 0.25, 2.4
+# Frames (a minute) in the median strength of a grip: the grip closes, and twists come and go, within it.
+_FRAMES = 120
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedStrength:
+    """Weights (c,) of a frame's relative change that give a grip's strength, and the calibrated grips' strengths.
+
+    A strength is the median over a grip's frames, and 1 for the calibration's mean frame; weakest and strongest are the
+    least and the largest of the calibration's grips.
+    """
+
+    weights: FloatArray
+    weakest: float
+    strongest: float
+
+    @classmethod
+    def fit(cls, weights: FloatArray, grips: Sequence[FloatArray]) -> Self:
+        """Fit to the (n, c) relative changes of each grip's frames."""
+        strengths = [median((one @ weights).tolist()) for one in grips]
+        return cls(weights, min(strengths), max(strengths))
+
+    def ratio(self, strength: float) -> float:
+        """Return a strength as a ratio of the nearest calibrated one, 1 between the weakest and the strongest."""
+        if strength > self.strongest:
+            return strength / self.strongest
+        # Fingertips that grip tools of several shapes may leave no direction of strength in common.
+        return strength / self.weakest if self.weakest > 0.0 and strength < self.weakest else 1.0
+
+
+class GripStrength:
+    """The strength of one fingertip's grip over its last frames."""
+
+    def __init__(self, calibrated: CalibratedStrength | None) -> None:
+        """Begin without a grip; nothing is compared without calibrated strengths."""
+        self._calibrated = calibrated
+        self._strengths: deque[float] = deque(maxlen=_FRAMES)
+
+    def add(self, relative_change: FloatArray) -> None:
+        """Take the (c,) relative change from idle of the grip's next frame."""
+        if self._calibrated is not None:
+            self._strengths.append(float(relative_change @ self._calibrated.weights))
+
+    def forget(self) -> None:
+        """Forget the grip."""
+        self._strengths.clear()
+
+    @property
+    def ratio(self) -> float:
+        """The strength as a ratio of the nearest calibrated one, 1 where it is unknown."""
+        if self._calibrated is None or not self._strengths:
+            return 1.0
+        return self._calibrated.ratio(median(self._strengths))
+
+
+def strength_reasons(ratios: dict[str, float]) -> tuple[str, ...]:
+    """Return why the calibration does not hold for a grip with these ratios of strength by side; none if it does."""
+    strong = {side: f"{ratio:.1f}" for side, ratio in ratios.items() if ratio > STRONGEST_RATIO}
+    # A ratio is 0 or less where the frames move another way.
+    weak = {side: f"{max(ratio, 0.0):.2f}" for side, ratio in ratios.items() if ratio < WEAKEST_RATIO}
+    found = (("strong", strong, "less"), ("weak", weak, "more"))
+    return tuple(_reason(how, shown, cure) for how, shown, cure in found if shown)
+
+
+def _reason(how: str, shown: dict[str, str], cure: str) -> str:
+    """Return the reason against a grip; `shown` has each side's ratio as text."""
+    sides, times = " and ".join(shown), " and ".join(shown.values())
+    return (
+        f"the grip at the {sides} fingertip is too {how}: {times} times as strong as in the calibration; grip with {cure} "
+        "force, or calibrate at this grip"
+    )

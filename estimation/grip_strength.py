@@ -13,10 +13,9 @@ from typing import Self
 
 from shearloop.bank.arrays import FloatArray
 
-# On the pairs of recorded grips with a calibration that carries over, the strengths are 0.39 to 1.97 of the calibrated
-# one; on those with a calibration that does not, at most 0.17 or at least 2.5. The limits are between these
-# (docs/decisions/0048).
-WEAKEST_RATIO, STRONGEST_RATIO = 0.25, 2.4
+# On pairs of recorded grips where the calibration of one carries over to the other, the strength is 0.43 to 2.07 times
+# the calibrated one; where it does not, at most 0.17 or at least 2.47 (docs/decisions/0048). The limits lie between.
+WEAKEST_RATIO, STRONGEST_RATIO = 0.25, 2.25
 # Frames (a minute) in the median strength of a grip: the grip closes, and twists come and go, within it.
 _FRAMES = 120
 
@@ -85,6 +84,6 @@ def _reason(how: str, shown: dict[str, str], cure: str) -> str:
     """Return the reason against a grip; `shown` has each side's ratio as text."""
     sides, times = " and ".join(shown), " and ".join(shown.values())
     return (
-        f"the grip at the {sides} fingertip is too {how}: {times} times as strong as in the calibration; grip with {cure} "
-        "force, or calibrate at this grip"
+        f"the grip at the {sides} fingertip is too {how}: {times} times as strong as in the calibration; grip with "
+        f"{cure} force, or calibrate at this grip"
     )

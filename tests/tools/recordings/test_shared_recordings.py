@@ -172,7 +172,7 @@ def test_a_grip_much_stronger_than_the_calibrated_one_is_refused_and_evaluate_sa
     strong = estimate_series(calibration, exchanged)
     assert not any(one.valid for one in strong.estimates)
     refused = [one for one in invalid_reasons([strong]) if "is too strong: " in one.sentence]
-    assert "at the right and left fingertip is too strong: 3." in refused[0].sentence
+    assert "at the right and left fingertip is too strong: " in refused[0].sentence
     assert sum(one.frames for one in refused) > 400
     unchecked = replace(calibration, validators=tuple(replace(one, strength=None) for one in calibration.validators))
     figures = figures_by_load([estimate_series(unchecked, exchanged)])["loaded"]

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from operator import sub
 
 import rtde_control
-import script_client
 
 from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge, ScriptReadiness, command_dashboard
 from shearloop.drivers.ur.messages import (
@@ -24,15 +23,7 @@ from shearloop.drivers.ur.messages import (
     WristSpeed,
 )
 from shearloop.drivers.ur.primary_port import PrimaryPort
-from shearloop.drivers.ur.script import (
-    KNOWN_SCRIPTS,
-    NO_MOTION_TICKS,
-    UPPER,
-    ScriptRegisters,
-    carry_wrench,
-    guard_script,
-    hash_of,
-)
+from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, ScriptRegisters, control_program, why_other_client
 from shearloop.drivers.ur.script_port import ScriptPort
 from shearloop.drivers.ur.settings import Six, UrSettings
 
@@ -48,26 +39,19 @@ class UrArm:
     """A connection for samples, one for control, and the dashboard when needed."""
 
     def __init__(
-        self, settings: UrSettings, version: str, registers: ScriptRegisters = UPPER, primary: PrimaryPort | None = None
+        self, settings: UrSettings, registers: ScriptRegisters = UPPER, primary: PrimaryPort | None = None
     ) -> None:
-        """Connect without starting a program, so that this works in a protective stop. `version` is like 5.17.3.0.
+        """Connect without starting a program, so that this works in a protective stop.
 
         Raises:
             RuntimeError: ur-rtde failed.
-            RobotLostError: the controller does not send its state, or ur-rtde's script is unknown.
+            RobotLostError: the controller does not send its state, or ur-rtde has another version.
         """
         self._settings = settings
+        self._registers = registers
         self._primary = primary
-        major, minor = map(int, version.split(".")[:2])
-        own = script_client.ScriptClient("", major, minor).getScript()
-        known = hash_of(own) in KNOWN_SCRIPTS
-        self._script = guard_script(own, settings, registers) if known else ""
-        if not self._script:
-            raise RobotLostError(
-                "version",
-                f"The installed ur-rtde has a control script for PolyScope {version} that is unknown, so that its "
-                f"limits cannot be added (SHA-256 {hash_of(own)}): install ur-rtde 1.6.5.",
-            )
+        if reason := why_other_client():
+            raise RobotLostError("version", f"{reason[0].upper()}{reason[1:]}.")
         self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3, registers)
         kind = rtde_control.RTDEControlInterface
         watchdog_ns = 1e9 / settings.watchdog_hz
@@ -129,7 +113,7 @@ class UrArm:
         return self._send_once(self._control.moveL, [*command.pose], speed, acceleration, asynchronous=True)
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
-        """Begin to end a linear move; ur-rtde's script takes the deceleration of an asynchronous stop in m/s²."""
+        """Begin to end a linear move."""
         # ur-rtde does not report whether the stop was accepted; the heartbeat after it does.
         self._send_once(self._control.stopJ, deceleration_rad_per_s2, asynchronous=True)
         return self.send_heartbeat()
@@ -169,16 +153,13 @@ class UrArm:
         Raises:
             RobotLostError: the controller does not take the script.
         """
+        self._held = self._wrench() if held and self._settings.facts.zeroes_at_start else None
         # ur-rtde's own script connection is never read, so that the controller soon stops listening to it.
-        script, self._held = self._script, None
-        if held and self._settings.facts.zeroes_at_start:
-            self._held = self._wrench()
-            script = carry_wrench(script, self._held)
-        self._script_port.send(script)
+        self._script_port.send(control_program(self._settings, self._registers, self._held))
         self.script_readiness.command_sent()
 
     def arm_watchdog(self) -> bool:
-        """Arm the robot's watchdog after an upload; accepted only by a program that answers."""
+        """Return whether the uploaded program answers; its watchdog is armed then."""
         armed = self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)
         if armed and self._settings.facts.zeroes_at_start:
             now: Six = self._receiver.latest().wrench

@@ -20,6 +20,7 @@ from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.messages import RobotLostError
+from shearloop.drivers.ur.script import CLIENT_VERSION, why_other_client
 from shearloop.drivers.ur.settings import Six, UrSettings
 
 # The settings for a controller, by its version and its serial number.
@@ -43,14 +44,14 @@ def missing_library() -> str:
         return (
             f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "
             f"{platform.machine()}: use Python 3.11 or 3.12 on x86-64, or build it with "
-            f"`{pip} ur-rtde`, which needs cmake, g++, git and Boost's headers"
+            f"`{pip} ur-rtde=={CLIENT_VERSION}`, which needs cmake, g++, git and Boost's headers"
         )
     try:
         import_module("rtde_control")
     except ImportError as error:
-        again = f"`{pip} --force-reinstall --no-deps ur-rtde`"
+        again = f"`{pip} --force-reinstall --no-deps ur-rtde=={CLIENT_VERSION}`"
         return f"the package ur-rtde, which drives the robot, cannot be loaded: install it again with {again} ({error})"
-    return ""
+    return why_other_client()
 
 
 class UrRobot:

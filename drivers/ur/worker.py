@@ -147,7 +147,7 @@ def connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
             raise registers_in_use(host)
         warning = " ".join(filter(None, (untested_sentence(version), primary.warning)))
         pipe.send(messages.WorkerPhase("connecting", warning, controller))
-        return UrArm(settings, version, registers, primary)
+        return UrArm(settings, registers, primary)
     except RuntimeError as error:
         text = str(error)
         if "already in use" in text:

@@ -590,7 +590,7 @@ def test_a_broken_robot_library_is_one_sentence(config, command, monkeypatch, tm
     arguments = ["--folder", str(tmp_path / "demo")] if command == "demo" else [robot]
     said = mistake(command, *arguments)
     assert "the package ur-rtde, which drives the robot, cannot be loaded: install it again with" in said
-    assert said.endswith("--no-deps ur-rtde` (librtde.so.1.6: cannot open shared object file)\n")
+    assert said.endswith("--no-deps ur-rtde==1.6.5` (librtde.so.1.6: cannot open shared object file)\n")
 
 
 @pytest.mark.parametrize("command", ["check", "run"])

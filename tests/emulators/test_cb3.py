@@ -27,10 +27,9 @@ def steps(robot: Robot, number: int) -> Robot:
     return robot
 
 
-@pytest.mark.parametrize("version", [(3, 10), (3, 15)])
-def test_our_script_runs_on_it_and_turns_the_wrist(version):
+def test_our_script_runs_on_it_and_turns_the_wrist():
     robot = Robot(CB3)
-    robot.upload(control_script(SETTINGS, version))
+    robot.upload(control_script(SETTINGS))
     steps(robot, 5)
     for _ in range(20):
         until = robot.registers["output_int_register_47"] + 12

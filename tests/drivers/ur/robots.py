@@ -12,7 +12,7 @@ import pytest
 from shearloop.drivers.connection import LinkMonitor, LinkObserver
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
-from shearloop.drivers.ur.script import LOWER, UPPER, guard_script
+from shearloop.drivers.ur.script import LOWER, UPPER, control_program
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.emulators.ur_robot import Robot
 
@@ -20,20 +20,19 @@ ROOT = Path(__file__).parents[3]
 
 
 DELIVERED = read_settings(ROOT / "config" / "demo_ur.yaml")
-# Controllers whose scripts differ.
-VERSIONS = [(3, 10), (5, 4), (5, 17), (5, 25), (10, 10)]
 # The commands of ur-rtde's script, and the cycle of its controller.
 MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 3, 8, 9, 15, 34, 35
 STEP_S = 0.002
 
 
-def control_script(settings: UrSettings | None = None, version: tuple[int, int] = (5, 17)) -> str:
-    """Return the control script as a controller receives it: ur-rtde's own, or with the limits of these settings."""
+def control_script(settings: UrSettings | None = None) -> str:
+    """Return a control script as a controller receives it: ours for these settings, or ur-rtde's own."""
+    if settings is not None:
+        return control_program(settings)
     script_client = pytest.importorskip("script_client", reason="ur-rtde has wheels for CPython up to 3.12 only")
-    text = script_client.ScriptClient("", *version).getScript()
-    script = guard_script(text, settings) if settings is not None else f"def rtde_control():\n{text}end\n"
+    text = script_client.ScriptClient("", 5, 17).getScript()
     # ur-rtde inserts the registers' numbers when it sends it.
-    return re.sub(r"= # (?:float|int) register offset\n", "= 0\n", script)
+    return re.sub(r"= # (?:float|int) register offset\n", "= 0\n", f"def rtde_control():\n{text}end\n")
 
 
 def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> None:

@@ -5,19 +5,19 @@ import dataclasses
 import importlib
 import sys
 from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError
 from types import ModuleType, SimpleNamespace
 from typing import ClassVar
 
 import pytest
 
+from shearloop.drivers.ur import script
 from shearloop.drivers.ur import settings as ur
 from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeOutputs, WristSpeed
 from shearloop.drivers.ur.script import LOWER, NO_MOTION_TICKS, UPPER
 from tests.drivers.ur.handler_bench import SETTINGS, received
 
 SIX = (0.0,) * 6
-VERSION = "5.17.3.0"
-SCRIPT = "    thread speed_thread():\n    end\n        keep_running = True\n"
 
 
 class Client:
@@ -40,10 +40,6 @@ class Client:
             return self.answers.get(name, True)
 
         return call
-
-
-class Control(Client):
-    """Stands for ur-rtde's control client."""
 
 
 class Receiver:
@@ -69,25 +65,21 @@ class Receiver:
 @pytest.fixture
 def arm(monkeypatch) -> Iterator[ModuleType]:
     """The module `shearloop.drivers.ur.arm` over fake clients."""
-    for name, kind, fake in (
-        ("rtde_control", "RTDEControlInterface", Control),
-        ("script_client", "ScriptClient", Client),
-    ):
-        module = ModuleType(name)
-        setattr(module, kind, fake)
-        monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setattr(Client, "answers", {"getScript": SCRIPT})
+    module = ModuleType("rtde_control")
+    module.RTDEControlInterface = Client
+    monkeypatch.setitem(sys.modules, "rtde_control", module)
+    monkeypatch.setattr(Client, "answers", {})
     # Another test may have imported it over the real clients.
     monkeypatch.delitem(sys.modules, "shearloop.drivers.ur.arm", raising=False)
     arm = importlib.import_module("shearloop.drivers.ur.arm")
     monkeypatch.setattr(arm, "RtdeReceiver", Receiver)
-    monkeypatch.setattr(arm, "KNOWN_SCRIPTS", {arm.hash_of(SCRIPT), arm.hash_of("of another form\n")})
+    monkeypatch.setattr(script, "version", lambda _: script.CLIENT_VERSION)
     yield arm
     del sys.modules["shearloop.drivers.ur.arm"]
 
 
 def test_sample_that_waited_in_the_socket_is_old(arm, monkeypatch):
-    reader, now_ns = arm.UrArm(SETTINGS, VERSION), 10**12
+    reader, now_ns = arm.UrArm(SETTINGS), 10**12
     monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
     for number, waited_ns in enumerate([0, 0, 200_000_000]):
         Receiver.made.sample = received(50.0 + 0.008 * number)
@@ -97,7 +89,7 @@ def test_sample_that_waited_in_the_socket_is_old(arm, monkeypatch):
 
 def test_refused_timer_slack_does_not_prevent_connecting(arm, monkeypatch, capsys):
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=lambda *_: -1))
-    assert arm.UrArm(SETTINGS, VERSION).read().connected
+    assert arm.UrArm(SETTINGS).read().connected
     assert "wake more often than needed" in capsys.readouterr().err
 
 
@@ -113,26 +105,26 @@ def test_timer_slack_is_a_fraction_of_the_watchdog_time(arm, monkeypatch, rate_h
     bound = ur.WristSpeedBound(0.01, 0.02)
     limits = dataclasses.replace(SETTINGS.limits, wrist_speed_rad_per_s=bound)
     timeouts = {"command_timeout_s": command_timeout_s, "silence_timeout_s": command_timeout_s}
-    arm.UrArm(dataclasses.replace(SETTINGS, limits=limits, rate_hz=rate_hz, **timeouts), VERSION)
+    arm.UrArm(dataclasses.replace(SETTINGS, limits=limits, rate_hz=rate_hz, **timeouts))
     # 0 is the default again, for what this thread starts later.
     assert asked == [slack_ms, 0]
 
 
 def test_progress_is_queried_only_for_a_linear_move(arm):
     Client.answers["getAsyncOperationProgressEx"] = SimpleNamespace(isAsyncOperationRunning=lambda: True)
-    one = arm.UrArm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS)
     assert not one.read().moving_linearly
     one.move(MoveLinear(SIX, 0.1, 0.1))
     assert [one.read().moving_linearly for _ in range(3)] == [True] * 3
     Receiver.made.sample = received(2.0)
     one.wrist(WristSpeed(0.1, 1.0), 0.1)
     assert not one.read().moving_linearly
-    assert Control.made.calls.count("getAsyncOperationProgressEx") == 3
+    assert Client.made.calls.count("getAsyncOperationProgressEx") == 3
 
 
 def test_no_call_blocks_when_no_program_runs(arm):
     """The watchdog has ended the program before it was ready for the next command: a further call would hang."""
-    one = arm.UrArm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS)
     assert one.zero_wrench()
     assert not one.send_heartbeat()
     assert not one.wrist(WristSpeed(0.1, 1.0), 0.1)
@@ -142,55 +134,57 @@ def test_no_call_blocks_when_no_program_runs(arm):
     assert not one.zero_wrench()
     assert not one.arm_watchdog()
     one.end_program()
-    assert Control.made.calls == ["zeroFtSensor"]
+    assert Client.made.calls == ["zeroFtSensor"]
 
 
 def test_register_is_cleared_once_the_client_knows_that_no_program_runs(arm):
     """Before that, the client would wait for the program."""
-    one = arm.UrArm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS)
     assert not one.clear_command()
-    assert Control.made.calls == ["isProgramRunning"]
+    assert Client.made.calls == ["isProgramRunning"]
     Client.answers["isProgramRunning"] = False
     assert one.clear_command()
-    assert Control.made.calls[1:] == ["isProgramRunning", "kickWatchdog"]
+    assert Client.made.calls[1:] == ["isProgramRunning", "kickWatchdog"]
 
 
 def test_sent_script_arms_its_watchdog(arm, monkeypatch):
     sent: list[str] = []
     monkeypatch.setattr(arm.ScriptPort, "send", lambda _, program: sent.append(program))
     for registers, number, flags in ((UPPER, 24, 24), (LOWER, 0, 16)):
-        one = arm.UrArm(SETTINGS, VERSION, registers)
+        one = arm.UrArm(SETTINGS, registers)
         one.upload()
         armed = f'rtde_set_watchdog("input_int_register_{number}", {SETTINGS.watchdog_hz:g}, "stop")'
         assert armed in sent.pop()
-        assert Control.made.arguments[2] == flags
+        assert Client.made.arguments[2] == flags
 
 
-def test_unknown_script_is_refused(arm):
-    """Without its deadline the wrist could turn on."""
-    Client.answers["getScript"] = "of another form\n"
-    with pytest.raises(RobotLostError, match="unknown, so that its limits"):
-        arm.UrArm(SETTINGS, VERSION)
-
-
-def test_script_with_another_hash_is_refused_by_it(arm):
-    """Also where its form is known: it may answer other commands."""
-    changed = f"{SCRIPT}# changed\n"
-    Client.answers["getScript"] = changed
-    with pytest.raises(RobotLostError, match=arm.hash_of(changed)) as lost:
-        arm.UrArm(SETTINGS, VERSION)
+@pytest.mark.parametrize("found", ["1.6.4", "1.7.0"])
+def test_another_version_of_the_client_is_refused_by_name(arm, monkeypatch, found):
+    """Its commands may have other numbers."""
+    monkeypatch.setattr(script, "version", lambda _: found)
+    with pytest.raises(RobotLostError, match=rf"is of version {found}, .* ur-rtde==1.6.5") as lost:
+        arm.UrArm(SETTINGS)
     assert lost.value.kind == "version"
+
+
+def test_a_client_without_a_version_is_refused(arm, monkeypatch):
+    def missing(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(script, "version", missing)
+    with pytest.raises(RobotLostError, match="is of version unknown"):
+        arm.UrArm(SETTINGS)
 
 
 def test_wrench_of_a_cb3_is_zeroed_without_its_controller(arm):
     """`zero_ftsensor` would end its program."""
     limits = dataclasses.replace(SETTINGS.limits, torque_nm=ur.TorqueBound(8.0, 12.0))
-    one = arm.UrArm(dataclasses.replace(SETTINGS, limits=limits, generation="cb3"), "3.15.8.0")
+    one = arm.UrArm(dataclasses.replace(SETTINGS, limits=limits, generation="cb3"))
     Receiver.made.sample = dataclasses.replace(received(1.0), wrench=(1.0, 2.0, 3.0, 0.0, 0.0, 1.0))
     assert one.zero_wrench()
     Receiver.made.sample = dataclasses.replace(received(1.1), wrench=(1.0, 2.5, 3.0, 0.0, 0.0, 3.0))
     assert one.read().wrench == (0.0, 0.5, 0.0, 0.0, 0.0, 2.0)
-    assert "zeroFtSensor" not in Control.made.calls
+    assert "zeroFtSensor" not in Client.made.calls
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -198,16 +192,16 @@ def test_wrench_of_what_is_held_outlives_the_zero_of_a_new_program(arm, monkeypa
     """An e-Series zeroes its wrench as a program starts."""
     sent: list[str] = []
     monkeypatch.setattr(arm.ScriptPort, "send", lambda _, program: sent.append(program))
-    one = arm.UrArm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS)
     load = (1.0, 0.0, 3.0, 0.0, 0.0, 1.5)
     Receiver.made.sample = dataclasses.replace(received(1.0), wrench=load)
     one.upload(held=held)
-    assert ("1.500000 - started_with[5]" in sent[0]) == held
+    assert ("global keeps_load = True\n  global load_before = [1.000000, 0.000000, 3.000000, " in sent[0]) == held
     Receiver.made.sample = dataclasses.replace(received(2.0), wrench=SIX)
     assert one.arm_watchdog()
     assert one.read().wrench == (load if held else SIX)
     # The next worker goes on with this zero, and a new one ends it.
-    another = arm.UrArm(SETTINGS, VERSION)
+    another = arm.UrArm(SETTINGS)
     another.wrench_zero = one.wrench_zero
     Receiver.made.sample = dataclasses.replace(received(3.0), wrench=SIX)
     assert another.read().wrench == (load if held else SIX)
@@ -217,7 +211,7 @@ def test_wrench_of_what_is_held_outlives_the_zero_of_a_new_program(arm, monkeypa
 
 
 def test_deadline_counts_from_the_latest_sample(arm):
-    one = arm.UrArm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS)
     Receiver.made.sample = received(1.0, script_ticks=10_000)
     assert one.wrist(WristSpeed(0.1, 1.0), 0.07)
     one.withdraw_deadline()
@@ -228,7 +222,7 @@ def test_script_port_is_read_until_the_program_plays(arm, monkeypatch):
     calls: list[str] = []
     for name in ("send", "drain", "close"):
         monkeypatch.setattr(arm.ScriptPort, name, lambda *_, name=name: calls.append(name))
-    one = arm.UrArm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS)
     one.upload()
     one.read()
     Receiver.made.sample = received(2.0, runtime_state=2)

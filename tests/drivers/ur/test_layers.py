@@ -6,12 +6,12 @@ import itertools
 import pytest
 
 from shearloop.drivers.ur.messages import ARRIVED, MoveLinear, RtdeSample, Stop, WristSpeed
-from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, carry_wrench
+from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, control_program
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.emulators.ur_robot import PLAYING, Robot
 from tests.drivers.ur import robots
 from tests.drivers.ur.handler_bench import AT_REST, CYCLE_NS, FakeArm, HandlerBench, enabled
-from tests.drivers.ur.robots import DELIVERED, VERSIONS, control_script, do, send
+from tests.drivers.ur.robots import DELIVERED, control_script, do, send
 
 LIMITS, TIMEOUT_S = DELIVERED.limits, DELIVERED.command_timeout_s
 FASTEST = LIMITS.wrist_speed_rad_per_s.inner
@@ -84,7 +84,8 @@ class ScriptedArm(FakeArm):
         return self._write(0)
 
     def upload(self, *, held: bool = False) -> None:
-        self.robot.upload(carry_wrench(self._script, tuple(self.robot.arm.wrench)) if held else self._script)
+        load = tuple(self.robot.arm.wrench)
+        self.robot.upload(control_program(self._settings, load=load) if held else self._script)
 
     def arm_watchdog(self) -> bool:
         return self._write(robots.SET_WATCHDOG, self._settings.watchdog_hz)
@@ -387,11 +388,10 @@ def test_a_program_that_starts_while_something_is_held_keeps_its_limits(held):
     assert not turn(arm, command, 0.3)[-1].rests
 
 
-@pytest.mark.parametrize("version", VERSIONS)
-def test_each_version_of_the_script_can_be_guarded(version):
+def test_script_reports_its_clock():
     robot = Robot()
     robot.registers.write(UPPER.command, 0, 0.0)
-    robot.upload(control_script(DELIVERED, version))
+    robot.upload(control_script(DELIVERED))
     for _ in range(10):
         robot.step(0.008)
     assert robot.program_running

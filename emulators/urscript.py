@@ -1,9 +1,10 @@
 """Runs URScript as a controller does: a client's text, translated to Python, one control cycle at a time.
 
 Source: UR's script manual. Statements become Python statements and functions generators, so that a function may use up
-cycles. Expressions are Python's already, but for poses (`p[…]`). A program plays the functions that ur-rtde's script
-needs for the commands of our driver, and ends when it calls another one. It also ends, as on a controller, when two
-threads move the arm, or when a watchdog is not fed. Scopes are simpler: a variable is global where it is declared so.
+cycles. Expressions are Python's already, but for poses (`p[…]`). A program does not start with an unknown name, with
+wrong arguments, or with a block that has no end. It plays the functions of our script, and of ur-rtde's for the commands
+of our driver, and ends when it calls another one. It also ends, as on a controller, when two threads move the arm, or
+when a watchdog is not fed. Scopes are simpler: a variable is global where it is declared so.
 """
 
 import ast
@@ -20,6 +21,7 @@ import numpy as np
 
 from shearloop.drivers.ur.script import LOWER, UPPER
 from shearloop.emulators.ur_arm import Arm
+from shearloop.emulators.urscript_names import E_SERIES_ONLY, check_names
 
 # An event's name and detail.
 Event = tuple[str, str]
@@ -33,8 +35,8 @@ CLOCKS = (LOWER.clock, UPPER.clock)
 FLOAT_LOSS = float(np.float32(1024.0) + np.float32(0.002) - np.float32(1024.0)) / 0.002
 # More loops than this within one cycle never end.
 MOST_LOOPS = 10_000
-# Functions from PolyScope 5 on.
-_E_SERIES = ("zero_ftsensor", "get_steptime")
+# The registers of each type and direction.
+_REGISTERS = range(48)
 # Functions that use up cycles.
 _LASTING = ("sync", "speedj", "movel", "stopj", "stopl")
 _SAME_KEYWORDS = {"and", "or", "not", "if", "elif", "else", "while", "def", "return", "break", "continue", "global"}
@@ -85,8 +87,12 @@ class _Expressions(ast.NodeTransformer):
 
 
 @lru_cache(maxsize=8)
-def translate(text: str) -> tuple[CodeType, str]:
-    """Return the compiled Python of a program, and the name of its main function; SyntaxError where it has none."""
+def translate(text: str) -> tuple[CodeType, str, frozenset[str]]:
+    """Return the compiled Python of a program, the name of its main function, and the controller's functions in it.
+
+    Raises:
+        SyntaxError: a controller would not start it.
+    """
     text = re.sub(r'("[^"\n]*")|#.*', lambda found: found[1] or "", text)
     # A statement may begin within a line and end within another: ur-rtde's first two do.
     text = re.sub(r"=[ \t]*\n\s*", "= ", text)
@@ -100,6 +106,8 @@ def translate(text: str) -> tuple[CodeType, str]:
     for line in filter(None, map(str.strip, text.splitlines())):
         if line == "end":
             depth -= 1
+            if depth < 0:
+                raise SyntaxError("an end has no block")
             continue
         lines.append("    " * (depth - line.startswith(("elif ", "else:"))) + _statement(line))
         if line.endswith(":"):
@@ -107,8 +115,10 @@ def translate(text: str) -> tuple[CodeType, str]:
             lines += ["    " * depth + one for one in _opening(line, declared)]
     if depth != 0:
         raise SyntaxError("a block has no end")
-    tree = _Expressions({*functions, *_LASTING}).visit(ast.parse("\n".join(lines)))
-    return compile(tree, "URScript", "exec"), functions[0]
+    tree = ast.parse("\n".join(lines))
+    called = check_names(tree, set(re.findall(r"^\s*thread (\w+)\(", text, re.MULTILINE)))
+    tree = _Expressions({*functions, *_LASTING}).visit(tree)
+    return compile(tree, "URScript", "exec"), functions[0], called
 
 
 def _statement(line: str) -> str:
@@ -118,6 +128,13 @@ def _statement(line: str) -> str:
     # Lists are values: to set an entry makes a new list.
     line = re.sub(r"^(\w+)\[(\w+)\] = (.+)$", r"\1 = put(\1, \2, \3)", line)
     return re.sub(r"\brun (\w+)\(\)", r"run(\1)", line)
+
+
+def _register(kind: str, address: int) -> str:
+    """Return the name of a register; ValueError where there is none."""
+    if address not in _REGISTERS:
+        raise ValueError(f"there is no register {address}")
+    return f"{kind}_register_{address}"
 
 
 def _opening(line: str, declared: set[str]) -> list[str]:
@@ -138,17 +155,16 @@ class Program:
     ) -> None:
         """Begin; SyntaxError where the text is no program. `log` gets the messages for the pendant's log.
 
-        Without `e_series` it lacks the functions that came with that generation.
+        Without `e_series` the controller lacks the functions that came with that generation.
         """
         self._registers, self._arm, self._log = registers, arm, log
         self._step_s = 0.0
         self._events: list[Event] = []
         self._watchdogs: dict[str, float] = {}
-        code, main = translate(text)
+        code, main, called = translate(text)
+        if not e_series and (unknown := called & E_SERIES_ONLY):
+            raise SyntaxError(f"name {min(unknown)} is not defined")
         names = self._functions()
-        if not e_series:
-            for name in _E_SERIES:
-                del names[name]
         exec(code, names)  # noqa: S102
         # By number; the main one is number 1, and the program ends with it.
         self._threads: dict[int, Thread] = {1: names[main]()}
@@ -161,8 +177,8 @@ class Program:
         registers, arm = self._registers, self._arm
         methods = {name: getattr(self, name) for name in vars(Program) if not name.startswith("_") and name != "cycle"}
         return methods | {
-            "read_input_float_register": lambda number: registers[f"input_double_register_{number}"],
-            "read_input_integer_register": lambda number: int(registers[f"input_int_register_{number}"]),
+            "read_input_float_register": lambda address: registers[_register("input_double", address)],
+            "read_input_integer_register": lambda address: int(registers[_register("input_int", address)]),
             "write_output_float_register": partial(self._write_output, "double"),
             "write_output_integer_register": partial(self._write_output, "int"),
             "get_actual_joint_positions": lambda: [*map(float, arm.q_rad)],
@@ -263,8 +279,10 @@ class Program:
             yield
         self._mover = 0
 
-    def _write_output(self, kind: str, number: int, value: float) -> None:
-        name = f"output_{kind}_register_{number}"
+    def _write_output(self, kind: str, address: int, value: float) -> None:
+        if kind == "int" and type(value) is not int:
+            raise TypeError(f"{value} is not an integer")
+        name = _register(f"output_{kind}", address)
         loses = self._registers.counts_as_float and name in CLOCKS
         self._registers[name] = FLOAT_LOSS * value if loses else value
 

@@ -62,10 +62,10 @@ def test_program_computes(text, written):
     [
         ("while True:\nx = 1\nend", "without sync"),
         ("freedrive_mode()", "freedrive_mode"),
-        # A function of Python's.
-        ("x = open(1)", "open"),
         ("halt\nwhile True:\nsync()\nend", "halted itself"),
         ("x = [1, 2]\ny = x[5]", "index"),
+        ("write_output_integer_register(0, 1.5)", "not an integer"),
+        ("x = read_input_float_register(48)", "no register 48"),
         ("thread t():\nspeedj([0, 0, 0, 0, 0, 1], a=1)\nend\nh = run t()\nsync()\nsync()\nstopj(1)", "another thread"),
         ('rtde_set_watchdog("input_int_register_0", 100, "stop")\nwhile True:\nsync()\nend', "watchdog"),
     ],
@@ -74,7 +74,28 @@ def test_program_ends_for_a_cause(text, why):
     assert why in run(text)[1]
 
 
-@pytest.mark.parametrize("text", ["while True:", "end", "x = = 2", "if x\nend"])
+@pytest.mark.parametrize("text", ["while True:", "end", "end\nend\ndef f():\ndef g():", "x = = 2", "if x\nend"])
 def test_text_with_mistakes_is_no_program(text):
     with pytest.raises(SyntaxError):
+        program(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        # A function of Python's.
+        ("x = open(1)", "open is not defined"),
+        ("stopj()", "stopj takes other arguments"),
+        ("stopj(1, 2)", "stopj takes other arguments"),
+        ("speedj([0, 0, 0, 0, 0, 1], v=1)", "speedj takes other arguments"),
+        ("def f(a):\nsync()\nend\nf()", "f takes other arguments"),
+        ("x = y + 1", "y is not defined"),
+        # Of another function, and not global.
+        ("def f():\nx = z\nend\nz = 1\nf()", "z is not defined"),
+        ("def f():\nsync()\nend\nh = run f()", "f is not a thread"),
+        (f"{COUNTING}t()", "t is a thread"),
+    ],
+)
+def test_a_program_with_an_unknown_name_or_wrong_arguments_does_not_start(text, why):
+    with pytest.raises(SyntaxError, match=why):
         program(text)

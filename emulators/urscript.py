@@ -2,9 +2,9 @@
 
 Source: UR's script manual. Statements become Python statements and functions generators, so that a function may use up
 cycles. Expressions are Python's already, but for poses (`p[…]`). A program does not start with an unknown name, with
-wrong arguments, or with a block that has no end. It plays the functions of our script, and of ur-rtde's for the commands
-of our driver, and ends when it calls another one. It also ends, as on a controller, when two threads move the arm, or
-when a watchdog is not fed. Scopes are simpler: a variable is global where it is declared so.
+wrong arguments, or with a block that has no end. It plays the functions of our script, and those that ur-rtde's needs
+for the same commands, and ends when it calls another one. It also ends, as on a controller, when two threads move the
+arm, or when a watchdog is not fed. Scopes are simpler: a variable is global where it is declared so.
 """
 
 import ast

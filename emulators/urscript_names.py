@@ -18,16 +18,15 @@ _PLAYED = """
     force_mode_set_damping(damping) force_mode_set_gain_scaling(scaling)
 """
 # Functions that ur-rtde's own script has for commands that our driver does not send: to call one ends a program.
-_NOT_PLAYED = frozenset(
-    """
-    direct_torque enable_external_ft_sensor end_force_mode end_freedrive_mode end_teach_mode force_mode freedrive_mode
-    ft_rtde_input_enable get_actual_joint_positions_history get_actual_tcp_pose get_actual_tool_flange_pose
-    get_forward_kin get_freedrive_status get_inverse_kin get_inverse_kin_has_solution get_joint_torques get_target_payload
-    get_target_payload_cog get_target_payload_inertia get_target_tcp_speed get_target_waypoint get_tcp_offset is_steady
+_NOT_PLAYED = """
+    direct_torque enable_external_ft_sensor end_force_mode end_freedrive_mode end_teach_mode force_mode
+    freedrive_mode ft_rtde_input_enable get_actual_joint_positions_history get_actual_tcp_pose
+    get_actual_tool_flange_pose get_forward_kin get_freedrive_status get_inverse_kin
+    get_inverse_kin_has_solution get_joint_torques get_target_payload get_target_payload_cog
+    get_target_payload_inertia get_target_tcp_speed get_target_waypoint get_tcp_offset is_steady
     is_within_safety_limits movej pose_sub pose_trans protective_stop servoc servoj set_gravity set_payload
     set_target_payload set_tcp speedl teach_mode tool_contact
-    """.split()
-)
+"""
 # What `translate` writes for statements.
 _INSERTED = frozenset({"put", "count_loop"})
 # Functions from PolyScope 5 on.
@@ -46,6 +45,7 @@ def _signatures() -> dict[str, tuple[list[str], int]]:
 
 
 _SIGNATURES = _signatures()
+_OTHERS = frozenset(_NOT_PLAYED.split()) | _INSERTED
 
 
 def check_names(tree: ast.Module, threads: Set[str]) -> frozenset[str]:
@@ -96,7 +96,7 @@ def _check_variables(
 def _check_call(call: ast.Call, functions: dict[str, ast.FunctionDef], threads: Set[str]) -> str:
     """Return the name of the called function; SyntaxError where it does not exist or takes other arguments."""
     if not isinstance(call.func, ast.Name):
-        raise SyntaxError("a call of something that is no function")
+        raise SyntaxError("a call of something that is no function")  # noqa: TRY004 - a mistake in the program
     name = call.func.id
     if name == "run":
         (thread,) = call.args
@@ -109,7 +109,7 @@ def _check_call(call: ast.Call, functions: dict[str, ast.FunctionDef], threads: 
         _check_arguments(call, name, parameters, len(parameters))
     elif name in _SIGNATURES:
         _check_arguments(call, name, *_SIGNATURES[name])
-    elif name not in _NOT_PLAYED | _INSERTED:
+    elif name not in _OTHERS:
         raise SyntaxError(f"name {name} is not defined")
     return name
 

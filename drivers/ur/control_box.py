@@ -564,7 +564,7 @@ class SampleAge:
 
 
 class ScriptReadiness:
-    """Waits until ur-rtde's control script is ready for the next command (output register 0).
+    """Waits until the control script is ready for the next command (the first output register).
 
     ur-rtde waits for that itself at the start of each call: without sleeping, for up to 4 s, also after the program has
     ended. Waiting here first keeps its calls short.

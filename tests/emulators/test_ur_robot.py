@@ -1,4 +1,4 @@
-"""The emulated controller without I/O, with ur-rtde's script: registers, watchdog, safety."""
+"""The emulated controller without I/O, with ur-rtde's own script: registers, watchdog, safety."""
 
 import math
 

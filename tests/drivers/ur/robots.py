@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[3]
 
 
 DELIVERED = read_settings(ROOT / "config" / "demo_ur.yaml")
-# The commands of ur-rtde's script, and the cycle of its controller.
+# Commands of ur-rtde's client, and the cycle of the controller.
 MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 3, 8, 9, 15, 34, 35
 STEP_S = 0.002
 
@@ -45,7 +45,7 @@ def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False
 
 
 def moving_asynchronously(robot: Robot) -> bool:
-    """Return whether ur-rtde's script reports a linear move under way."""
+    """Return whether the script reports a linear move under way."""
     states = (int(robot.registers[f"output_int_register_{half.first + 2}"]) for half in (LOWER, UPPER))
     return any(state & 1 << 15 for state in states)
 

@@ -124,11 +124,10 @@ def test_each_register_is_accessed_in_one_place():
     accesses = Counter(re.findall(r"(?:read|write)_(?:in|out)put_\w+_register\(first[^,)]*", CODE))
     assert set(accesses.values()) == {1}
     assert len(re.findall(r"_register\(", CODE)) == sum(accesses.values())
+    types = {"integer": "int", "float": "double"}
     places = {
-        f"{kind}put_{number.replace('integer', 'int').replace('float', 'double')}_register_{UPPER.first + int(offset or 0)}"
-        for kind, number, offset in re.findall(
-            r"(?:read|write)_(in|out)put_(\w+)_register\(first(?: \+ (\d+))?[,)]", CODE
-        )
+        f"{way}put_{types[kind]}_register_{UPPER.first + int(offset or 0)}"
+        for way, kind, offset in re.findall(r"(?:read|write)_(in|out)put_(\w+)_register\(first(?: \+ (\d+))?[,)]", CODE)
     }
     ours = {UPPER.command, UPPER.state, UPPER.deadline, UPPER.clock, UPPER.step}
     assert places == ours | {"input_int_register_25", "output_int_register_26"}

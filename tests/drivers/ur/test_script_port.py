@@ -15,7 +15,7 @@ from shearloop.emulators.ur_robot import Robot
 from tests.emulator_process import own_address
 
 HOST = own_address(6)
-# As long as ur-rtde's script.
+# Longer than the buffers.
 PROGRAM = "def program():\n" + "  # a comment\n" * 3000 + "  sync()\nend\n"
 
 

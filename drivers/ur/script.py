@@ -1,7 +1,7 @@
 """The program for the robot: our control script behind the values of one rig's settings.
 
-`control.script` is the program's text. It answers the commands that `arm` sends through ur-rtde's client, whose protocol
-of registers is private to each version. The client gives each motion a deadline, by the script's own clock, in a
+`control.script` is the program's text. It answers the commands that `arm` sends through ur-rtde's client, in a protocol
+of registers that is private to each version. The client gives each motion a deadline, by the script's own clock, in a
 register that ur-rtde leaves free, and extends it. The script turns the wrist no further than the deadline, its range
 and its largest force and torque allow. It stops a straight move that its client does not stop, and ends. The watchdog
 is slower: a program that ends while the arm moves may end in a protective stop.

@@ -57,7 +57,7 @@ def blocks(text: str) -> list[str]:
 BLOCKS = [
     pytest.param(block, id=f"{page.stem}-{n}") for page in PAGES for n, block in enumerate(blocks(page.read_text()))
 ]
-SYSTEM_PROGRAMS = {"sudo", "apt", "pip", "uvx", "ssh", "dask", "systemctl", "journalctl"}
+SYSTEM_PROGRAMS = {"sudo", "apt", "pip", "uvx", "ssh", "dask", "docker", "systemctl", "journalctl"}
 
 
 @pytest.mark.parametrize("block", BLOCKS)

@@ -253,6 +253,15 @@ class ControlLoop:
             return f"{loaded}, which would become the zero; {cure}"
         return None
 
+    def _why_no_tare_step(self) -> str | None:
+        """Return why an experiment cannot take a zero now, or None: nobody is there to confirm it."""
+        if (reason := self.held or self._why_uncertain()) is not None:
+            return f"{reason}; put a `release` before it"
+        if (loaded := self._loaded()) is not None:
+            cure = "if nothing is loaded, `shearloop command tare --yes` takes the zero before the start"
+            return f"{loaded}, which would become the zero; take the load off ({cure})"
+        return None
+
     def _loaded(self) -> str | None:
         """Return which sensor measures a load that does not come from its drift, or None."""
         # Fingers that are known to be empty do not load a fingertip: its torque is drift.
@@ -413,8 +422,8 @@ class ControlLoop:
         if not experiment.running:
             return self._ended(self.safety.report(decision.faults))
         action = command.action if command.action is not None and not still and experiment.begin_action() else None
-        if isinstance(action, TareStep) and (reason := self.held or self._why_uncertain()):
-            self._fail(experiment, f"{reason}; put a `release` before it")
+        if isinstance(action, TareStep) and (reason := self._why_no_tare_step()) is not None:
+            self._fail(experiment, reason)
             return self._ended(self.safety.report(decision.faults))
         if isinstance(action, IdentifyStep):
             wrist.begin_identification(action, limit_nm)

@@ -11,7 +11,7 @@ import pytest
 
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.control.control_loop import LOADED_NM, ControlLoop
-from shearloop.daemon.control.experiment import ExperimentPhase
+from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
 from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, first_motion
 from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
@@ -20,7 +20,7 @@ from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.drivers.errors import DriverError
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
-from tests.daemon.control.loop_rig import GRIP, LOAD, Rig, new_loop, phase, started, stop
+from tests.daemon.control.loop_rig import EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS
 
 WAIT = {"do": "wait", "wait_s": 60}
@@ -136,6 +136,52 @@ def test_a_tare_step_with_a_held_tool_is_refused():
     assert phase(rig) is ExperimentPhase.STOPPED
     assert "step 1 (tare) cannot be done: its fingers hold" in rig.control_loop.experiment.stop_reason
     assert rig.begun == []
+
+
+class OnLever(Rig):
+    """A rig where something leans on the load cell's lever, and on nothing else."""
+
+    lever_nm = 0.0
+
+    def sense(self, torque_nm: float) -> None:
+        # The fingertip's torque is of the gel.
+        super().sense(torque_nm + self.lever_nm)
+
+
+def test_a_tare_step_under_load_is_refused():
+    rig = OnLever(new_loop())
+    rig.lever_nm = 0.074
+    started(rig, {"do": "tare"}, GRIP, {"do": "hold_torque", "torque_nm": 0.06, "hold_s": 1.0})
+    rig.run(1)
+    assert phase(rig) is ExperimentPhase.STOPPED
+    reason = rig.control_loop.experiment.stop_reason
+    assert "step 1 (tare) cannot be done: load_cell measures +0.07" in reason
+    assert "which would become the zero; take the load off" in reason
+    assert rig.begun == []
+    # The same rig without it.
+    rig.lever_nm = 0.0
+    rig.control_loop.acknowledge()
+    started(rig, {"do": "tare"})
+    rig.run(2)
+    assert phase(rig) is ExperimentPhase.DONE
+
+
+@pytest.mark.parametrize("from_s", [0.0, 2.5])
+def test_no_torque_is_done_while_fingertip_and_load_cell_disagree(from_s):
+    """A load that came after the tare, before or in the step: the loop holds, and then stops; it never says done."""
+    config = LoopConfig(disagreement_nm=0.1, max_innovation_nm=1.0)
+    loop = ControlLoop(config, {"right": EIT, "load_cell": LOAD}, ("gripper", "right"))
+    rig = OnLever(loop, noise_nm=0.001)
+    hold = {"do": "hold_torque", "torque_nm": 0.06, "hold_s": 3.0}
+    started(rig, GRIP, {"do": "identify"}, hold, torque_source="load_cell")
+    while loop.experiment.running and not isinstance(loop.experiment.command.wrist, TrackTorque):
+        rig.step()
+    assert loop.experiment.running, loop.experiment.stop_reason
+    rig.run(from_s)
+    rig.lever_nm = -0.2
+    rig.run(200)
+    assert phase(rig) is ExperimentPhase.STOPPED
+    assert FaultCode.TORQUES_DISAGREE in [fault.code for fault in loop.safety.stop_faults]
 
 
 def test_the_angle_since_the_grip_belongs_to_the_grip():

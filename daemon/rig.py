@@ -9,9 +9,9 @@ import structlog
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, commissioning_of, measured_widths
-from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, SerialDevice
+from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.control import experiment_check, experiment_schema
-from shearloop.daemon.control.action_executor import Tareable
+from shearloop.daemon.control.action_executor import LONGEST_TARE_S, Tareable
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
@@ -259,6 +259,7 @@ def build_sensors(
         period_s = config.fingertips[sides[0]].frame_period_s
         pairs = CombinedTask(
             COMBINED, combined, publisher, clock, loop, gripper, inputs(COMBINED),
+            longest_tare_s=_longest_tare_s(config.fingertips[sides[0]]),
             period_s=period_s, pairing=FramePairing(sides, period_s), sides=[inputs(side) for side in sides],
         )  # fmt: skip
     tasks: dict[str, Task] = {}
@@ -268,7 +269,7 @@ def build_sensors(
         zero_slots = session.calibration.table.zero_slots
         board = EitKit(link(name, own.device), zero_slots, own.frame_period_s, inputs(name), patience)
         task = BoardTask(
-            name, session, publisher, clock, loop, gripper, inputs(name),
+            name, session, publisher, clock, loop, gripper, inputs(name), longest_tare_s=_longest_tare_s(own),
             board=board, combined=pairs, always_heatmap=own.heatmap == "always",
         )  # fmt: skip
         tasks[name] = tareable[name] = task
@@ -293,6 +294,11 @@ def log_assumptions(sessions: Mapping[str, Session]) -> None:
     for name, session in sessions.items():
         if assumed := session.calibration.assumption_text:
             structlog.get_logger().warning(f"the calibration of {name} assumes that {assumed}")
+
+
+def _longest_tare_s(fingertip: FingertipConfig) -> float:
+    """Return the time within which a fingertip's tare must be complete: three times that of its frames."""
+    return max(LONGEST_TARE_S, 3.0 * fingertip.baseline_frames * fingertip.frame_period_s)
 
 
 def build_rig(

@@ -57,7 +57,7 @@ class PaperSession(Session):
     @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
-        return self._untouched.missing
+        return self._untouched.missing and not self._lacks_idle_frame
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next frame of one side and return its difference to the idle frame, or the reasons against it."""

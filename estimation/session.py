@@ -35,6 +35,7 @@ from shearloop.estimation.values import Estimate, Measured, ProcessedFrame, Tact
 from shearloop.words import counted
 
 _REPEATED_FRAME = ("the board sent the same frame again",)
+_NO_IDLE_FRAME = ("the idle frame was not completed in time; tare again with nothing gripped",)
 UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _UNKNOWN = (None, None, None)
 _UNCALIBRATED = ("no calibration is configured: k and sigma have no torque",)
@@ -91,6 +92,7 @@ class Session:
 
     def reset(self, idle_frames: int = 0) -> None:
         """Forget the session: the next frame is its first, and the next `idle_frames` usable ones are untouched."""
+        self._lacks_idle_frame = False
         self._begin(idle_frames)
         # The (m, c) difference to the idle frame behind the last estimate, None where there was none.
         self.difference: FloatArray | None = None
@@ -111,6 +113,10 @@ class Session:
         self._grips = [GripDetector(one) for one in fingertips.sides]
         self._memory = GripMemory(motion, fingertips.idle.shape)
 
+    def give_up_tare(self) -> None:
+        """End a tare that is not complete: later frames could be of any load. None has an estimate until the next."""
+        self._lacks_idle_frame = True
+
     @property
     def fixed(self) -> dict[str, object]:
         """What follows from the configuration, and is no state."""
@@ -124,7 +130,7 @@ class Session:
     @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
-        return self._idle.taring
+        return self._idle.taring and not self._lacks_idle_frame
 
     @property
     def grip_t_s(self) -> FloatArray:
@@ -162,6 +168,8 @@ class Session:
         if frame.repeated:
             return Estimate(valid=False, reasons=_REPEATED_FRAME)
         self.difference = None
+        if self._lacks_idle_frame:
+            return Estimate(valid=False, reasons=_NO_IDLE_FRAME)
         # Noise makes every side of a new frame differ, except where no channel has a signal.
         repeats = ((frame.channels == self._latest).all(axis=1) & frame.channels.any(axis=1)).any()
         self._latest = frame.channels

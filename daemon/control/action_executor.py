@@ -44,6 +44,10 @@ UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait f
 class Tareable(Protocol):
     """A sensor with a zero."""
 
+    @property
+    def taring(self) -> bool:
+        """Whether a zero that was asked for is being taken."""
+
     def tare(self) -> None:
         """Take a new zero from later measurements."""
 

@@ -148,6 +148,8 @@ class ControlLoopRunner:
             return ENDING
         if self.actions.unlocking:
             return UNLOCKING
+        if taring := [name for name, sensor in self.actions.sensors.items() if sensor.taring]:
+            return f"a zero is being taken ({', '.join(taring)}), with nothing gripped; start again when it is done"
         return self._control_loop.start_refusal()
 
     async def start(self, file: ExperimentFile, stops_before: int | None = None) -> str | None:

@@ -10,6 +10,8 @@ from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFram
 from shearloop.drivers.eit_kit import Frame
 from shearloop.estimation import Adaptation, Estimate
 
+_GIVEN_UP = " given up"
+
 
 def frame_message(name: str, frame: Frame) -> EitFrame:
     """Return the message of a frame."""
@@ -35,6 +37,17 @@ def torques_from_bytes(data: bytes) -> tuple[int, str, FloatArray]:
     """Return the frame, the source and the torques (n,) of a raw event; raises ValueError for other data."""
     frame, reference, *torques = data.decode().split()
     return int(frame), reference, np.array(torques, dtype=np.float64)
+
+
+def tare_as_bytes(frame: int, *, given_up: bool = False) -> bytes:
+    """Return the raw event's data: the frame that a tare begins with, or before which an incomplete one is given up."""
+    return f"{frame}{_GIVEN_UP if given_up else ''}".encode()
+
+
+def tare_from_bytes(data: bytes) -> tuple[int, bool]:
+    """Return the frame of a tare, and whether it is given up there; raises ValueError for other data."""
+    text = data.decode()
+    return int(text.removesuffix(_GIVEN_UP)), text.endswith(_GIVEN_UP)
 
 
 def adapted_message(name: str, frames: tuple[Frame, ...], reference: str, adaptation: Adaptation) -> EitAdapted:

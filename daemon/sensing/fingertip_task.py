@@ -5,15 +5,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import structlog
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.action_executor import LONGEST_TARE_S
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.fingertip_messages import adapted_message, estimate_message, torques_as_bytes
+from shearloop.daemon.sensing.fingertip_messages import (
+    adapted_message,
+    estimate_message,
+    tare_as_bytes,
+    torques_as_bytes,
+)
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
@@ -29,32 +36,47 @@ class _Tare:
     """A tare of one estimator: when it begins, whether it is done, and why its frames were refused."""
 
     def __init__(self) -> None:
-        # The tare begins with the first frame acquired after this.
+        # The tare begins with the first frame acquired after this, and ends before the first one acquired after that.
         self._from_ns: int | None = None
+        self._until_ns = 0
+        self.begun = self._expired = False
         self.done = asyncio.Event()
         self.done.set()
         # By the reason without its numbers: the count, and the latest reason.
         self._refused: dict[str, tuple[int, str]] = {}
 
-    def begin(self, now_ns: int) -> None:
+    def begin(self, now_ns: int, within_s: float) -> None:
         """Begin, also during another tare."""
-        self._from_ns = now_ns
+        self._from_ns, self._until_ns = now_ns, now_ns + round(within_s * 1e9)
+        self.begun = self._expired = False
         self.done.clear()
         self._refused.clear()
 
+    def is_under_way(self, now_ns: int) -> bool:
+        """Return whether the next frames belong to it."""
+        return not (self.done.is_set() or self._expired) and now_ns <= self._until_ns
+
+    def expires(self, t_begin_ns: int) -> bool:
+        """Return, once, whether a frame that began then is too late for it."""
+        late = not (self.done.is_set() or self._expired) and t_begin_ns > self._until_ns
+        self._expired |= late
+        return late
+
     def is_due(self, t_begin_ns: int) -> bool:
         """Return, once, whether a frame that began then is the tare's first."""
-        due = self._from_ns is not None and t_begin_ns >= self._from_ns
+        due = not self._expired and self._from_ns is not None and t_begin_ns >= self._from_ns
         self._from_ns = None if due else self._from_ns
+        self.begun |= due
         return due
 
-    def give_up(self) -> None:
-        """Forget a tare that no frame has begun."""
+    def give_up(self, now_ns: int) -> None:
+        """Forget a tare that no frame has begun, and end one that is not complete."""
         self._from_ns = None
+        self._until_ns = min(self._until_ns, now_ns)
 
     def add(self, reason: str, *, taring: bool) -> None:
         """Take the reason of an estimate, and whether more frames are needed."""
-        if self.done.is_set() or self._from_ns is not None:
+        if self.done.is_set() or self._expired or self._from_ns is not None:
             return
         if not taring:
             self.done.set()
@@ -83,6 +105,8 @@ class FingertipTask:
     loop: ControlLoop | None = None
     gripper: GripperTask | None = None
     inputs: InputRecorder | None = None
+    # The longest time of a tare that nobody waits for.
+    longest_tare_s: float = LONGEST_TARE_S
     count: int = 0
     _tare: _Tare = field(default_factory=_Tare)
     _held: Measured | None = None
@@ -93,9 +117,12 @@ class FingertipTask:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
         number, now_ns = frames[0].seq, self.clock.now_ns()
         # A replay tares, takes the held tool, and corrects the gain before the same frame.
-        if self._tare.is_due(min(frame.t_begin_ns for frame in frames)):
+        began_ns = min(frame.t_begin_ns for frame in frames)
+        if self._tare.expires(began_ns):
+            self._give_up_tare(number, now_ns)
+        if self._tare.is_due(began_ns):
             self.session.tare()
-            self._record(InputKind.TARE, now_ns, str(number).encode())
+            self._record(InputKind.TARE, now_ns, tare_as_bytes(number))
         tool = self.gripper.held_tool(now_ns) if self.gripper is not None else None
         if tool != self._held:
             self._held = tool
@@ -124,12 +151,25 @@ class FingertipTask:
         self._tare.add(message.reason, taring=self.session.taring)
 
     def tare(self) -> None:
-        """Take a new idle frame from frames acquired entirely after now."""
-        self._tare.begin(self.clock.now_ns())
+        """Take a new idle frame from frames acquired entirely after now, within `longest_tare_s`."""
+        self._tare.begin(self.clock.now_ns(), self.longest_tare_s)
+
+    @property
+    def taring(self) -> bool:
+        """Whether the next frames belong to a tare that was asked for."""
+        return self._tare.is_under_way(self.clock.now_ns())
+
+    def _give_up_tare(self, number: int, now_ns: int) -> None:
+        """Leave a tare that no frame has completed in time: later frames could be of any load."""
+        why = self._tare.reasons or "no frame came in time"
+        structlog.get_logger().warning(f"the idle frame of {self.name} was not taken: {why}")
+        if self._tare.begun and self.session.taring:
+            self.session.give_up_tare()
+            self._record(InputKind.TARE, now_ns, tare_as_bytes(number, given_up=True))
 
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new idle frame and wait until it is complete; return None, or why it is not."""
-        self.tare()
+        self._tare.begin(self.clock.now_ns(), within_s)
         try:
             async with asyncio.timeout(within_s):
                 await self._tare.done.wait()
@@ -138,7 +178,7 @@ class FingertipTask:
             return f"{what}: {self._tare.reasons or 'no frame came'}"
         finally:
             # Frames that come later could be of any load.
-            self._tare.give_up()
+            self._tare.give_up(self.clock.now_ns())
         return None
 
     async def adapt(self, reference: str) -> None:

@@ -71,6 +71,11 @@ class LoadCellTask:
         self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self._period_s * 1e9)
         self._zero_until_ns = now_ns + round(self._timeout_s * 1e9)
 
+    @property
+    def taring(self) -> bool:
+        """Whether the next readings belong to a zero that was asked for."""
+        return self._zeroing is not None and self._clock.now_ns() <= self._zero_until_ns
+
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new zero and wait until it is done; return None, or why it was not taken."""
         self.tare()

@@ -95,6 +95,8 @@ class SkinTask:
         self._radius_m = _radius_m(config)
         self._zero_timeout_s = max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples * config.daq.sample_period_s)
         self._sampled = asyncio.Event()
+        # When the latest zero was asked for.
+        self._asked_ns = -(2**63)
         self._reason = ""
         self._valid = 0
 
@@ -112,11 +114,17 @@ class SkinTask:
 
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""
-        now_ns = self._clock.now_ns()
+        now_ns = self._asked_ns = self._clock.now_ns()
         if self._inputs is not None:
             self._inputs.record(RawEvent(InputKind.TARE, now_ns))
         self._skin.restart_average()
         self._estimator.tare(now_ns)
+
+    @property
+    def taring(self) -> bool:
+        """Whether the next samples belong to a zero that was asked for a short time ago."""
+        waited_s = (self._clock.now_ns() - self._asked_ns) / 1e9
+        return self._estimator.zero is None and not self._estimator.refused and waited_s < self._zero_timeout_s
 
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new zero and wait until it is done; return None, or why it was not taken."""

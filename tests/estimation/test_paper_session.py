@@ -59,6 +59,20 @@ def uncalibrated(baseline_frames: int, **options: int) -> PaperSession:
     return PaperSession(Calibration.uncalibrated("bank"), matcher, baseline_frames=baseline_frames, **options)
 
 
+def test_a_tare_that_is_given_up_gives_no_torque_until_the_next():
+    session = tared(OneCell())
+    session.tare()
+    estimated(session, 10, noisy())
+    session.give_up_tare()
+    assert not session.taring
+    for number in range(11, 25):
+        given_up = estimated(session, number, noisy(PATTERN))
+        assert (given_up.valid, given_up.torque_nm) == (False, None)
+        assert "tare again with nothing gripped" in given_up.reasons[0]
+    session.tare()
+    assert session.taring
+
+
 def test_the_baseline_is_the_mean_of_its_frames_and_has_their_noise():
     untouched = UntouchedFrames(400)
     untouched.frames.extend(noisy() for _ in range(400))

@@ -99,6 +99,20 @@ def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(taring, process):
     assert not memory.taring
 
 
+def test_a_zero_that_is_given_up_gives_no_estimate_until_the_next(taring, process, like):
+    session = taring(8)
+    process(session, [0.0] * 5)
+    session.give_up_tare()
+    assert not session.taring
+    for number in range(12):
+        estimate = session.estimate(like(2.5 + 0.5 * number, 1.0))
+        assert not estimate.valid
+        assert estimate.reasons == ("the idle frame was not completed in time; tare again with nothing gripped",)
+    session.tare(2)
+    assert session.taring
+    assert session.estimate(like(9.0, 0.0)).reasons == ("taking the idle frame, 1 of 2",)
+
+
 def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(motion_calibration, taring, process):
     seen = process(taring(2), [0, 0, *np.full(motion_calibration.estimator.motion.n_needed + 5, 0.3)])
     assert not seen[-1].reasons

@@ -30,6 +30,7 @@ from shearloop.daemon.sensing.fingertip_messages import (
     adapted_message,
     estimate_message,
     frame_message,
+    tare_from_bytes,
     torques_from_bytes,
 )
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
@@ -148,8 +149,10 @@ class RecordedRun:
                         found.frame_numbers[event.source][arrival_ns] = content["frame"]
                     case RecordedEvent(topic=messages.SkinShear.topic, content=content):
                         found.sample_numbers[event.t_mono_ns] = content["sample"]
-                    case RecordedEvent(raw=RawEvent(kind=InputKind.TARE, data=data)) if data.isdigit():
-                        before.append((int(data), InputKind.TARE, None))
+                    # A load cell's has a raw value, and the skin's is empty.
+                    case RecordedEvent(raw=RawEvent(kind=InputKind.TARE, data=data)) if data.split(b" ")[0].isdigit():
+                        number, given_up = tare_from_bytes(data)
+                        before.append((number, InputKind.TARE, given_up))
                     case RecordedEvent(raw=RawEvent(kind=InputKind.TOOL, data=data)):
                         number, tool = tool_from_bytes(data)
                         before.append((number, InputKind.TOOL, tool))
@@ -398,7 +401,11 @@ class Replay:
             if kind is InputKind.TOOL and self._latest_frame.get(source, -1) < first <= number:
                 session.set_tool(value)
             elif kind is InputKind.TARE and first == number:
-                session.tare()
+                # `value`: whether one that is not complete is given up.
+                if value:
+                    session.give_up_tare()
+                else:
+                    session.tare()
             elif kind is InputKind.ADAPT and first == number:
                 self._adapt(source, frames, *value)
         self._latest_frame[source] = number

@@ -203,7 +203,10 @@ class Cell:
             LoopConfig(), {WRENCH: source}, ("robot",), dead_tasks=self.died
         )
         clock = StepClock(self.robot.bench)
-        self.runner = ControlLoopRunner(self.control_loop, self.robot, self.gripper, {}, self.published, clock)
+        self.sensors: dict[str, Any] = {}
+        self.runner = ControlLoopRunner(
+            self.control_loop, self.robot, self.gripper, self.sensors, self.published, clock
+        )
         self.task: asyncio.Task[None] | None = None
         self.holding = True
 

@@ -138,6 +138,16 @@ def test_a_tare_step_with_a_held_tool_is_refused():
     assert rig.begun == []
 
 
+async def test_no_start_while_a_zero_is_taken():
+    """Its first step could grip a tool, whose torque becomes the zero."""
+    async with with_gripper() as cell:
+        cell.sensors |= {name: SimpleNamespace(taring=name == "right") for name in ("load_cell", "right")}
+        refusal = "a zero is being taken (right), with nothing gripped; start again when it is done"
+        assert cell.runner.start_refusal() == refusal
+        cell.sensors["right"].taring = False
+        assert cell.runner.start_refusal() is None
+
+
 class OnLever(Rig):
     """A rig where something leans on the load cell's lever, and on nothing else."""
 

@@ -16,6 +16,7 @@ from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes
+from shearloop.daemon.sensing.fingertip_messages import tare_from_bytes
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.sessions import COMBINED
@@ -85,6 +86,16 @@ class FakeSession:
             self.tared_before.append(number)
         self._tared = False
         return Estimate(valid=False, reasons=(self.reason,))
+
+
+class Taring(FakeSession):
+    """Never has all frames of a tare."""
+
+    taring, given_up = True, 0
+
+    def give_up_tare(self) -> None:
+        self.given_up += 1
+        self.taring = False
 
 
 class FixedClock(Clock):
@@ -328,14 +339,14 @@ async def test_waiting_for_a_tare_ends_when_it_is_complete():
 
 
 async def test_tare_that_times_out_says_why_its_frames_were_refused():
-    clock, session = FixedClock(), FakeSession()
-    session.taring = True
+    clock, session = FixedClock(), Taring()
     task = estimates("right", RecordingPublisher(), session, clock)
     async with running(task.tare_and_wait(0.2)) as (waiting,):
         await asyncio.sleep(0)
         for seq, reason in enumerate(("3 channels jumped", "nothing", "5 channels jumped", "7 channels jumped"), 2):
             session.reason = reason
-            await task.process(frame(seq, clock.t_ns + seq * PERIOD_NS))
+            # Each began soon after the tare was asked for.
+            await task.process(frame(seq, clock.t_ns + (620 + seq) * MS))
         error = await waiting
     said = "the idle frame of right could not be taken within 0.2 s"
     assert error == f"{said}: 3 frames: 7 channels jumped, 1 frame: nothing"
@@ -343,6 +354,37 @@ async def test_tare_that_times_out_says_why_its_frames_were_refused():
         assert (await waiting).endswith("no frame came")
     await task.process(frame(9, clock.t_ns + 9 * PERIOD_NS))
     assert session.tared_before == [2], "a later frame may be of a gripped tool"
+
+
+async def test_a_tare_of_a_fingertip_that_is_not_there_is_not_taken_at_the_load_of_a_later_hour(log):
+    clock, session, raw = FixedClock(), FakeSession(), list[RawEvent]()
+    task = estimates("right", RecordingPublisher(), session, clock, inputs=SimpleNamespace(record=raw.append))
+    task.tare()
+    assert task.taring
+    clock.t_ns += round(task.longest_tare_s * 1e9) + 1
+    assert not task.taring
+    # It is plugged in, with a tool in the fingers.
+    await task.process(frame(0, clock.t_ns + PERIOD_NS + 80 * MS))
+    assert session.tared_before == []
+    assert log.said == ["the idle frame of right was not taken: no frame came in time"]
+    assert raw == []
+
+
+async def test_a_tare_that_lost_its_board_on_the_way_gives_no_estimate_until_the_next(log):
+    clock, session, raw = FixedClock(), Taring(), list[RawEvent]()
+    task = estimates("right", RecordingPublisher(), session, clock, inputs=SimpleNamespace(record=raw.append))
+    task.tare()
+    await task.process(frame(0, clock.t_ns + PERIOD_NS + 80 * MS))
+    assert session.tared_before == [0]
+    clock.t_ns += round(task.longest_tare_s * 1e9) + 1
+    for number in (1, 2):
+        await task.process(frame(number, clock.t_ns + PERIOD_NS + 80 * MS))
+    assert session.given_up == 1
+    assert [(one.kind, tare_from_bytes(one.data)) for one in raw] == [
+        (InputKind.TARE, (0, False)),
+        (InputKind.TARE, (1, True)),
+    ], "as a replay finds it"
+    assert log.said == ["the idle frame of right was not taken: 1 frame: nothing"]
 
 
 def test_the_configured_frame_period_is_the_boards():

@@ -1,5 +1,8 @@
 """What the loop publishes and logs of its states: every experiment's begin and end, and each change once."""
 
+import asyncio
+from types import SimpleNamespace
+
 import pytest
 from structlog.testing import capture_logs
 
@@ -10,7 +13,7 @@ from shearloop.daemon.control.samples import GripperStatus
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import wire_map
 from shearloop.daemon.run_summary import RunSummary
-from tests.daemon.control.cell import Cell, driven
+from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven
 from tests.drivers.ur.handler_bench import SETTINGS
 
 
@@ -77,3 +80,25 @@ async def test_a_further_fault_is_logged_by_its_code_alone():
     (line,) = (line for line in lines if line["event"] == "loop")
     assert line["faults"] == f"{FaultCode.STEP_FAILED.text}, {FaultCode.DEVICE_LOST.text}"
     assert "cause" not in line
+
+
+@pytest.mark.parametrize(
+    "step", [MOVE, GRIP, TWIST, {"do": "wait", "wait_s": 60}, {"do": "tare"}], ids=lambda one: one["do"]
+)
+async def test_a_persons_own_stop_is_no_error_and_its_line_begins_with_it(step):
+    async with driven() as cell:
+        # Neither a grip nor a zero ends by itself.
+        cell.gripper.there.clear()
+        cell.sensors["right"] = SimpleNamespace(taring=False, tare_and_wait=lambda _: asyncio.Event().wait())
+        await cell.start(step)
+        await cell.cycles(10)
+        assert cell.control_loop.running is not None
+        with capture_logs() as lines:
+            assert cell.runner.stop() == "test"
+            await cell.until_ended(50)
+            await cell.cycles(50)
+    assert [line for line in lines if line["log_level"] != "info"] == []
+    (line,) = (line for line in lines if line["event"] == "loop")
+    cause = FaultCode.OPERATOR_STOP.value.kind
+    assert line["cause"].lower().startswith(cause.lower())
+    assert "activity" not in line, "the cause is said once"

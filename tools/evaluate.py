@@ -117,13 +117,28 @@ def evaluate_recordings(
         calibration.assumption_text,
         draw_stream,
         no_better_than_clock,
-        [f"{name}: {warning}" for name, warning in warned if warning],
+        _known_data(calibration, named, time_range) + [f"{name}: {warning}" for name, warning in warned if warning],
         [
             f"{path.name}: {'; '.join(one.left_out)}"
             for (path, _), one in zip(named, parts, strict=True)
             if one.left_out
         ],
     )
+
+
+def _known_data(
+    calibration: Calibration, named: Sequence[tuple[Path, FrameSeries]], time_range: tuple[float, float]
+) -> list[str]:
+    """Return a sentence for each recording that a calibration was fitted to."""
+    source = calibration.source
+    # Other parts of one recording are new data.
+    whole = time_range == (0.0, 1.0) or " from " not in source
+    return [
+        f"{path.name} has the name of a recording that the calibration was fitted to ({source}); errors on known data "
+        "are smaller than on new ones, so judge it on another recording"
+        for path, _ in named
+        if path.name in source and whole
+    ]
 
 
 def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:

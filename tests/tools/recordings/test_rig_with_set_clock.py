@@ -209,3 +209,19 @@ def test_every_command_gives_the_same_numbers(rig_run, truth, set_s, tmp_path):
     found = results(rig_run.record(tmp_path / "stepped", set_s), calibration, tmp_path / "found")
     for name, value in truth.items():
         assert found[name] == value, name
+
+
+def test_evaluate_says_that_a_calibration_knows_the_recording(plain, tmp_path, ran):
+    whole, part, other = tmp_path / "whole.cal", tmp_path / "part.cal", tmp_path / "other.mcap"
+    other.write_bytes(plain.read_bytes())
+    ran("calibrate", plain, "--sides", "right,left", "--out", whole)
+    ran("calibrate", plain, "--sides", "right,left", "--time-range", "0:0.7", "--out", part)
+    known = f"Warning: {plain.name} has the name of a recording that the calibration was fitted to"
+    for calibration, recording, options in (
+        (whole, plain, ()),
+        (whole, plain, ("--time-range", "0.7:1")),
+        (part, plain, ()),
+    ):
+        assert known in ran("evaluate", calibration, recording, *options).err
+    for calibration, recording, options in ((part, plain, ("--time-range", "0.7:1")), (whole, other, ())):
+        assert "Warning" not in ran("evaluate", calibration, recording, *options).err

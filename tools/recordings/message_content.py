@@ -18,6 +18,8 @@ from shearloop.drivers.serial_sensor import InputKind
 
 # Unix time and CLOCK_MONOTONIC in ns: the year 2116, and 146 years after the start of a computer.
 _LATEST_NS = 2**62
+# Frames and heatmaps have less than 1 MB, and states a few. JSON of this size is parsed within three seconds.
+_LARGEST_MESSAGE_BYTES = 16 << 20
 _LONGEST_QUOTE = 40
 
 
@@ -61,7 +63,10 @@ def read_content(topic: str, data: bytes) -> dict[str, Any]:
     import writes. Raises UnknownTopicError for another topic and ContentError for what does not fit it.
     """
     name = schema.schema_name(topic)
+    if len(data) > _LARGEST_MESSAGE_BYTES:
+        raise ContentError(f"it has {len(data) >> 20} MB, and at most {_LARGEST_MESSAGE_BYTES >> 20} are read")
     try:
+        # Its nesting is bounded there.
         content = from_json(data)
     except ValueError as error:
         raise ContentError(f"it is not JSON ({error})") from error

@@ -54,6 +54,8 @@ COMPUTED_TOPICS = tuple(kind.topic for kind in _COMPUTED)
 # These depend on the computer, not on the measurement.
 NOT_COMPARED = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
 _MAX_EXAMPLES = 5
+# A daemon's has some kilobytes. One of this size is refused key by key within two seconds.
+_LARGEST_CONFIGURATION_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +122,10 @@ class RecordedRun:
                 return {key: files.get(str(value), value) for key, value in section.items()}
 
             with reading(self.path):
-                content = json.loads(self._attached[schema.CONFIGURATION], object_hook=with_copies)
+                written = self._attached[schema.CONFIGURATION]
+                if len(written) > _LARGEST_CONFIGURATION_BYTES:
+                    raise ContentError(f"its configuration has {len(written) >> 10} kB: no daemon wrote it")
+                content = json.loads(written, object_hook=with_copies)
             where = f"{self.path}: its configuration does not fit this version"
             self._own = validated(content, DaemonConfig, where, UserError, cure="; give one with --config CONFIG")
             yield self._own

@@ -2,12 +2,17 @@
 
 import json
 import math
+import re
+from io import FileIO
 from typing import Any
 
 import pytest
 
 from shearloop.daemon.messaging.messages import TOPICS, wire_map
 from shearloop.daemon.recorder import schema
+from shearloop.daemon.recorder.schema import basic_identity
+from shearloop.daemon.recorder.writer import McapFile
+from shearloop.tools.recordings import message_content, replay
 from shearloop.tools.recordings.message_content import ContentError, columns, read_content
 from tests.sample_messages import sample
 from tests.tools.recordings.every_message import made
@@ -76,3 +81,28 @@ def test_every_way_out_refuses_a_strange_message(form, topic, changes, problem, 
         said = mistake("recording", "export", path, "--format", form, "--out", tmp_path / "out")
     assert problem in said
     assert f"{path}: a message cannot be used: {topic}, number " in said
+
+
+@pytest.mark.parametrize("data", [b"[" * 10**6, b'{"a":' * 10**6, b'{"source":' + b"9" * 10**6 + b"}"])
+def test_deep_messages_and_long_numbers_end_the_parser_at_once(data):
+    """Its own bounds: neither the stack nor the time grows with the message."""
+    with pytest.raises(ContentError, match="it is not JSON") as refused:
+        read_content("load.torque", data)
+    assert int(re.search(r"column (\d+)", str(refused.value))[1]) < 10_000, "where the parser gave up"
+
+
+def test_a_message_beyond_all_sizes_is_not_parsed(monkeypatch):
+    monkeypatch.setattr(message_content, "from_json", lambda _: pytest.fail("parsed"))
+    with pytest.raises(ContentError, match="it has 16 MB, and at most 16 are read"):
+        read_content("load.torque", b" " * ((16 << 20) + 1))
+
+
+def test_a_configuration_beyond_all_sizes_is_not_parsed(tmp_path, mistake, monkeypatch):
+    file = McapFile(FileIO(tmp_path / "x.partial", "xb"))
+    file.identify(dict(basic_identity("a test")))
+    keys = {f"key{number}": 1 for number in range(100_000)}
+    file.attach("configuration.json", "application/json", json.dumps(keys).encode(), 0)
+    file.close(tmp_path / "x.mcap")
+    monkeypatch.setattr(replay, "validated", lambda *_, **__: pytest.fail("validated"))
+    said = mistake("recording", "replay", tmp_path / "x.mcap", "--publish", f"ipc://{tmp_path}/r")
+    assert "its configuration has 1453 kB: no daemon wrote it" in said

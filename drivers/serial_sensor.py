@@ -274,8 +274,6 @@ class SerialSensor(Generic[ValueT]):
         self._parser = parser
         self._inputs = inputs
         self._silence_s = BOOT_S
-        # Values of the last read that `readings` has not yielded yet: the parser is ahead of its reader by these.
-        self.unread = 0
         self._least_patience = self.patience = patience
         self._prompt_values = 0
         self._value_ns = 0
@@ -284,8 +282,7 @@ class SerialSensor(Generic[ValueT]):
         """Yield the values of every line, in order and without end, as `batches` does."""
         async with contextlib.aclosing(self.batches()) as batches:
             async for values in batches:
-                for number, value in enumerate(values, 1):
-                    self.unread = len(values) - number
+                for value in values:
                     yield value
 
     async def batches(self) -> AsyncGenerator[Sequence[ValueT]]:

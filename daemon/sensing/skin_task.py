@@ -102,13 +102,13 @@ class SkinTask:
 
     async def run(self) -> None:
         """Publish every sample's force and pass its torque on, until cancelled."""
-        async with contextlib.aclosing(self._skin.samples()) as samples:
-            async for sample in samples:
-                reading = self._estimator.update(sample)
-                self._publish(sample, reading)
-                self._sampled.set()
-                self._sampled.clear()
-                if self._inputs is not None and self._inputs.wants_state and self._skin.is_between_readings:
+        async with contextlib.aclosing(self._skin.batches()) as batches:
+            async for samples in batches:
+                for sample in samples:
+                    self._publish(sample, self._estimator.update(sample))
+                    self._sampled.set()
+                    self._sampled.clear()
+                if self._inputs is not None and self._inputs.wants_state:
                     state = {**self._skin.state, "estimator": self._estimator}
                     record_state(self._inputs, state, self._estimator.fixed, self._clock.now_ns())
 

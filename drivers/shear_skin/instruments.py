@@ -7,8 +7,8 @@ import asyncio
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable, Mapping
-from contextlib import suppress
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from contextlib import aclosing, suppress
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from time import monotonic_ns
@@ -102,8 +102,6 @@ class PolledInstrument(ABC, Generic[ReadingT]):
     inputs: InputRecorder | None = None
     # Its name in messages.
     instrument: ClassVar[str] = ""
-    # A reply is one reading: no reading waits behind another.
-    unread: ClassVar[int] = 0
     _lines: LineSplitter = field(default_factory=partial(LineSplitter, MAX_REPLY_BYTES), init=False)
     _count: int = field(default=0, init=False)
     _errors: Counter[str] = field(default_factory=Counter, init=False)
@@ -150,6 +148,12 @@ class PolledInstrument(ABC, Generic[ReadingT]):
                     yield reading
             finally:
                 await self._shut_down()
+
+    async def batches(self) -> AsyncGenerator[Sequence[ReadingT]]:
+        """Yield each reading as a batch of its own, as a board yields those of a read."""
+        async with aclosing(self.readings()) as readings:
+            async for reading in readings:
+                yield (reading,)
 
     def diagnostics(self) -> Diagnostics:
         """Return the instrument's values for `health`; counts are since the process began."""

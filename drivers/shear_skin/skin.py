@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections import Counter
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -225,7 +225,7 @@ def _is_reachable(before: tuple[float, float], after: tuple[float, float], misse
 
 
 class ShearSkin:
-    """Source and DAQ of one skin. Run `watch_source` next to `samples`: without it every sample has a fault."""
+    """Source and DAQ of one skin. Run `watch_source` next to `batches`: without it every sample has a fault."""
 
     def __init__(self, source: Keithley6430, daq: Daq, gauge_ohm: float = GAUGE_OHM, averaged: int = 1) -> None:
         self._source = source
@@ -240,18 +240,15 @@ class ShearSkin:
             async for reading in readings:
                 self._latest = reading
 
-    async def samples(self) -> AsyncGenerator[SkinSample]:
-        """Yield a sample for every block of readings, without end; iterate within `contextlib.aclosing`."""
-        async with contextlib.aclosing(self._daq.readings()) as readings:
-            async for voltages in readings:
-                sample = self._averager.add(self._validator.sample(voltages, self._latest))
-                if sample is not None:
-                    yield sample
+    async def batches(self) -> AsyncGenerator[Sequence[SkinSample]]:
+        """Yield the samples that each read completes, often none, without end; all that was read is in their state.
 
-    @property
-    def is_between_readings(self) -> bool:
-        """Whether everything that was read has become a sample, or a part of an average."""
-        return not self._daq.unread
+        Iterate within `contextlib.aclosing`.
+        """
+        async with contextlib.aclosing(self._daq.batches()) as batches:
+            async for readings in batches:
+                averaged = (self._averager.add(self._validator.sample(one, self._latest)) for one in readings)
+                yield [sample for sample in averaged if sample is not None]
 
     @property
     def state(self) -> dict[str, object]:

@@ -181,7 +181,7 @@ def tcp(address: str) -> Link:
 async def read(source: Link, daq: Daq) -> AsyncIterator["asyncio.Queue[SkinSample]"]:
     skin, queue = ShearSkin(Keithley6430(source, period_s=0.05), daq), asyncio.Queue[SkinSample]()
 
-    async with running(skin.watch_source(), pass_on(skin.samples(), queue.put_nowait)):
+    async with running(skin.watch_source(), pass_on(skin.batches(), lambda samples: [*map(queue.put_nowait, samples)])):
         yield queue
 
 

@@ -2,15 +2,16 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from shearloop.drivers.connection import Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.defaults import DAQ_RATE_HZ
-from shearloop.drivers.shear_skin.instruments import AdcBoard, Keithley6430, ScpiScanner
+from shearloop.drivers.shear_skin.instruments import AdcBoard, Keithley6430, ScpiScanner, SourceReading, Voltages
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from shearloop.emulators.ports import SocketServer
 from shearloop.emulators.skin import Circuit, EmulatedKeithley6430, EmulatedScanner, SkinInstruments
@@ -81,7 +82,9 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         daq_link = bench.link(await played.daq_port.get())
         daq = AdcBoard(daq_link, RATE_HZ) if adc else ScpiScanner(daq_link, period_s=1 / RATE_HZ, timeout_s=deadline_s)
         bench.skin = ShearSkin(Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s), daq)
-        async with running(bench.skin.watch_source(), pass_on(bench.skin.samples(), bench.on_sample)):
+        async with running(
+            bench.skin.watch_source(), pass_on(bench.skin.batches(), lambda samples: [*map(bench.on_sample, samples)])
+        ):
             await bench.next_says()
             yield bench
 
@@ -230,3 +233,26 @@ async def test_an_instrument_that_is_no_source_is_refused_by_name():
         async with running(pass_on(source.readings(), lambda _: None)):
             assert "says it is 'Agilent Technologies,34972A" in (await links.down()).sentence
         await scanner.disconnect()
+
+
+async def test_every_read_ends_with_the_samples_that_it_completes():
+    """A recording needs the state between two reads, also if no mean ever ends with one."""
+    milli_ns, current_a = 1_000_000, 1e-3
+
+    async def batches() -> AsyncGenerator[list[Voltages]]:
+        # Each mean is of the last reading of one read and the first of the next.
+        for first in (0, 1, 3, 5):
+            times_ns = [number * milli_ns for number in range(first, first + (2 if first else 1))]
+            yield [Voltages(0.1, 0.1, t_ns, t_ns) for t_ns in times_ns]
+
+    source = SimpleNamespace(current_a=current_a, period_s=1.0)
+    skin = ShearSkin(source, SimpleNamespace(period_s=1e-3, batches=batches), 100.0, averaged=2)
+    source.readings = lambda: readings(SourceReading(0, output_on=True, voltage_v=0.2, current_a=current_a))
+    await skin.watch_source()
+    found = [len(samples) async for samples in skin.batches()]
+    assert found == [0, 1, 1, 1]
+
+
+async def readings(*values: SourceReading) -> AsyncGenerator[SourceReading]:
+    for one in values:
+        yield one

@@ -148,9 +148,12 @@ class ControlLoopRunner:
             return ENDING
         if self.actions.unlocking:
             return UNLOCKING
-        if taring := [name for name, sensor in self.actions.sensors.items() if sensor.taring]:
+        if (refusal := self._control_loop.start_refusal()) is not None:
+            return refusal
+        taring = [name for name, sensor in self.actions.sensors.items() if sensor.taring]
+        if taring:
             return f"a zero is being taken ({', '.join(taring)}), with nothing gripped; start again when it is done"
-        return self._control_loop.start_refusal()
+        return None
 
     async def start(self, file: ExperimentFile, stops_before: int | None = None) -> str | None:
         """Begin an experiment; return None, or why it cannot begin.

@@ -146,6 +146,10 @@ async def test_no_start_while_a_zero_is_taken():
         assert cell.runner.start_refusal() == refusal
         cell.sensors["right"].taring = False
         assert cell.runner.start_refusal() is None
+        # A step of the experiment that runs takes one too.
+        await cell.start(WAIT)
+        cell.sensors["right"].taring = True
+        assert cell.runner.start_refusal() == "the experiment 'test' is still running; stop it first"
 
 
 class OnLever(Rig):

@@ -136,7 +136,12 @@ class ActionExecutor:
         if self.gripper is not None:
             # An activation opens and closes the fingers; after a failure they may still move.
             self.fingers_move = True
-            await self.gripper.unlock()
+            try:
+                await self.gripper.unlock()
+            except (ActionError, DriverError) as error:
+                raise ActionError(
+                    f"the robot is unlocked and may move again, and the gripper is not: {error}"
+                ) from error
             self.fingers_move = False
 
     def stop_unlocking(self) -> bool:

@@ -138,6 +138,7 @@ class Gripper:
 
     def __init__(self) -> None:
         self.error: Exception | None = None
+        self.unlock_error: Exception | None = None
         self.there = asyncio.Event()
         self.there.set()
         self.asked: list[str] = []
@@ -156,6 +157,8 @@ class Gripper:
 
     async def unlock(self) -> None:
         await self.there.wait()
+        if self.unlock_error is not None:
+            raise self.unlock_error
 
     async def open_by_operator(self) -> None:
         self.asked.append("open")

@@ -94,6 +94,19 @@ async def test_nothing_starts_after_a_stop_before_it_is_acknowledged(stop):
         await cell.start(WAIT)
 
 
+async def test_an_unlock_that_the_gripper_fails_says_what_was_unlocked_and_acknowledges_nothing():
+    async with driven() as cell:
+        await operator(cell)
+        await cell.cycles(20)
+        cell.gripper.unlock_error = DriverError("there is no connection to the gripper")
+        unlocking = asyncio.create_task(cell.runner.unlock())
+        while not unlocking.done():
+            await cell.cycles(1)
+        said = "the robot is unlocked and may move again, and the gripper is not: there is no connection to the gripper"
+        assert unlocking.result() == said
+        assert "a stop has not been acknowledged" in (cell.runner.start_refusal() or "")
+
+
 async def test_the_daemons_end_in_mid_experiment_is_a_stop():
     async with driven(WAIT) as cell:
         cell.runner.close()

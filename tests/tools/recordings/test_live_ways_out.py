@@ -40,9 +40,8 @@ def test_listen_and_the_page_give_what_was_recorded(config, tmp_path):
     sent, watched = asyncio.run(run_watched(path, tmp_path))
     watched.check(Recorded(latest_recording(tmp_path / "recordings"), sent), LISTENED, NOT_PAGED)
     assert watched.listened.numbers()["eit.estimate", "right"] == [*range(LAST_FRAME + 1)]
-    charted = {(topic, one["source"], one["timestamp"]): one for topic, one in sent}
     assert {topic for topic, _ in watched.history} == {"eit.estimate", "load.torque"}
     for topic, sample in watched.history:
         keys = ("source", "timestamp", *CHARTED[topic])
-        truth = charted[topic, sample["source"], sample["timestamp"]]
-        assert sample == {key: truth[key] for key in keys}, topic
+        # Readings that came in one read may be a nanosecond apart, and have one time in seconds.
+        assert sample in [{key: one[key] for key in keys} for name, one in sent if name == topic], topic

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys
+from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, with_connection
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.callers import caller
 
@@ -88,9 +88,10 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
     elif accepted:
-        print(*_lines(args.name, reply), sep="\n")
+        print(with_connection("\n".join(_lines(args.name, reply)), args, addresses.COMMAND_ADDRESS))
     else:
-        print(f"shearloop command: {args.name} was refused: {reply.get('reason')}", file=sys.stderr)
+        reason = with_connection(str(reply.get("reason")), args, addresses.COMMAND_ADDRESS)
+        print(f"shearloop command: {args.name} was refused: {reason}", file=sys.stderr)
         if reply.get("invalid") and args.experiment is not None:
             print(mistakes_of(args.experiment), file=sys.stderr, end="")
     return 0 if accepted else 1

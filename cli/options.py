@@ -4,6 +4,8 @@ import argparse
 import contextlib
 import math
 import os
+import re
+import shlex
 from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
@@ -170,6 +172,14 @@ def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) 
     add_option(parser, "--connect", _daemon, "ADDRESS", f"{purpose} (default: %(default)s)", default=default)
     add_option(parser, "--key", Path, "FILE", "your .key_secret, for a daemon on the network (default: in ~/.config)")
     add_option(parser, "--server-key", Path, "FILE", "that daemon's .key (default: in ~/.config)")
+
+
+def with_connection(text: str, args: argparse.Namespace, default: str) -> str:
+    """Return a text whose `shearloop command …` have the options of the connection that this command was given."""
+    given = {"--connect": args.connect if args.connect != default else None, "--key": args.key}
+    given["--server-key"] = args.server_key
+    options = "".join(f" {name} {shlex.quote(str(value))}" for name, value in given.items() if value is not None)
+    return re.sub(r"`(shearloop command [^`]+)`", lambda found: f"`{found[1]}{options}`", text)
 
 
 def add_fingertip(parser: argparse.ArgumentParser) -> None:

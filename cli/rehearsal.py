@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.cli.free_ports import free_port, is_free
+from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS
 from shearloop.drivers.defaults import DASHBOARD_PORT, PRIMARY_PORT, RTDE_PORT, SCRIPT_PORT, URCAP_PORT
 from shearloop.errors import UserError
 
@@ -76,7 +77,8 @@ class _Stage:
             self._content |= {"autostart": True, "stop_when_done": True}
             self._sentences.append(f"{config.experiment} starts by itself, and ends the rehearsal")
         elif config.robot is not None:
-            self._sentences.append("no `experiment` is configured: start one with `shearloop command start`")
+            reached = f" --connect {config.commands}" if config.commands != COMMAND_ADDRESS else ""
+            self._sentences.append(f"no `experiment` is configured: start one with `shearloop command start{reached}`")
         if config.recording is not None:
             folder = config.recording.folder / "emulated"
             self._content["recording"] = {"folder": folder}

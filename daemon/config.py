@@ -25,7 +25,7 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
     URCAP_PORT,
 )
-from shearloop.drivers.hosts import why_no_host
+from shearloop.drivers.hosts import is_loopback_host, why_no_host
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
@@ -349,7 +349,7 @@ class DaemonConfig(ConfigModel):
                     yield f"{key}.serial_number", number
                 case SerialDevice(path=Path() as path) if _is_hardware(path.resolve()):
                     yield f"{key}.path", str(path)
-                case InstrumentSocket(host=host) | GripperSocket(host=host) if not addresses.is_loopback_host(host):
+                case InstrumentSocket(host=host) | GripperSocket(host=host) if not is_loopback_host(host):
                     yield f"{key}.host", host
 
     def _ports(self) -> dict[str, list[str]]:

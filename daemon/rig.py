@@ -1,6 +1,7 @@
 """The rig: builds sensors, gripper, robot and control loop from the configuration, and checks its experiment."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -20,7 +21,6 @@ from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wren
 from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.experiment_files import ExperimentFiles, read_document, without_mistakes
 from shearloop.daemon.logs import LinkReporter
-from shearloop.daemon.messaging.addresses import is_loopback_host
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.rig_memory import RigMemory, memory_path
@@ -33,6 +33,7 @@ from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.hosts import is_loopback_host
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.models import MODELS, GripperModel
@@ -45,7 +46,7 @@ from shearloop.estimation import Session
 
 # An emulated rig cannot hurt: its deadlines are longer by this factor, so that it survives a busy computer.
 EMULATED_PATIENCE = 10.0
-# A torque of an emulated sensor is fresh for this long.
+# A torque of an emulated sensor, and a state of an emulated robot, is fresh for this long.
 EMULATED_STALE_S = 5.0
 
 
@@ -127,7 +128,7 @@ def with_emulated_deadlines(settings: UrSettings) -> UrSettings:
         settings,
         command_timeout_s=EMULATED_PATIENCE * settings.command_timeout_s,
         silence_timeout_s=EMULATED_PATIENCE * settings.silence_timeout_s,
-        state_timeout_s=1.0,
+        state_timeout_s=EMULATED_STALE_S,
         hang_timeout_s=10.0,
     )
 
@@ -161,7 +162,9 @@ def make_loop(
         for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
         if fingertip is not None and fingertip.creep is not None
     }
-    return ControlLoop(loop, sources, required, gels, dead_tasks, patience_of(config))
+    # Its thread begins with the first check of a gain.
+    compute = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gain").submit
+    return ControlLoop(loop, sources, required, gels, dead_tasks, patience_of(config), compute)
 
 
 def make_gripper(

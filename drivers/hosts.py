@@ -18,3 +18,11 @@ def why_no_host(host: str) -> str:
         except ValueError:
             return f"is no address: {host} does not have four numbers up to 255"
     return ""
+
+
+def is_loopback_host(host: str) -> bool:
+    """Return whether a host's name or address is this computer itself."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

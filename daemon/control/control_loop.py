@@ -23,7 +23,7 @@ from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_fo
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
 from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs, TorqueSample, TorqueSource
 from shearloop.daemon.control.torque_controller import WristCommand
-from shearloop.daemon.control.wrist_controller import WristController
+from shearloop.daemon.control.wrist_controller import Compute, WristController, at_once
 from shearloop.daemon.loop_config import LoopConfig
 
 # A torque below this counts as drift: a tare needs no confirmation.
@@ -84,11 +84,13 @@ class ControlLoop:
         creep: Mapping[str, Creep] = MappingProxyType({}),
         dead_tasks: Mapping[str, str] = MappingProxyType({}),
         patience: float = 1.0,
+        compute: Compute = at_once,
     ) -> None:
         """Take all torque sources by name, the required devices, and the creep of sources that measure shear.
 
         Each source that measures torque may drive. `dead_tasks` has the error of each task that is dead at present.
-        `patience` is the factor on the deadlines, above 1 on an emulated rig alone.
+        `patience` is the factor on the deadlines, above 1 on an emulated rig alone. `compute` begins a computation that
+        would make the loop late.
         """
         kept_s = max(ADAPTED_OVER_S, compared_for_s(sources.values(), config))
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
@@ -101,7 +103,7 @@ class ControlLoop:
         self._sources = sources
         self._creep = creep
         self._wrists = {
-            name: WristController(source, config) for name, source in sources.items() if source.measures_torque
+            name: WristController(source, config, compute) for name, source in sources.items() if source.measures_torque
         }
         # The wrist's controller for the driving torque, and the faults to watch for.
         self.wrist = next(iter(self._wrists.values()))

@@ -196,11 +196,18 @@ def _limit(good: Callable[[float], bool], trials: FloatArray) -> float:
 
 
 def is_stable(model: LoopModel) -> bool:
-    """Return whether all roots of the characteristic polynomial lie outside the unit circle of x = z⁻¹."""
-    polynomial = characteristic_polynomial(model)
-    # np.roots takes the highest power first: this order gives the roots in z = 1/x, which must lie inside the circle.
-    roots = np.roots(polynomial)
-    return bool(np.all(np.abs(roots) < 1.0 - 1e-9))
+    """Return whether all roots of the characteristic polynomial lie outside the unit circle of x = z⁻¹.
+
+    The Schur-Cohn recursion: each step divides out one root's worth of the reflected polynomial, and the roots lie
+    outside the circle exactly if every ratio of last to first coefficient is below 1.
+    """
+    row = characteristic_polynomial(model)
+    while row.size > 1:
+        ratio = row[-1] / row[0]
+        if not abs(ratio) < 1.0:
+            return False
+        row = row[:-1] - ratio * row[:0:-1]
+    return True
 
 
 def characteristic_polynomial(model: LoopModel) -> FloatArray:
@@ -284,6 +291,26 @@ def with_margins(settings: ControllerSettings, found: ToolModel, config: LoopCon
         if _passes(margins(lowered), config, found.sample_period_s):
             return replace(settings, kp=lowered.kp, ki=lowered.ki)
     return settings
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedGain:
+    """The gains that a loop may be closed with, or why it may not."""
+
+    kp: float
+    ki: float
+    refusal: str | None
+
+
+def judged_gain(settings: ControllerSettings, found: ToolModel, config: LoopConfig) -> JudgedGain:
+    """Return the gains of these settings after the check of their margins.
+
+    It takes up to some seconds on a busy computer. An automatic gain is lowered where it lacks the required margins; a
+    person's is refused rather than changed.
+    """
+    if config.kp is None:
+        settings = with_margins(settings, found, config)
+    return JudgedGain(settings.kp, settings.ki, margin_refusal(settings, found, config))
 
 
 def margin_refusal(settings: ControllerSettings, found: ToolModel, config: LoopConfig) -> str | None:

@@ -17,7 +17,8 @@ from shearloop.drivers.ur.settings import UrLimits
 class StepPlan:
     """One step: its action in words, its largest values, and its limits, reversals and refusals.
 
-    `reverses` says whether it turns a held tool against the turn before, `turns_back` whether it turns both ways.
+    `torque_nm` is None where the step turns the tool by an angle, and its torque is not known before. `reverses` says
+    whether it turns a held tool against the turn before, `turns_back` whether it turns both ways.
     """
 
     number: int
@@ -25,7 +26,7 @@ class StepPlan:
     text: str
     duration_s: float
     direction: str = ""
-    torque_nm: float = 0.0
+    torque_nm: float | None = 0.0
     angle_rad: float = 0.0
     force_n: float = 0.0
     timeout_s: float | None = None
@@ -64,9 +65,15 @@ class Plan:
         return max(step.angle_rad for step in self.steps)
 
     @property
-    def torque_nm(self) -> float:
-        """The largest torque of a step."""
-        return max(step.torque_nm for step in self.steps)
+    def torque_nm(self) -> float | None:
+        """The largest torque that a step asks for; None if none does and a step turns the tool by an angle."""
+        known = [step.torque_nm for step in self.steps if step.torque_nm is not None]
+        return max(known, default=0.0) or (0.0 if self.torque_is_known else None)
+
+    @property
+    def torque_is_known(self) -> bool:
+        """Whether no step turns the tool by an angle, with a torque that is not known before."""
+        return all(step.torque_nm is not None for step in self.steps)
 
     @property
     def force_n(self) -> float:
@@ -75,7 +82,8 @@ class Plan:
 
     def as_json(self) -> dict[str, Any]:
         """Return the plan for a script."""
-        totals = {name: getattr(self, name) for name in ("duration_s", "angle_rad", "torque_nm", "force_n")}
+        names = ("duration_s", "angle_rad", "torque_nm", "torque_is_known", "force_n")
+        totals = {name: getattr(self, name) for name in names}
         return asdict(self) | totals
 
     def sentences(self) -> Iterator[str]:
@@ -83,9 +91,10 @@ class Plan:
         yield f"plan of {self.name!r}, driven by {self.torque_source}, about {_duration(self.duration_s)}:"
         for step in self.steps:
             yield from step.sentences()
-        torque = f"{self.torque_nm:g} N·m"
-        if any(step.do in ("twist", "identify") for step in self.steps):
-            torque += " where a torque is asked for, and a torque not known before where the tool turns by an angle"
+        torque = f"{self.torque_nm:g} N·m" if self.torque_nm is not None else ""
+        if not self.torque_is_known:
+            torque += " where a torque is asked for, and " if torque else ""
+            torque += "a torque not known before where the tool turns by an angle"
         yield (
             f"  at most {_angle(self.angle_rad)} in a step, {torque}, fingers "
             f"{self.force_n:g} N; its limits stop it at {self.limit_nm:g} N·m and {_angle(self.limit_rad)} from "
@@ -139,7 +148,7 @@ def plan_of(
                 _words(step, gripper),
                 duration_s,
                 turn.begins or "",
-                needs.torque_nm,
+                None if isinstance(step, steps.TwistStep | steps.IdentifyStep) else needs.torque_nm,
                 _largest_angle(step, needs),
                 step.force_n if isinstance(step, steps.GripStep) else 0.0,
                 step.timeout_s,

@@ -2,11 +2,16 @@
 
 import math
 from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import replace
+from functools import partial
+from typing import TypeAlias
 
 from shearloop.daemon.control.experiment import ConstantVelocity, Hold, MoveToAngle, TrackTorque, WristSetpoint
 from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
-from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal, with_margins
+from shearloop.daemon.control.margins import JudgedGain, gain_for_noise, integral_gain, judged_gain
 from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.control.torque_controller import (
     LONGEST_STEP_NS,
@@ -18,6 +23,9 @@ from shearloop.daemon.control.torque_controller import (
 from shearloop.daemon.control.wrist_limit import WristLimit
 from shearloop.daemon.loop_config import LoopConfig
 
+# Begins a computation that would make the loop late, and returns its future.
+Compute: TypeAlias = Callable[[Callable[[], JudgedGain]], "Future[JudgedGain]"]
+
 # Torques that wait for the next wrist angle.
 MOST_PENDING = 64
 # The largest drift of the torque at a fixed angle that counts as creep.
@@ -28,11 +36,21 @@ TRAVEL_LIMIT_RAD = 3.2
 LEAST_INNOVATION_LIMIT_NM = 0.01
 
 
+def at_once(job: Callable[[], JudgedGain]) -> "Future[JudgedGain]":
+    """Do a computation within this call, as where time is simulated."""
+    done: Future[JudgedGain] = Future()
+    done.set_result(job())
+    return done
+
+
 class WristController:
     """Carries out one set point at a time; a new one starts from the present wrist angle."""
 
-    def __init__(self, source: TorqueSource, config: LoopConfig) -> None:
+    def __init__(self, source: TorqueSource, config: LoopConfig, compute: Compute = at_once) -> None:
         self.source = source
+        self._compute = compute
+        # The check of the gain for the identified tool.
+        self._judged: Future[JudgedGain] | None = None
         self.tool: ToolModel | None = None
         self.controller: TorqueController | None = None
         # The torque set point of the closed loop, and the limit of its step.
@@ -93,16 +111,22 @@ class WristController:
         return (self.tracked, self._torque_limit_nm) == (setpoint, torque_limit_nm)
 
     def close_loop(self, setpoint: TrackTorque, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> str | None:
-        """Track a torque with the identified tool; return None, or why it cannot be tracked."""
+        """Track a torque with the identified tool; return None, or why it cannot be tracked.
+
+        Until the check of the gain has ended, the loop stays open and the wrist stands still.
+        """
         tool = self.tool
         if tool is None:
             return "the tool has not been identified; put an `identify` step before the first `hold_torque`"
         settings = controller_settings(self._config, tool, self.source, setpoint, torque_limit_nm)
-        if self._config.kp is None:
-            # A person's gain is refused rather than changed.
-            settings = with_margins(settings, tool, self._config)
-        if refusal := margin_refusal(settings, tool, self._config):
-            return refusal
+        if self._judged is None:
+            self._judged = self._compute(partial(judged_gain, settings, tool, self._config))
+        if not self._judged.done():
+            return None
+        judged = self._judged.result()
+        if judged.refusal:
+            return judged.refusal
+        settings = replace(settings, kp=judged.kp, ki=judged.ki)
         if self.controller is None:
             here_nm = tool.torque_nm + tool.stiffness_nm_per_rad * (wrist_rad - tool.angle_rad)
             self.controller = TorqueController(settings, t_ns, wrist_rad, here_nm, tool.known_measurements)
@@ -121,7 +145,7 @@ class WristController:
         speed_rad_per_s = excitation.command(t_ns, wrist_rad)
         if not excitation.done:
             return WristCommand(speed_rad_per_s)
-        self.tool, self.excitation = excitation.result, None
+        self.tool, self.excitation, self._judged = excitation.result, None, None
         return WristCommand()
 
     def hold(self) -> WristCommand:
@@ -131,7 +155,7 @@ class WristController:
 
     def reset(self) -> None:
         """Forget the tool, after a new grip or a new zero."""
-        self.tool = self.controller = self.tracked = self.excitation = None
+        self.tool = self.controller = self.tracked = self.excitation = self._judged = None
 
     def _on_the_way_rad(self, t_ns: int) -> float:
         """Return the turn that was sent and does not show in the angle yet."""

@@ -41,14 +41,6 @@ def is_local(address: str) -> bool:
         return False
 
 
-def is_loopback_host(host: str) -> bool:
-    """Return whether a host's name or address is this computer itself."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 def has_valid_port(address: str) -> bool:
     """Return whether a tcp address ends in a port, or in `*` for any free port; other addresses need no port.
 

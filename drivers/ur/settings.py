@@ -12,13 +12,15 @@ from pydantic import Field
 
 from shearloop.drivers import ranges
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.hosts import why_no_host
+from shearloop.drivers.hosts import is_loopback_host, why_no_host
 
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
 
 # The arm can move this long without its daemon.
 _Deadline = Annotated[float, Field(gt=0, le=1)]
+# The oldest state that a robot elsewhere may be moved on.
+_LONGEST_STATE_S = 1.0
 # The wrist stands this long after the last decision (docs/safety.md).
 _PROMISED_S = 0.2
 # A client has this time to stop a straight move after its deadline; then the script does.
@@ -240,8 +242,9 @@ class UrSettings(_Checked):
     """A wrist speed holds for this long after its decision, and after the robot's last state; then the wrist stops."""
     silence_timeout_s: _Deadline = 0.1
     """Other motion stops when the daemon sends nothing for this long."""
-    state_timeout_s: _Deadline = 0.25
-    """An older state blocks motion; at three times this age the connection counts as lost."""
+    state_timeout_s: Annotated[float, Field(gt=0, le=10)] = 0.25
+    """An older state blocks motion; at three times this age the connection counts as lost. Above 1 s for an emulated
+    robot on this computer alone."""
     connect_timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0
     """Time for connecting."""
     hang_timeout_s: Annotated[float, Field(gt=0, le=10)] = 1.5
@@ -257,6 +260,11 @@ class UrSettings(_Checked):
         """Refuse an invalid host."""
         if reason := why_no_host(self.host):
             raise ValueError(f"host {reason}; give the robot's address")
+        if self.state_timeout_s > _LONGEST_STATE_S and not is_loopback_host(self.host):
+            raise ValueError(
+                f"state_timeout_s: {self.state_timeout_s:g} s is above {_LONGEST_STATE_S:g} s, and {self.host} is not "
+                f"this computer: give {_LONGEST_STATE_S:g} or less"
+            )
         facts = self.facts
         for key, inner, noise, unit in (
             ("force_n", self.limits.force_n.inner, facts.noise_n, "N"),

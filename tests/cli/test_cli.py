@@ -581,6 +581,16 @@ def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, caps
     assert "unlock: done" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("given", [(), ("--connect", "tcp://127.0.0.1:9762")])
+def test_a_hint_reaches_the_daemon_that_the_command_reached(given, monkeypatch, capsys):
+    reason = "a stop waits; `shearloop command unlock` ends it, and `shearloop listen health` tells more"
+    reply = {"ok": False, "reason": reason}
+    monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", lambda *_: dict(reply))
+    assert main(["command", "start", *given]) == 1
+    hinted = " ".join(("shearloop command unlock", *given))
+    assert f"`{hinted}` ends it, and `shearloop listen health`" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", ["check", "run", "demo"])
 def test_a_broken_robot_library_is_one_sentence(config, command, monkeypatch, tmp_path, mistake):
     (tmp_path / "rtde_control.py").write_text("raise ImportError('librtde.so.1.6: cannot open shared object file')")

@@ -44,7 +44,11 @@ def test_the_plan_of_every_delivered_experiment_is_in_words_and_in_numbers(path,
     assert [step["do"] for step in planned["steps"]] == [step["do"] for step in steps]
     assert all(any(line.split()[:2] == [str(n), step["do"]] for line in said) for n, step in enumerate(steps, 1))
     assert planned["force_n"] == max(step.get("force_n", 0) for step in steps)
-    assert planned["torque_nm"] == max(step.get("torque_nm", step.get("until_torque_nm", 0)) for step in steps)
+    asked = max(step.get("torque_nm", step.get("until_torque_nm", 0)) for step in steps)
+    by_angle = [step["do"] in ("twist", "identify") for step in steps]
+    assert planned["torque_nm"] == (asked or (None if any(by_angle) else 0))
+    assert planned["torque_is_known"] is not any(by_angle)
+    assert [step["torque_nm"] is None for step in planned["steps"]] == by_angle
     assert planned["duration_s"] == pytest.approx(sum(step["duration_s"] for step in planned["steps"]))
     assert not any(step["refused"] or step["notes"] for step in planned["steps"])
 

@@ -56,10 +56,10 @@ def test_only_an_emulated_rig_has_longer_deadlines(tmp_path):
         config = load_daemon_config(tmp_path / "rig.yaml")
         settings = open_settings(config)
         loop = make_loop(config, settings, {"right": EIT}, {})
-        found[emulated] = settings.command_timeout_s, EIT.fresh_s(loop.config)
+        found[emulated] = settings.command_timeout_s, settings.state_timeout_s, EIT.fresh_s(loop.config)
         # The watchdog is the last resort, after the deadlines have stopped the wrist.
         assert settings.standstill_s < 1 / settings.watchdog_hz
-    assert found == {False: (0.1, pytest.approx(2.5 * 0.5412)), True: (1.0, 5.0)}
+    assert found == {False: (0.1, 0.25, pytest.approx(2.5 * 0.5412)), True: (1.0, 5.0, 5.0)}
     robot_at("192.168.1.10", tmp_path)
     with pytest.raises(UserError, match="is not this computer"):
         open_settings(load_daemon_config(tmp_path / "rig.yaml"))

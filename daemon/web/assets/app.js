@@ -83,12 +83,17 @@ function fingertips() {
   }
 }
 
-// A phone shows the chart before the buttons that a token permits.
+// A phone shows the chart before the buttons that a token permits, and before the cap.
 const phone = matchMedia("(max-width: 640px)");
 
 function arrangeControls() {
-  if (phone.matches) byId("torque").after(byId("controls"));
-  else byId("lead").after(byId("controls"));
+  if (phone.matches) {
+    byId("torque").after(byId("controls"));
+    byId("controls").after(byId("cap"));
+  } else {
+    byId("lead").after(byId("controls"));
+    byId("trouble").after(byId("cap"));
+  }
 }
 phone.addEventListener("change", arrangeControls);
 arrangeControls();

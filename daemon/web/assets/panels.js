@@ -68,8 +68,9 @@ function drivingTorque(link) {
 export function torquePanel(link) {
   const loop = link.get("loop.state");
   const named = loop?.content.torque_source;
-  const [first] = estimatesFirst(link);
-  const estimate = link.get("eit.estimate", first);
+  const known = estimatesFirst(link);
+  const first = known.find((source) => !link.isOld(link.get("eit.estimate", source))) ?? known[0];
+  const estimate = link.get("eit.estimate", known[0]);
   const driving = drivingTorque(link);
   markAge(byId("torque"), link, driving?.message);
   put(byId("torque-source"), driving ? `${driving.name}${named ? ", drives the loop" : ""}` : named ? `${named}, drives the loop` : "torque");
@@ -336,8 +337,7 @@ export function loopPanel(link) {
   const reasons = current?.reasons ?? "";
   // The reason for the stop is listed below, with its cure.
   const stopped = current?.phase === "stopped";
-  const texts = [stopped && reasons ? "" : current?.activity, stopped && stopTimes(link, current)];
-  put(byId("phase-activity"), texts.filter(Boolean).join(" "));
+  put(byId("phase-activity"), stopped && reasons ? "" : current?.activity ?? "");
   const underWay = Boolean(current?.steps) && (ACTIVE.has(current.phase) || current.phase === "done");
   const share = underWay ? current.progress : 0;
   if (byId("progress").value !== share) byId("progress").value = share;
@@ -352,6 +352,7 @@ export function loopPanel(link) {
   byId("holding").dataset.kind = stop && !asked ? "stop" : "hold";
   put(byId("holding-title"), { note: "Note", "refuse start": "No start" }[current.response] ?? (asked ? "Stopped as asked" : stop ? `Stopped: ${current.response}` : "Holding, because"));
   put(byId("cause"), current.cause || reasons);
+  put(byId("stop-times"), stopped ? stopTimes(link, current) : "");
   // `reasons` begins with the cause.
   const others = current.cause ? reasons.slice(current.cause.length).trim() : "";
   show(byId("others"), others !== "");

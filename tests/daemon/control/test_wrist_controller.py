@@ -1,11 +1,15 @@
 """The wrist's speed for a set point, and its approach to an angle."""
 
+from collections.abc import Callable
+from concurrent.futures import Future
+
 import pytest
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import MoveToAngle, TrackTorque
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
+from shearloop.daemon.control.margins import JudgedGain
 from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.daemon.loop_config import LoopConfig
@@ -72,12 +76,40 @@ async def test_wrist_comes_to_rest_at_an_angle_however_fast_it_may_be_asked_to(a
             assert cell.state.wrist_rad == pytest.approx(angle_rad, abs=1e-4)
 
 
+TOOL = ToolModel(
+    stiffness_nm_per_rad=0.2, stiffness_std=0.002, lag_s=0.0, lag_std_s=0.01, age_s=0.05, actuation_s=0.02,
+    noise_nm=0.001, sample_period_s=0.1, angle_rad=0.0, torque_nm=0.0, torque_std_nm=0.0005,
+)  # fmt: skip
+
+
+def test_while_the_gain_is_checked_elsewhere_the_wrist_stands_and_then_the_loop_is_closed():
+    checks: list[tuple[Callable[[], JudgedGain], Future[JudgedGain]]] = []
+
+    def later(job: Callable[[], JudgedGain]) -> Future[JudgedGain]:
+        checks.append((job, Future()))
+        return checks[-1][1]
+
+    one, goal = WristController(TorqueSource(name="load_cell", period_s=0.1), AT_ONCE, later), TrackTorque(0.1, 0.02)
+    one.tool = TOOL
+    for cycle in range(3):
+        t_ns = 10**9 + cycle * CYCLE_NS
+        assert one.close_loop(goal, t_ns, 0.0, 0.3) is None
+        assert not one.tracks(goal, 0.3)
+        assert one.turn(goal, t_ns, 0.0, 0.0).speed_rad_per_s == 0.0
+    ((job, checked),) = checks
+    checked.set_result(job())
+    assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0, 0.3) is None
+    assert one.tracks(goal, 0.3)
+    one.reset()
+    one.tool = TOOL
+    assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0, 0.3) is None
+    checks[1][1].set_result(JudgedGain(0.5, 0.0, "controller refused"))
+    assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0, 0.3) == "controller refused"
+
+
 def test_each_torque_has_its_own_ramp_and_limit():
     one = wrist()
-    one.tool = ToolModel(
-        stiffness_nm_per_rad=0.2, stiffness_std=0.002, lag_s=0.0, lag_std_s=0.01, age_s=0.05, actuation_s=0.02,
-        noise_nm=0.001, sample_period_s=0.1, angle_rad=0.0, torque_nm=0.0, torque_std_nm=0.0005,
-    )  # fmt: skip
+    one.tool = TOOL
     assert one.close_loop(TrackTorque(0.1, 0.5), 10**9, 0.0, torque_limit_nm=0.15) is None
     assert one.close_loop(TrackTorque(0.3, 0.01), 10**9, 0.0, torque_limit_nm=0.5) is None
     angle_rad = 0.0

@@ -252,9 +252,7 @@ def test_a_hold_shows_its_cause_then_the_codes_of_others_and_their_sentences_on_
                 "#safety-mode": "protective stop (3)",
                 "#gripper-fault": "fault 11: overheated",
                 "#holding-title": "Stopped: stop and keep grip",
-                "#phase-activity": (
-                    "From its cause: decided after 0.004 s, sent after 0.006 s, standstill after 0.123 s."
-                ),
+                "#stop-times": "From its cause: decided after 0.004 s, sent after 0.006 s, standstill after 0.123 s.",
                 "#wanted": "–",
                 "#progress-text": "",
             },

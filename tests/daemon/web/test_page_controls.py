@@ -156,8 +156,15 @@ def test_a_refusal_goes_after_some_seconds(browsed):
     page.wait_for_function("() => document.querySelector('#answer').textContent === ''")
 
 
-def test_a_phone_shows_the_chart_on_its_first_screen(browsed):
+@pytest.mark.parametrize("stopped", [False, True], ids=["running", "stopped"])
+def test_a_phone_shows_the_chart_on_its_first_screen(stopped, browsed):
+    cap = "speeds are at most 0.2 rad/s and 0.05 m/s, and the torque 0.3 N·m, because no report is configured"
+    stop = {"phase": "stopped", "response": "stop and keep grip", "cause": CAUSE, "reasons": REASONS, "faults": "x"}
+    unsent = {"sent_after_s": None, "refusal": "Nothing can be sent.", "blocked_after_s": 0.004}
+    health = {"tasks": {}, "cap": cap, "emulated": True}
+    browsed.daemon.say(health=health, loop=stop if stopped else {}, stop=unsent if stopped else {})
     page = browsed.open(token=True)
+    browsed.until("#cap", "A record")
     page.set_viewport_size({"width": 390, "height": 844})
     page.wait_for_function("() => document.querySelector('#torque').nextElementSibling?.id === 'controls'")
     page.wait_for_selector("#torque-chart canvas")

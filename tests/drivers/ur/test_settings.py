@@ -65,6 +65,15 @@ def test_mistake_is_reported(tmp_path, old, new, said):
         read_settings(changed(tmp_path, (old, new)))
 
 
+def test_only_a_robot_on_this_computer_may_have_states_older_than_a_second(tmp_path):
+    late = "state_timeout_s: 5"
+    assert read_settings(changed(tmp_path, ("host: 192.168.1.10", f"host: 127.0.0.1\n{late}"))).state_timeout_s == 5
+    with pytest.raises(
+        DriverError, match=r"state_timeout_s: 5 s is above 1 s, and 192\.168\.1\.10 is not this computer"
+    ):
+        read_settings(changed(tmp_path, ("host: 192.168.1.10", f"host: 192.168.1.10\n{late}")))
+
+
 def test_missing_file_is_reported(tmp_path):
     with pytest.raises(DriverError, match="nowhere"):
         read_settings(tmp_path / "nowhere.yaml")

@@ -63,6 +63,8 @@ class EmulatedBoard:
         self._lasting: str | None = None
         self._lasts_until_s = math.inf
         self._last_line = b""
+        # A fault: each line is sent this many lines late, and the lines that wait.
+        self._late, self._waiting = 0, deque[bytes]()
 
     async def _wait_for_start(self) -> bool:
         """Wait until the board is started; return whether that took time."""
@@ -84,7 +86,7 @@ class EmulatedBoard:
                     due_s = loop.time()
                     continue
                 try:
-                    line = self._next_line(loop.time())
+                    line = self.next_line(loop.time())
                 except StopIteration:
                     break
                 with contextlib.suppress(ConnectionError):  # unplugged while the line waited for a reader
@@ -96,14 +98,19 @@ class EmulatedBoard:
 
         Several faults apply to one line each, in order.
         """
-        if text.strip() == "normal":
-            self._injected.clear()
-            self._end_lasting()
-        else:
-            self._injected.append(parse_fault(text, self.faults))
+        match text.split():
+            case ["normal"]:
+                self._injected.clear()
+                self._end_lasting()
+                self._late, self._waiting = 0, deque()
+            case ["late", *lines]:
+                refusal = "no number of lines from 0 to 100; write for instance late 1"
+                self._late = int(number_between(" ".join(lines), 0, 100, refusal))
+            case _:
+                self._injected.append(parse_fault(text, self.faults))
 
-    def _next_line(self, now_s: float) -> bytes:
-        """Return the next line with its faults, or nothing; StopIteration at the end of the data."""
+    def next_line(self, now_s: float) -> bytes:
+        """Return the line that is due now, with its faults, or nothing; StopIteration at the end of the data."""
         fault, seconds = self._injected.popleft() if self._injected else ("", 0.0)
         if fault in TIMED_FAULTS:
             self._end_lasting()
@@ -117,7 +124,10 @@ class EmulatedBoard:
                 return self._last_line
             case "saturation":
                 return b"%d\r\n" % COUNTS_MAX
-        self._last_line = next(self._lines)
+        self._waiting.append(next(self._lines))
+        if len(self._waiting) <= self._late:
+            return b""
+        self._last_line = self._waiting.popleft()
         return self._changed(fault, self._last_line) if fault else self._last_line
 
     def _changed(self, fault: str, line: bytes) -> bytes:
@@ -153,11 +163,11 @@ class EitKitBoard(EmulatedBoard):
     A `y` ends a silence without a duration.
     """
 
-    faults = ("cut-line", "wrong-count", "nan", "garbage", "silence", "unplug", "zero-channel")
+    faults = ("cut-line", "wrong-count", "nan", "garbage", "silence", "unplug", "zero-channel", "late")
     _started = False
 
-    def _next_line(self, now_s: float) -> bytes:
-        line = super()._next_line(now_s)
+    def next_line(self, now_s: float) -> bytes:
+        line = super().next_line(now_s)
         if self._lasting != "zero-channel" or not line:
             return line
         # An open electrode.
@@ -218,4 +228,4 @@ PAPER_SKETCH = Sketch(counts_per_nm=1.0, tare_counts=0.0, noise_counts=2e-5, dec
 class Hx711Board(EmulatedBoard):
     """The load cell's board."""
 
-    faults = ("garbage", "spike", "torn", "silence", "saturation", "stuck", "unplug")
+    faults = ("garbage", "spike", "torn", "silence", "saturation", "stuck", "unplug", "late")

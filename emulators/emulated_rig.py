@@ -26,8 +26,8 @@ JOINTS = {joint.value: joint for joint in Joint}
 # The pads face each other: a shear on the right has the opposite sign on the left.
 SIDES = {"right": 1.0, "left": -1.0}
 COMMANDS = (
-    f"kick NM, slip [NM], weigh NM, flip load, joint {'|'.join(JOINTS)}, object MM|none, silence DEVICE [SECONDS], "
-    "unplug DEVICE [SECONDS], replug DEVICE, right|left|load FAULT, "
+    f"kick NM, slip [NM], weigh NM, flip load|FINGERTIP, joint {'|'.join(JOINTS)}, object MM|none, "
+    "silence DEVICE [SECONDS], unplug DEVICE [SECONDS], replug DEVICE, right|left|load FAULT, "
     "gripper drop|fault CODE|…, a fault of the robot, or normal"
 )
 
@@ -73,9 +73,11 @@ class EmulatedRig:
         gripper = Gripper(object_mm=diameter_mm, fingers=Fingers(model))
         self.scene = Scene(gripper, twin, speed, clamp_n=CLAMP_N if gripper_on == "none" else 0.0)
         self.controller = Controller(Robot(make, self.scene), host=host, rate_hz=rate_hz)
+        # Fingertips that are mounted the other way round.
+        self._flipped: set[str] = set()
         boards: dict[str, EitKitBoard | Hx711Board] = {
             side: EitKitBoard(
-                self._frames(synthesiser, SIDES.get(side, (-1.0) ** number)),
+                self._frames(side, synthesiser, SIDES.get(side, (-1.0) ** number)),
                 period_s=FRAME_PERIOD_S / speed,
                 link=run_dir / f"eit-{side}",
                 seed=seed + number,
@@ -123,12 +125,15 @@ class EmulatedRig:
                 self.scene.load_nm = _torque(torque_nm)
             case ["flip", "load"]:
                 self.scene.load_sign = -1.0
+            case ["flip", side] if isinstance(self.commanded.get(side), EitKitBoard):
+                self._flipped.add(side)
             case ["joint", name] if name in JOINTS:
                 self.scene.put_on(JOINTS[name])
             case ["object", *_]:
                 self._device("gripper").command(text)
             case ["normal"]:
                 self.scene.load_nm, self.scene.load_sign = 0.0, 1.0
+                self._flipped.clear()
                 for commanded in self.commanded.values():
                     commanded.command("normal")
             case ["replug", device]:
@@ -147,10 +152,11 @@ class EmulatedRig:
             raise ValueError(f"there is no device {name!r}; there are {', '.join(self.commanded)}")
         return self.commanded[name]
 
-    def _frames(self, synthesiser: FrameSynthesiser, sign: float) -> Iterator[bytes]:
+    def _frames(self, side: str, synthesiser: FrameSynthesiser, sign: float) -> Iterator[bytes]:
         while True:
             grip, shear_nm, width_mm = self.scene.frame(FRAME_PERIOD_S)
-            yield format_line(synthesiser.line(grip, sign * shear_nm, width_mm))
+            seen_nm = -shear_nm if side in self._flipped else shear_nm
+            yield format_line(synthesiser.line(grip, sign * seen_nm, width_mm))
 
     def _torques_nm(self, period_s: float) -> Iterator[float]:
         while True:

@@ -119,7 +119,7 @@ class Server(ABC):
     appearances: asyncio.Queue[str]
 
     def __init__(self, answer_s: float) -> None:
-        self._answer_s = self._usual_answer_s = answer_s
+        self.answer_s = self._usual_answer_s = answer_s
         # normal, silence or unplug.
         self._state = "normal"
         self._changed = asyncio.Event()
@@ -154,9 +154,9 @@ class Server(ABC):
                 for time_s in times_s:
                     self._recovery = asyncio.get_running_loop().call_later(time_s, self._begin, "normal")
             case ["slow", answer_ms]:
-                self._answer_s = number_between(answer_ms, 0.0, 10_000.0, "no time in ms of at most 10000") / 1000
+                self.answer_s = number_between(answer_ms, 0.0, 10_000.0, "no time in ms of at most 10000") / 1000
             case ["normal"]:
-                self._answer_s = self._usual_answer_s
+                self.answer_s = self._usual_answer_s
                 self._begin("normal")
             case _:
                 raise ValueError(f"{text!r} is no command; there are {OUTAGES}")
@@ -187,7 +187,7 @@ class PtyServer(Server):
                 if not reply or self._state == "silence":
                     continue
                 # The time of the measurement.
-                await asyncio.sleep(self._answer_s)
+                await asyncio.sleep(self.answer_s)
                 with contextlib.suppress(ConnectionError):  # unplugged in between
                     await self._port.write(reply)
 
@@ -258,6 +258,6 @@ class SocketServer(Server):
                 replies = session.feed(data)
                 if replies and self._state != "silence":
                     # The time of the measurement.
-                    await asyncio.sleep(self._answer_s)
+                    await asyncio.sleep(self.answer_s)
                     writer.write(replies)
                     await writer.drain()

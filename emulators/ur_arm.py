@@ -103,8 +103,8 @@ class Speed:
     target_rad_per_s: Vector
     acceleration_rad_per_s2: float
     halts: bool = False
-    # No joint gets slower than at this rate; finite with worn brakes.
-    braking_rad_per_s2: float = math.inf
+    # No joint gets slower than at this rate, (6,); finite with worn brakes.
+    braking_rad_per_s2: Vector = field(default_factory=lambda: np.full(6, math.inf))
 
     def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:
         """Return the arm one cycle later."""
@@ -188,8 +188,8 @@ class Arm:
         self.motion: Speed | LinearMove | None = None
         # The pendant's speed slider, a factor on commanded speeds.
         self.speed_slider = 1.0
-        # Faults: how fast it brakes, the noise of its measured speeds, and a force (3,) that nothing exerts.
-        self.braking_rad_per_s2 = math.inf
+        # Faults: how fast each joint brakes, the noise of its measured speeds, and a force (3,) that nothing exerts.
+        self.braking_rad_per_s2 = np.full(6, math.inf)
         self.noise_rad_per_s = 0.0
         self.bias_n = np.zeros(3)
         # Of what hangs on the tool.
@@ -236,9 +236,16 @@ class Arm:
             return self.qd_rad_per_s
         return np.asarray(self.qd_rad_per_s + self._random.normal(0.0, self.noise_rad_per_s, 6))
 
+    def brake(self, deceleration_rad_per_s2: float, *, wrist: bool = True) -> None:
+        """Slow down no faster than this from now on; without the wrist, its joint brakes as before."""
+        self.braking_rad_per_s2 = np.full(6, deceleration_rad_per_s2)
+        if not wrist:
+            self.braking_rad_per_s2[5] = math.inf
+
     def mend(self) -> None:
         """End every fault."""
-        self.speed_slider, self.braking_rad_per_s2, self.noise_rad_per_s = 1.0, math.inf, 0.0
+        self.speed_slider, self.noise_rad_per_s = 1.0, 0.0
+        self.braking_rad_per_s2 = np.full(6, math.inf)
         self.bias_n, self.hung_kg = np.zeros(3), 0.0
 
     def turn(self, target_rad_per_s: Vector, acceleration: float) -> None:

@@ -118,22 +118,8 @@ class Controller:
             case [name, text] if name in _WITH_NUMBER:
                 low, high, otherwise, begin = _WITH_NUMBER[name]
                 begin(self, number_between(text, low, high, otherwise))
-            case ["protective-stop"]:
-                self.robot.protective_stop("requested by hand")
-            case ["emergency-stop"]:
-                self.robot.emergency_stop()
-            case ["release"]:
-                self.robot.release()
-            case ["protect-abrupt-ends"]:
-                self.robot.protects_abrupt_ends = True
-            case ["protect-ends"]:
-                self.robot.protects_ends = True
-            case ["float-clock"]:
-                self.robot.registers.counts_as_float = True
-            case ["drop-rtde"]:
-                # The other ports live on.
-                for writer in list(self._rtde):
-                    writer.close()
+            case [name] if name in _WITHOUT_NUMBER:
+                _WITHOUT_NUMBER[name](self)
             case ["version", numbers]:
                 if re.fullmatch(r"\d{1,4}(\.\d{1,4}){3}", numbers) is None:
                     raise ValueError(f"{numbers!r} is not a version such as 5.4.0.0")
@@ -148,6 +134,11 @@ class Controller:
                 raise ValueError(f"{name} does not take {' '.join(arguments) or 'nothing'}")
             case _:
                 raise ValueError(f"there is no fault {line!r}; there are {', '.join(FAULTS)}")
+
+    def drop_rtde(self) -> None:
+        """Close the RTDE connections; the other ports live on."""
+        for writer in list(self._rtde):
+            writer.close()
 
     def weigh(self, payload_kg: float) -> None:
         """Have this payload set at the pendant."""
@@ -286,6 +277,16 @@ def _set_bias(controller: Controller, force_n: float) -> None:
     controller.robot.arm.bias_n[0] = force_n
 
 
+_WITHOUT_NUMBER: dict[str, Callable[[Controller], None]] = {
+    "protective-stop": lambda one: one.robot.protective_stop("requested by hand"),
+    "emergency-stop": lambda one: one.robot.emergency_stop(),
+    "release": lambda one: one.robot.release(),
+    "drop-rtde": Controller.drop_rtde,
+    "protect-abrupt-ends": lambda one: setattr(one.robot, "protects_abrupt_ends", True),
+    "protect-ends": lambda one: setattr(one.robot, "protects_ends", True),
+    "float-clock": lambda one: setattr(one.robot.registers, "counts_as_float", True),
+    "watchdog-waits": lambda one: setattr(one.robot.registers, "watchdog_waits", True),
+}
 # The range of each fault's number, what another number is, and how it begins.
 _WITH_NUMBER: dict[str, tuple[float, float, str, Callable[[Controller, float], None]]] = {
     "silence": (0.0, 86400.0, "not a time in seconds from 0 to 86400", Controller.silence),
@@ -297,13 +298,14 @@ _WITH_NUMBER: dict[str, tuple[float, float, str, Callable[[Controller, float], N
     ),
     "slow-braking": (
         *(0.01, 100.0, "not a deceleration in rad/s² from 0.01 to 100"),
-        lambda one, x: setattr(one.robot.arm, "braking_rad_per_s2", x),
+        lambda one, x: one.robot.arm.brake(x),
+    ),
+    "slow-arm": (
+        *(0.01, 100.0, "not a deceleration in rad/s² from 0.01 to 100"),
+        lambda one, x: one.robot.arm.brake(x, wrist=False),
     ),
     "bias": (-100.0, 100.0, "not a force in N from -100 to 100", _set_bias),
     "error-code": (1, 9999, "not a code from 1 to 9999", lambda one, code: one.report_error(int(code))),
     "hang": (0.0, 20.0, "not a mass in kg from 0 to 20", lambda one, x: setattr(one.robot.arm, "hung_kg", x)),
 }
-FAULTS = (
-    *("protective-stop", "emergency-stop", "release", "drop-rtde", "protect-abrupt-ends", "protect-ends"),
-    *("float-clock", "version", *_WITH_NUMBER, *_LASTING, "normal"),
-)
+FAULTS = (*_WITHOUT_NUMBER, "version", *_WITH_NUMBER, *_LASTING, "normal")

@@ -180,7 +180,8 @@ class Robot:
 
     def clear_faults(self) -> None:
         """Be safe and powered, without a program."""
-        self.protects_abrupt_ends = self.protects_ends = self.registers.counts_as_float = False
+        self.protects_abrupt_ends = self.protects_ends = False
+        self.registers.counts_as_float = self.registers.watchdog_waits = False
         self.arm.mend()
         self.end_program("the faults are cleared")
         self.robot_mode, self.safety_mode, self._power_step_s = MODE_RUNNING, SAFETY_NORMAL, math.inf

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from shearloop.drivers.ur.script import LOWER, UPPER
-from shearloop.emulators.ur_arm import Arm
+from shearloop.emulators.ur_arm import Arm, LinearMove
 from shearloop.emulators.urscript_names import E_SERIES_ONLY, check_names
 
 # An event's name and detail.
@@ -59,6 +59,8 @@ class Registers(defaultdict[str, float]):
         self.written_s: defaultdict[str, float] = defaultdict(float)
         # A fault: the script's clock loses what a sum of cycles in 32-bit floats loses after 17 minutes.
         self.counts_as_float = False
+        # A fault: a watchdog does not look while the arm moves straight.
+        self.watchdog_waits = False
 
     def write(self, name: str, value: float, now_s: float) -> None:
         """Set an input register, as a client does over RTDE."""
@@ -203,7 +205,8 @@ class Program:
             ProgramEndedError: the program ends.
         """
         self._step_s, self._events = step_s, []
-        for name, period_s in self._watchdogs.items():
+        waits = self._registers.watchdog_waits and isinstance(self._arm.motion, LinearMove)
+        for name, period_s in self._watchdogs.items() if not waits else ():
             # Writes from before the program count: the manual does not say that the time begins here.
             if now_s - self._registers.written_s[name] > period_s:
                 raise ProgramEndedError("the RTDE watchdog was not fed")

@@ -44,6 +44,8 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   float-clock             let the script's clock lose 2.3 %, as a sum of cycles in 32-bit floats does after 17 min
   velocity-noise RAD/S    report joint speeds with this noise
   slow-braking RAD/S²     brake no joint faster than this
+  slow-arm RAD/S²         brake no joint but the wrist faster than this
+  watchdog-waits          let the watchdog not look while the arm moves straight
   bias N                  report a force that nothing exerts
   hang KG                 hang a mass on the tool
   slider FRACTION         move the pendant's speed slider, 1 at its right end
@@ -58,7 +60,7 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
         "next frame: cut-line, wrong-count, nan, garbage; or to what follows: silence [SECONDS], unplug [SECONDS], "
-        "zero-channel [SECONDS]. "
+        "zero-channel [SECONDS]; late N sends each line N lines late. "
         "Starting the board ends a silence without a number; `normal` ends every fault."
     )
     frames = parser.add_argument_group("frames")
@@ -128,8 +130,8 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Prints the port's path, again each time it is plugged in. A fault's name on standard input applies to the "
         "next line: garbage, spike, torn; or to what follows: silence [SECONDS], saturation [SECONDS], stuck "
-        "[SECONDS], unplug [SECONDS]; `normal` ends them. `torque NM` sets the torque, `mass G` that of a "
-        "mass on the lever."
+        "[SECONDS], unplug [SECONDS], late N, each line N lines late; `normal` ends them. `torque NM` sets the "
+        "torque, `mass G` that of a mass on the lever."
     )
     add_option(parser, "--torque-nm", number(-1000.0, 1000.0), "NM", "the torque (default: %(default)s)", default=0.0)
     parser.add_argument("--paper-sketch", action="store_true", help="send N·m, as the paper's board did, not counts")

@@ -38,7 +38,7 @@ Commands, one a line on standard input:
   silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot
   unplug DEVICE [SECONDS]     disconnect a device, without a number until `replug DEVICE`
   weigh NM                    add a torque to the load cell's, on top of the tool's
-  flip load                   turn the load cell's sign
+  flip load|FINGERTIP         turn the sign of the load cell, or of a fingertip's shear
   right|left FAULT            any fault of `emulate eit-kit`, for instance right cut-line
   load FAULT                  any fault of `emulate hx711`, for instance load spike
   gripper drop|fault CODE|…   the tool falls; or any command of `emulate gripper-socket`

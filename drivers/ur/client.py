@@ -29,6 +29,8 @@ SettingsFor: TypeAlias = Callable[[str, str], UrSettings]
 EXIT_S = 3.0
 # The worker's own alarms end it at a known place; the daemon kills it this much later.
 GRACE_S = 1.0
+# The module of the worker process.
+WORKER = "shearloop.drivers.ur.worker"
 # The worker's activity once it sends states.
 CONTROLLING = "controlling"
 # The end of the worker's error output that a message quotes.
@@ -64,11 +66,14 @@ class UrRobot:
         *,
         warns: bool = True,
         settings_for: SettingsFor | None = None,
+        worker: str = WORKER,
     ) -> None:
         """`warns`: say at each connection that the deadlines are longer than promised.
 
-        `settings_for` returns the settings for a controller of this version and serial number, else these.
+        `settings_for` returns the settings for a controller of this version and serial number, else these. `worker` is
+        the module of the worker process.
         """
+        self._worker = worker
         self.settings = settings
         self._settings_for = settings_for
         self._promise = settings.warning if warns else ""
@@ -136,9 +141,7 @@ class UrRobot:
 
     async def _run_worker(self) -> None:
         connection = WorkerConnection(self.settings, self)
-        await asyncio.get_running_loop().subprocess_exec(
-            lambda: connection, sys.executable, "-m", "shearloop.drivers.ur.worker"
-        )
+        await asyncio.get_running_loop().subprocess_exec(lambda: connection, sys.executable, "-m", self._worker)
         connection.send(self.settings)
         self._send_held(connection)
         self._connection = connection

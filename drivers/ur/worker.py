@@ -13,6 +13,7 @@ import signal
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NoReturn
 
 from shearloop.drivers.ur import messages
@@ -93,8 +94,11 @@ class Pipe:
             self.open = False
 
 
-def main() -> NoReturn:
-    """Run until disconnected, or until the daemon or the controller is gone."""
+def main(adapted: Callable[[UrSettings], UrSettings] | None = None) -> NoReturn:
+    """Run until disconnected, or until the daemon or the controller is gone.
+
+    `adapted` returns the settings to drive with, where these are not the daemon's.
+    """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     # The daemon receives the terminal's and the service manager's signals too, and decides when to stop.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -107,6 +111,8 @@ def main() -> NoReturn:
         settings = receive_settings(pipe)
         if settings is None:
             _exit(EXIT_DONE)
+        if adapted is not None:
+            settings = adapted(settings)
         control(pipe, settings, connect(pipe, settings))
     except RobotLostError as error:
         pipe.send(messages.Failed(error.kind, str(error)))

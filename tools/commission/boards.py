@@ -1,26 +1,25 @@
-"""Stage 6: the boards that measure the tool: rate, noise and dead channels, the load cell's scale and lag."""
+"""Stage 6: the boards that measure the tool: rate, noise and dead channels, the load cell's scale and lag, clocks."""
 
-import asyncio
-import contextlib
 import math
 import statistics
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from typing import Final
 
 import numpy as np
 
 from shearloop.daemon.commissioning import Line
-from shearloop.daemon.config import FingertipConfig, LoadCellConfig
 from shearloop.daemon.sensing.sessions import fingertip_table
-from shearloop.drivers.connection import SerialLink
-from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.errors import UserError
+from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.context import Context
-from shearloop.tools.commission.listening import LoadCellListener
+from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GRIP_N, close_fingers, open_fingers
+from shearloop.tools.commission.listening import SILENT_S
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.report import Measured, judged
+from shearloop.tools.commission.tap import frame_step_s, judge_clocks, load_step_s, robot_step_s
 
 STAGE: Final = "6 boards"
 RATE_TOLERANCE: Final = 0.1
@@ -30,35 +29,76 @@ SCALE_TOLERANCE: Final = 0.02
 LOAD_SAMPLES: Final = 40
 # A torque that is known to 2 % has to be this many standard deviations high.
 _LEAST_NM: Final = 0.02
-_SLOW: Final = 5.0
+# Before and after a press each device has to show a level.
+_LEVEL_S: Final = 1.5
+_LEVEL_FRAMES: Final = 6
 
 
 def measure(context: Context) -> Measured:
     """Return the stage's lines."""
     config = context.config
+    if not config.fingertips and config.load_cell is None:
+        raise UserError("the configuration has no fingertip and no load cell, so that stage 6 measures nothing")
     lines: list[Line] = []
     context.operator.act("See that nothing touches the fingertips and that the load cell carries no load")
-    for name, fingertip in config.fingertips.items():
-        table = fingertip_table(fingertip)
-        frames = asyncio.run(_frames(fingertip, table.zero_slots, context.counts.frames))
-        lines += judge_frames(name, frames, fingertip.frame_period_s)
-    if config.load_cell is not None:
-        lines += _load_cell(context.operator, config.load_cell)
-    if not lines:
-        raise UserError("the configuration has no fingertip and no load cell, so that stage 6 measures nothing")
-    return Measured(lines)
+    with ExitStack() as opened:
+        fingertips = {name: opened.enter_context(context.rig.fingertip(name)) for name in config.fingertips}
+        load = opened.enter_context(context.rig.load_cell()) if config.load_cell is not None else None
+        for name, board in fingertips.items():
+            period_s = config.fingertips[name].frame_period_s
+            lines += judge_frames(name, board.take(context.counts.frames + 1, SILENT_S + period_s), period_s)
+        if load is not None and config.load_cell is not None:
+            lines += _weigh(context.operator, load, config.load_cell.rate_hz)
+        return Measured([*lines, *_clocks(context, fingertips, load)])
 
 
-async def _frames(fingertip: FingertipConfig, zero_slots: np.ndarray, count: int) -> list[Frame]:
-    board = EitKit(SerialLink(**fingertip.device.model_dump()), zero_slots, fingertip.frame_period_s)
-    frames: list[Frame] = []
-    async with asyncio.timeout(_SLOW * fingertip.frame_period_s * (count + 5)):
-        async with contextlib.aclosing(board.readings()) as readings:
-            async for frame in readings:
-                frames.append(frame)
-                if len(frames) > count:
-                    break
-    return frames
+def _clocks(
+    context: Context, fingertips: Mapping[str, Arrivals[Frame]], load: Arrivals[LoadSample] | None
+) -> list[Line]:
+    """Return the lines on the clocks, with a tool in the grip that the operator presses."""
+    context.operator.act("Put the tool on the load cell's lever, between the open fingers")
+    with ExitStack() as opened:
+        hand = opened.enter_context(context.rig.hand()) if context.config.gripper is not None else None
+        if hand is not None:
+            context.operator.allow(
+                f"the fingers close onto the tool at {FINGERS_MM_PER_S:g} mm/s with at most {GRIP_N:g} N, and open "
+                "after the press"
+            )
+            hand.activate()
+            if close_fingers(hand, GRIP_N).diameter_mm is None:
+                raise UserError("the gripper holds nothing: put the tool between its fingers, and run the stage again")
+        lines = _press(context, fingertips, load)
+        if hand is not None:
+            open_fingers(hand, GRIP_N)
+    return lines
+
+
+def _press(
+    context: Context, fingertips: Mapping[str, Arrivals[Frame]], load: Arrivals[LoadSample] | None
+) -> list[Line]:
+    """Have the tool pressed once, and return the lines on the moments at which the devices saw it."""
+    config = context.config
+    slowest_s = max([own.frame_period_s for own in config.fingertips.values()], default=0.0)
+    level_s = _LEVEL_S + _LEVEL_FRAMES * slowest_s
+    context.operator.say(f"Keep away from the tool for {level_s:.0f} s.")
+    context.observer.forget()
+    begun_ns = context.clock.now_ns()
+    context.observer.listen(level_s)
+    context.operator.act(
+        "Press the tool about the wrist's axis, quickly and by about 0.1 N·m, and keep the pressure until the next line"
+    )
+    context.observer.listen(level_s)
+    found = {
+        name: frame_step_s(board.since(begun_ns), fingertip_table(config.fingertips[name]))
+        for name, board in fingertips.items()
+    }
+    load_s = load_step_s(load.since(begun_ns)) if load is not None else None
+    reference = "the robot's wrench", robot_step_s(context.observer.since(begun_ns))
+    if not context.settings.facts.zeroes_wrench and found:
+        # Forces that are estimated from the joints' currents are too noisy.
+        name = next(iter(found))
+        reference = name, found.pop(name)
+    return judge_clocks(reference, found, load_s, config.load_cell.rate_hz if config.load_cell is not None else 0.0)
 
 
 def judge_frames(name: str, frames: Sequence[Frame], period_s: float) -> list[Line]:
@@ -96,20 +136,15 @@ def judge_frames(name: str, frames: Sequence[Frame], period_s: float) -> list[Li
     ]
 
 
-def _load_cell(operator: Operator, config: LoadCellConfig) -> list[Line]:
-    with LoadCellListener(config) as load:
-        return _weigh(operator, load, config)
-
-
-def _weigh(operator: Operator, load: LoadCellListener, config: LoadCellConfig) -> list[Line]:
+def _weigh(operator: Operator, load: Arrivals[LoadSample], rate_hz: float) -> list[Line]:
     """Return the lines on the load cell, without and with a known torque."""
-    rest = load.wait(time.monotonic_ns(), LOAD_SAMPLES)
+    rest = load.take(LOAD_SAMPLES, SILENT_S)
     known_nm = operator.number(
         "Load the lever with a known torque and let it rest; its size in N·m (mass × 9.81 × arm)", _LEAST_NM, 5.0
     )
-    loaded = load.wait(time.monotonic_ns(), LOAD_SAMPLES)
+    loaded = load.take(LOAD_SAMPLES, SILENT_S)
     operator.act("Take the known torque off")
-    return judge_load(rest, loaded, known_nm, config.rate_hz)
+    return judge_load(rest, loaded, known_nm, rate_hz)
 
 
 def judge_load(rest: Sequence[LoadSample], loaded: Sequence[LoadSample], known_nm: float, rate_hz: float) -> list[Line]:

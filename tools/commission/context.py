@@ -10,13 +10,17 @@ from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.script import UPPER, ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
+from shearloop.tools.commission.arrivals import Clock
 from shearloop.tools.commission.bounds import bounded
+from shearloop.tools.commission.limits import TimeLimits, limits_for
 from shearloop.tools.commission.mover import Mover
-from shearloop.tools.commission.observer import Observer
+from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.operator import Operator
+from shearloop.tools.commission.rig import Rig
 
 # With fewer stops of each layer a report raises no speed.
 STOPS_NEEDED: Final = 5
+_STOPS_WITHIN_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +44,11 @@ class Counts:
 
 @dataclass(slots=True)
 class Context:
-    """One commissioning: configuration, settings, operator, report so far, and the two processes on the robot."""
+    """One commissioning: configuration, settings, devices, operator, report so far, and the two ends on the robot."""
 
     config: DaemonConfig
     settings: UrSettings
+    rig: Rig
     controller: ControllerInfo
     operator: Operator
     report: Report
@@ -51,8 +56,18 @@ class Context:
     opened: ExitStack
     _observer: Observer | None = field(default=None, init=False)
     _mover: Mover | None = field(default=None, init=False)
-    # The wrist's angle that the operator confirmed.
-    _pose_rad: float | None = field(default=None, init=False)
+    # Where the arm stood when the operator confirmed it.
+    _confirmed: Seen | None = field(default=None, init=False)
+
+    @property
+    def clock(self) -> Clock:
+        """The rig's time."""
+        return self.rig.clock
+
+    @property
+    def limits(self) -> TimeLimits:
+        """The limits on times."""
+        return limits_for(self.config)
 
     @property
     def registers(self) -> ScriptRegisters:
@@ -63,32 +78,49 @@ class Context:
     def observer(self) -> Observer:
         """The observer, which is started when it is first needed."""
         if self._observer is None:
-            watched = Observer(self.settings.host, self.settings.rate_hz, self.registers)
-            self._observer = self.opened.enter_context(watched)
+            self._observer = self.opened.enter_context(self.rig.observer(self.registers))
         return self._observer
 
     @property
     def mover(self) -> Mover:
-        """The process that drives the robot, which is started when it is first needed."""
+        """What drives the robot, which is started when it is first needed."""
         if self._mover is None:
             here_rad = self.observer.latest().wrist_rad
-            self._mover = self.opened.enter_context(Mover(bounded(self.settings, here_rad)))
+            self._mover = self.opened.enter_context(self.rig.mover(bounded(self.settings, here_rad)))
         return self._mover
 
     @property
-    def pose_rad(self) -> float:
-        """The wrist's angle about which motions are allowed; the operator confirms it once."""
-        if self._pose_rad is None:
-            here_rad = self.observer.latest().wrist_rad
+    def confirmed(self) -> Seen:
+        """A sample of the pose about which motions are allowed; the operator confirms it once."""
+        if self._confirmed is None:
+            here = self.observer.latest()
             self.operator.act(
-                f"Wrist 3 stands at {here_rad:.3f} rad. Check that the arm stands free, that the tool may turn by "
-                "0.1 rad either way and move 20 mm along its axis, and that no cable wraps about the wrist"
+                f"Wrist 3 stands at {here.wrist_rad:.3f} rad. Check that the arm stands free, that the tool may turn "
+                "by 0.1 rad either way and move 20 mm along its axis, and that no cable wraps about the wrist"
             )
-            self._pose_rad = here_rad
-        return self._pose_rad
+            self._confirmed = here
+        return self._confirmed
+
+    @property
+    def pose_rad(self) -> float:
+        """The wrist's angle in the confirmed pose."""
+        return self.confirmed.wrist_rad
+
+    def stop_program(self) -> bool:
+        """Stop the program on the robot; return whether it stopped."""
+        self.rig.stop_program()
+        since_ns = self.clock.now_ns()
+        return self.observer.wait_for(lambda seen: not seen.plays, since_ns, _STOPS_WITHIN_S) is not None
+
+    def comes_to_rest(self, within_s: float) -> Seen:
+        """Wait until the arm rests, and return a sample at rest; raises UserError where it does not come to rest."""
+        seen = self.observer.comes_to_rest(self.settings.rest_rad_per_s, within_s)
+        if seen is None:
+            raise UserError("the arm does not come to rest: look at the teach pendant")
+        return seen
 
     def ready(self) -> Mover:
-        """Return the process once the robot is ready to move; raises UserError."""
+        """Return what drives the robot once the robot is ready to move; raises UserError."""
         if refusal := self.mover.unlock():
             raise UserError(f"the robot does not get ready: {refusal}")
         return self.mover

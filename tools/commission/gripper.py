@@ -1,25 +1,19 @@
 """Stage 2: the gripper: activation, the time of an exchange, a table of widths, and the detection of objects."""
 
-import asyncio
-import math
-import time
 from collections.abc import Sequence
 from typing import Final
 
 from shearloop.daemon.commissioning import Line, Supplied
 from shearloop.daemon.config import GripperConfig
-from shearloop.daemon.rig import gripper_calibration, make_gripper_client, patience_of
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
-from shearloop.drivers.robotiq.messages import GripperCommand, GripperState
+from shearloop.drivers.robotiq.gripper import WidthCalibration
+from shearloop.drivers.robotiq.messages import GripperState
 from shearloop.tools.commission.context import Context
-from shearloop.tools.commission.report import Measured, judged
+from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GENTLE_N, Hand, close_fingers, open_fingers
+from shearloop.tools.commission.report import Measured, judged, percentile_99
 
 STAGE: Final = "2 gripper"
-LONGEST_EXCHANGE_S: Final = 0.08
 WIDTH_MM: Final = 1.0
-_GENTLE_N: Final = 20.0
-_SPEED_MM_PER_S: Final = 60.0
 
 
 def measure(context: Context) -> Measured:
@@ -27,62 +21,53 @@ def measure(context: Context) -> Measured:
     config = context.config.gripper
     if config is None:
         return Measured([Line(what="gripper", value="none is configured")])
-    return asyncio.run(_measure(context, config))
-
-
-async def _measure(context: Context, config: GripperConfig) -> Measured:
-    hand = RobotiqGripper(make_gripper_client(config, patience_of(context.config)), gripper_calibration(config))
     context.operator.allow(
         "the gripper opens and closes its fingers once over the whole stroke, unless it is active already; nothing is "
         "between them"
     )
-    try:
-        await hand.connect()
-        await hand.activate(operator_confirmed=True)
-        lines = [await _exchanges(hand, context.counts.exchanges)]
-        gauges = await _gauges(context, hand)
-        width_line, supplies = judge_widths(gauges, config)
-        return Measured([*lines, width_line, *await _objects(context, hand)], supplies)
-    finally:
-        await hand.close()
+    with context.rig.hand() as hand:
+        hand.activate(operator_confirmed=True)
+        lines = [_exchanges(context, hand)]
+        width_line, supplies = judge_widths(_gauges(context, hand), config)
+        return Measured([*lines, width_line, *_objects(context, hand)], supplies)
 
 
-async def _exchanges(hand: RobotiqGripper, count: int) -> Line:
+def _exchanges(context: Context, hand: Hand) -> Line:
+    count, longest_s = context.counts.exchanges, context.limits.longest_exchange_s
     times_s = []
     for _ in range(count):
-        begun_s = time.monotonic()
-        await hand.read()
-        times_s.append(time.monotonic() - begun_s)
-    p99_s = sorted(times_s)[math.ceil(0.99 * count) - 1]
+        begun_ns = context.clock.now_ns()
+        hand.read()
+        times_s.append((context.clock.now_ns() - begun_ns) / 1e9)
+    p99_s = percentile_99(times_s)
     return judged(
         "exchange with the gripper, p99",
         f"{1e3 * p99_s:.1f} ms",
-        f"below {1e3 * LONGEST_EXCHANGE_S:g} ms",
+        f"below {1e3 * longest_s:g} ms",
         "its state is younger than 0.25 s",
-        passed=p99_s < LONGEST_EXCHANGE_S,
+        passed=p99_s < longest_s,
         count=count,
     )
 
 
-async def _gauges(context: Context, hand: RobotiqGripper) -> list[tuple[float, float]]:
+def _gauges(context: Context, hand: Hand) -> list[tuple[float, float]]:
     """Return (counts, mm) of gauges that the gripper held."""
     gauges = []
     for number in range(1, context.counts.gauges + 1):
         question = f"Hold gauge {number} of {context.counts.gauges} between the fingers; its width in mm"
-        width_mm = await asyncio.to_thread(context.operator.number, question, 0.5, hand.model.stroke_mm)
-        state = await _close_and_open(context, hand, f"gauge {number}")
+        width_mm = context.operator.number(question, 0.5, hand.model.stroke_mm)
+        state = _close_and_open(context, hand, f"gauge {number}")
         gauges.append((float(state.position_counts), width_mm))
     return gauges
 
 
-async def _close_and_open(context: Context, hand: RobotiqGripper, what: str) -> GripperState:
+def _close_and_open(context: Context, hand: Hand, what: str) -> GripperState:
     """Close onto something, open again, and return the closed gripper's state."""
-    await asyncio.to_thread(
-        context.operator.allow,
-        f"the fingers close at {_SPEED_MM_PER_S:g} mm/s with at most {_GENTLE_N:g} N onto {what}, then open",
+    context.operator.allow(
+        f"the fingers close at {FINGERS_MM_PER_S:g} mm/s with at most {GENTLE_N:g} N onto {what}, then open"
     )
-    closed = await hand.finish(await hand.move(GripperCommand(0.0, _SPEED_MM_PER_S, _GENTLE_N)))
-    await hand.finish(await hand.move(GripperCommand(hand.model.stroke_mm, _SPEED_MM_PER_S, _GENTLE_N)))
+    closed = close_fingers(hand)
+    open_fingers(hand)
     return closed
 
 
@@ -99,17 +84,16 @@ def judge_widths(gauges: Sequence[tuple[float, float]], config: GripperConfig) -
     return line, Supplied(widths=tuple(gauges)) if passed else Supplied()
 
 
-async def _objects(context: Context, hand: RobotiqGripper) -> list[Line]:
+def _objects(context: Context, hand: Hand) -> list[Line]:
     """Return the lines on objects that are held, and on nothing that is held."""
     count, seen = context.counts.objects, 0
     for number in range(1, count + 1):
-        await asyncio.to_thread(
-            context.operator.act,
-            f"Hold object {number} of {count} between the fingers: a thin, a thick, a soft, a hard one",
+        context.operator.act(
+            f"Hold object {number} of {count} between the fingers: a thin, a thick, a soft, a hard one"
         )
-        seen += (await _close_and_open(context, hand, f"object {number}")).diameter_mm is not None
-    await asyncio.to_thread(context.operator.act, "Take everything out of the gripper")
-    empty = (await _close_and_open(context, hand, "nothing")).diameter_mm is None
+        seen += _close_and_open(context, hand, f"object {number}").diameter_mm is not None
+    context.operator.act("Take everything out of the gripper")
+    empty = _close_and_open(context, hand, "nothing").diameter_mm is None
     return [
         judged(
             "objects that are detected",

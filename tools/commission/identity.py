@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from shearloop.daemon.commissioning import Line
 from shearloop.daemon.config import DaemonConfig, SerialDevice
-from shearloop.drivers.ur.control_box import ControllerInfo, RtdeReceiver, untested_sentence
+from shearloop.drivers.ur.control_box import ControllerInfo, untested_sentence
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.tools.commission.context import Context
@@ -28,16 +28,9 @@ class Identity:
 
 def measure(context: Context) -> Measured:
     """Return the stage's lines; raises RobotLostError if the controller does not answer."""
-    settings = context.settings
     checksum = context.operator.ask(CHECKSUM_QUESTION)
-    receiver = RtdeReceiver(
-        settings.host, settings.rate_hz, settings.connect_timeout_s, context.registers, writes=False
-    )
-    try:
-        outputs = receiver.latest()
-    finally:
-        receiver.close()
-    return Measured(judge_identity(Identity(context.controller, outputs, checksum), settings, context.config))
+    found = Identity(context.controller, context.rig.outputs(context.registers), checksum)
+    return Measured(judge_identity(found, context.settings, context.config))
 
 
 def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfig) -> tuple[Line, ...]:

@@ -12,7 +12,7 @@ from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.observer import WRIST, Seen
-from shearloop.tools.commission.report import Measured, judged
+from shearloop.tools.commission.report import Measured, judged, percentile_99
 
 STAGE: Final = "3 empty gripper"
 SPEED_RAD_PER_S: Final = 0.2
@@ -77,12 +77,12 @@ def measure(context: Context) -> Measured:
     mover.move("turn", rad_per_s=-speed, to_rad=middle_rad - TURN_RAD)
     for number in range(count):
         sign = 1.0 if number % 2 == 0 else -1.0
-        _come_to_rest(context)
+        context.comes_to_rest(_COMES_TO_REST_S)
         asked_ns = mover.request("turn", rad_per_s=sign * speed, to_rad=middle_rad + sign * TURN_RAD)
         sent = mover.event("sent", asked_ns, _COMES_TO_REST_S)
         if (refusal := mover.ended(asked_ns)) or sent is None:
             raise UserError(f"the wrist did not turn: {refusal}")
-        _come_to_rest(context)
+        context.comes_to_rest(_COMES_TO_REST_S)
         turns.append(Turn(sent["t_ns"], sign * speed, context.observer.since(sent["t_ns"])))
         context.observer.forget()
     lines, supplies = judge_turns(turns, context, SIGMAS * sigma_rad_per_s)
@@ -108,11 +108,11 @@ def judge_noise(samples: Sequence[Seen], rest_rad_per_s: float) -> tuple[Line, f
 
 def judge_turns(turns: Sequence[Turn], context: Context, noise_rad_per_s: float) -> tuple[list[Line], Supplied]:
     """Return the lines on delay, tracking and acceleration, and the delays."""
-    settings = context.settings
+    settings, longest_s = context.settings, context.limits.reaction_s(context.settings)
     # The ramp takes some milliseconds to a speed that noise does not have.
     threshold = max(noise_rad_per_s, 0.02 * SPEED_RAD_PER_S)
-    delays_s = sorted(turn.delay_s(threshold) for turn in turns)
-    p99_s = delays_s[math.ceil(0.99 * len(delays_s)) - 1]
+    delays_s = [turn.delay_s(threshold) for turn in turns]
+    p99_s = percentile_99(delays_s)
     fractions = [one for turn in turns for one in turn.cruise()]
     reached = statistics.mean(fractions) if fractions else 0.0
     acceleration = max(turn.largest_acceleration() for turn in turns)
@@ -122,9 +122,10 @@ def judge_turns(turns: Sequence[Turn], context: Context, noise_rad_per_s: float)
         judged(
             "command to motion, p99",
             f"{1e3 * p99_s:.1f} ms (median {1e3 * statistics.median(delays_s):.1f})",
-            f"at most reaction_s, {1e3 * settings.reaction_s:g} ms",
+            f"at most {'reaction_s' if longest_s == settings.reaction_s else 'for an emulated rig'}, "
+            f"{1e3 * longest_s:g} ms",
             "the wrist brakes within its range",
-            passed=p99_s <= settings.reaction_s,
+            passed=p99_s <= longest_s,
             count=len(delays_s),
         ),
         judged(
@@ -173,11 +174,3 @@ def _slider(context: Context) -> Line:
         "the loop's gain",
         passed="slider" in refusal,
     )
-
-
-def _come_to_rest(context: Context) -> None:
-    seen = context.observer.rest_since(
-        context.observer.latest().made_ns, context.settings.rest_rad_per_s, _COMES_TO_REST_S
-    )
-    if seen is None:
-        raise UserError("the arm does not come to rest: look at the teach pendant")

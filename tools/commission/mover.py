@@ -1,4 +1,4 @@
-"""The commissioning's end of `mover_process`: requests, events, and a clean start after each kill."""
+"""The commissioning's end of what drives the robot: requests, events, and a clean start after each kill."""
 
 import contextlib
 import json
@@ -7,19 +7,20 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from types import TracebackType
 from typing import Any, Final, Self
 
 from shearloop.drivers.ur.messages import encode
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
+from shearloop.tools.commission.arrivals import REAL_CLOCK, Arrivals, Clock
 
 Event = dict[str, Any]
 # A controller unlocks a protective stop after 5 s; a worker starts and connects within some seconds more.
 READY_WITHIN_S: Final = 30.0
 _AGAIN_S: Final = 1.0
+WATCHDOG_WORKER: Final = "shearloop.tools.commission.watchdog_worker"
 _ENDS_WITHIN_S: Final = 6.0
 
 
@@ -27,17 +28,84 @@ class MoveRefusedError(UserError):
     """The robot did not carry out a motion; the message says why."""
 
 
-class Mover:
-    """Drives the robot through a process of its own; a context, which ends the process at its end."""
+class Mover(ABC):
+    """Drives the robot by requests, which `shearloop.tools.commission.mover_process` carries out."""
 
-    def __init__(self, settings: UrSettings) -> None:
+    def __init__(self, settings: UrSettings, clock: Clock = REAL_CLOCK) -> None:
         """Take the settings whose limits bound every motion; nothing is started yet."""
         self.settings = settings
+        self.events: Arrivals[Event] = Arrivals(lambda event: int(event["t_ns"]), clock)
+
+    @abstractmethod
+    def start(self, *, watchdog_alone: bool = False) -> None:
+        """Start what drives the robot; it sends the program to the robot where the robot is ready.
+
+        `watchdog_alone`: without a worker, only the robot's watchdog ends a straight move in time.
+        """
+
+    @abstractmethod
+    def kill(self) -> None:
+        """End what drives the robot at once, also where it is stopped."""
+
+    @abstractmethod
+    def stop_worker(self) -> int:
+        """Stop the worker process by SIGSTOP, so that the robot's watchdog gets no commands; return the time."""
+
+    @abstractmethod
+    def send(self, request: Event) -> None:
+        """Send a request."""
+
+    def restart(self, *, watchdog_alone: bool = False) -> None:
+        """End what drives the robot, and start it again."""
+        self.kill()
+        self.start(watchdog_alone=watchdog_alone)
+
+    def event(self, kind: str, since_ns: int, within_s: float) -> Event | None:
+        """Return the first event of a kind since a moment, or None after `within_s`."""
+        return self.events.wait_for(lambda event: event["event"] == kind, since_ns, within_s)
+
+    def request(self, do: str, **arguments: object) -> int:
+        """Send a request without waiting for its end; return its time."""
+        asked_ns = self.events.clock.now_ns()
+        self.send({"do": do, **arguments})
+        return asked_ns
+
+    def ended(self, asked_ns: int, within_s: float = READY_WITHIN_S) -> str:
+        """Return why a request was refused or ended early, or an empty string."""
+        event = self.event("ended", asked_ns, within_s)
+        if event is not None:
+            return str(event["refusal"])
+        lost = self.event("lost", asked_ns, 0.0)
+        return str(lost["sentence"]) if lost is not None else f"the robot did not answer within {within_s:g} s"
+
+    def unlock(self, within_s: float = READY_WITHIN_S) -> str:
+        """Make the robot ready, again while it refuses; return why it is not ready, or an empty string."""
+        clock = self.events.clock
+        until_ns = clock.now_ns() + round(1e9 * within_s)
+        while True:
+            left_s = (until_ns - clock.now_ns()) / 1e9
+            refusal = self.ended(self.request("unlock"), max(1.0, left_s))
+            if not refusal or clock.now_ns() + _AGAIN_S * 1e9 >= until_ns:
+                return refusal
+            clock.sleep(_AGAIN_S)
+
+    def move(self, do: str, **arguments: object) -> int:
+        """Carry out a motion to its end; return when it was asked for. Raises MoveRefusedError."""
+        asked_ns = self.request(do, **arguments)
+        if refusal := self.ended(asked_ns):
+            raise MoveRefusedError(f"the motion was not carried out: {refusal}")
+        return asked_ns
+
+
+class MoverProcess(Mover):
+    """Drives the robot through a process of its own, which can die; a context, which ends the process at its end."""
+
+    def __init__(self, settings: UrSettings) -> None:
+        """Take the settings; nothing is started yet."""
+        super().__init__(settings)
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
         self._worker = 0
-        self._events: list[Event] = []
-        self._changed = threading.Condition()
 
     def __enter__(self) -> Self:
         """Start the process."""
@@ -48,15 +116,25 @@ class Mover:
         self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
     ) -> None:
         """Stop the arm and end the process."""
-        self.end()
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_ENDS_WITHIN_S)
+        self.kill()
 
-    def start(self) -> None:
-        """Start a process and its worker, which sends the program to the robot where the robot is ready."""
+    def start(self, *, watchdog_alone: bool = False) -> None:
+        """Start a process and its worker."""
         command = [sys.executable, "-m", "shearloop.tools.commission.mover_process"]
+        command += [WATCHDOG_WORKER] if watchdog_alone else []
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._write(encode(self.settings).decode())
         self._reader = threading.Thread(target=self._read, args=(self._process,), name="mover", daemon=True)
         self._reader.start()
+
+    def send(self, request: Event) -> None:
+        """Send a request."""
+        self._write(f"{json.dumps(request)}\n")
 
     def _write(self, line: str) -> None:
         if self._process is None or self._process.stdin is None:
@@ -72,23 +150,12 @@ class Mover:
             return
         for line in process.stdout:
             event: Event = json.loads(line)
-            with self._changed:
-                if event["event"] == "connected":
-                    self._worker = event["worker"]
-                self._events.append(event)
-                self._changed.notify_all()
-
-    def end(self) -> None:
-        """End the process: it stops the arm first."""
-        if self._process is not None and self._process.stdin is not None:
-            with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.close()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(_ENDS_WITHIN_S)
-        self.kill()
+            if event["event"] == "connected":
+                self._worker = event["worker"]
+            self.events.add(event)
 
     def kill(self) -> None:
-        """End the process and its worker at once; a stopped one ends too."""
+        """End the process and its worker at once."""
         for pid in (self._process.pid if self._process is not None else 0, self._worker):
             if pid:
                 with contextlib.suppress(ProcessLookupError):
@@ -106,54 +173,7 @@ class Mover:
         self._process = self._reader = None
 
     def stop_worker(self) -> int:
-        """Stop the worker process by SIGSTOP, so that the robot's watchdog gets no commands; return the time."""
-        stopped_ns = time.monotonic_ns()
+        """Stop the worker process; return the time."""
+        stopped_ns = self.events.clock.now_ns()
         os.kill(self._worker, signal.SIGSTOP)
         return stopped_ns
-
-    def event(self, kind: str, since_ns: int, within_s: float) -> Event | None:
-        """Return the first event of a kind since a moment, or None after `within_s`."""
-
-        def found() -> Event | None:
-            return next((one for one in self._events if one["event"] == kind and one["t_ns"] >= since_ns), None)
-
-        return self._wait(found, within_s)
-
-    def _wait(self, found: Callable[[], Event | None], within_s: float) -> Event | None:
-        until_s = time.monotonic() + within_s
-        with self._changed:
-            while (event := found()) is None:
-                left_s = until_s - time.monotonic()
-                if left_s <= 0 or not self._changed.wait(left_s):
-                    return None
-            return event
-
-    def request(self, do: str, **arguments: object) -> int:
-        """Send a request without waiting for its end; return its time."""
-        asked_ns = time.monotonic_ns()
-        self._write(f"{json.dumps({'do': do, **arguments})}\n")
-        return asked_ns
-
-    def ended(self, asked_ns: int, within_s: float = READY_WITHIN_S) -> str:
-        """Return why a request was refused or ended early, or an empty string."""
-        event = self.event("ended", asked_ns, within_s)
-        if event is not None:
-            return str(event["refusal"])
-        lost = self.event("lost", asked_ns, 0.0)
-        return str(lost["sentence"]) if lost is not None else f"the robot did not answer within {within_s:g} s"
-
-    def unlock(self, within_s: float = READY_WITHIN_S) -> str:
-        """Make the robot ready, again while it refuses; return why it is not ready, or an empty string."""
-        until_s = time.monotonic() + within_s
-        while (refusal := self.ended(self.request("unlock"), max(1.0, until_s - time.monotonic()))) and (
-            time.monotonic() + _AGAIN_S < until_s
-        ):
-            time.sleep(_AGAIN_S)
-        return refusal
-
-    def move(self, do: str, **arguments: object) -> int:
-        """Carry out a motion to its end; return when it was asked for. Raises MoveRefusedError."""
-        asked_ns = self.request(do, **arguments)
-        if refusal := self.ended(asked_ns):
-            raise MoveRefusedError(f"the motion was not carried out: {refusal}")
-        return asked_ns

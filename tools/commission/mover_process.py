@@ -1,7 +1,8 @@
 """The process in the daemon's place: it drives the robot by the daemon's own client, and can be killed or stopped.
 
-`python -m shearloop.tools.commission.mover_process`: the robot's settings in the first line of the input, then one
-request a line in JSON; events a line in JSON. At the end of the input it stops the arm and disconnects.
+`python -m shearloop.tools.commission.mover_process [WORKER]`: the robot's settings in the first line of the input, then
+one request a line in JSON; events a line in JSON. At the end of the input it stops the arm and disconnects. WORKER is
+the module of the robot's process, by default the daemon's own.
 """
 
 import asyncio
@@ -11,23 +12,26 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from shearloop.drivers.connection import LinkMonitor
-from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.client import WORKER, UrRobot
 from shearloop.drivers.ur.messages import (
     ARRIVED,
+    Command,
     CommandReply,
     MessageDecoder,
     MoveLinear,
+    RobotState,
     Stop,
     Unlock,
     WristSpeed,
     tool_axis,
 )
 from shearloop.drivers.ur.settings import UrSettings
+from shearloop.tools.commission.bounds import LARGEST_M
 
 # What a request may bring about at full speed: signals to the worker process, then to this one.
 CAUSES: Final[Mapping[str, tuple[signal.Signals | None, signal.Signals | None]]] = {
@@ -37,139 +41,187 @@ CAUSES: Final[Mapping[str, tuple[signal.Signals | None, signal.Signals | None]]]
     "daemon stopped": (None, signal.SIGSTOP),
     "daemon and worker killed": (signal.SIGKILL, signal.SIGKILL),
 }
-# A wrist at this share of its speed turns at full speed.
+# At this share of its speed a motion is at full speed.
 _FULL: Final = 0.95
 # A motion that has not ended by then is stopped.
 _LONGEST_S: Final = 30.0
 LINE_M_PER_S2: Final = 0.3
+_ROUNDING_M: Final = 1e-6
 
 
-class Mover:
+class DrivenRobot(Protocol):
+    """The daemon's client of a robot, as far as requests need it."""
+
+    state: RobotState | None
+
+    def next_state(self) -> Awaitable[RobotState]:
+        """Return the next state."""
+
+    def send(self, command: Command) -> Awaitable[CommandReply]:
+        """Send a command at once and return its reply."""
+
+    def keep_moving(self) -> None:
+        """Let a straight move that is under way go on."""
+
+
+class Surroundings(Protocol):
+    """What a driver needs beside the robot: the time, a place for its events, and what ends a motion."""
+
+    def now_ns(self) -> int:
+        """Return the monotonic time in ns."""
+
+    def report(self, event: str, **facts: object) -> None:
+        """Tell the commissioning of an event, with its time."""
+
+    def bring_about(self, cause: str) -> None:
+        """Do what `CAUSES` says."""
+
+
+class Driver:
     """Carries out one request after the other."""
 
-    def __init__(self, settings: UrSettings) -> None:
-        self._settings = settings
-        self.robot = UrRobot(settings, LinkMonitor(), warns=False)
-        self._reported_worker = 0
+    def __init__(self, settings: UrSettings, robot: DrivenRobot, around: Surroundings) -> None:
+        """Take the settings whose accelerations count, and the robot."""
+        self._settings, self._robot, self._around = settings, robot, around
 
     @property
     def _acceleration_rad_per_s2(self) -> float:
         return self._settings.limits.wrist_acceleration_rad_per_s2.inner
 
-    async def watch(self) -> None:
-        """Report each new worker process, and each loss of the robot."""
-        losses = 0
-        while True:
-            await self.robot.next_state()
-            worker = worker_pid()
-            if worker and worker != self._reported_worker:
-                self._reported_worker = worker
-                report("connected", worker=worker)
-            if self.robot.losses.total() != losses:
-                losses = self.robot.losses.total()
-                report("lost", sentence=self.robot.monitor.latest.sentence)
-
     async def handle(self, request: Mapping[str, Any]) -> None:
         """Carry out one request, and report its end."""
-        while self.robot.state is None:
-            await self.robot.next_state()
+        while self._robot.state is None:
+            await self._robot.next_state()
+        cause = request.get("cause", "")
         match request["do"]:
             case "unlock":
-                reply = await self.robot.send(Unlock())
+                reply = await self._robot.send(Unlock())
             case "turn":
-                reply = await self._turn(request["rad_per_s"], request["to_rad"], request.get("cause", ""))
+                reply = await self._turn(request["rad_per_s"], request["to_rad"], cause)
             case "swing":
                 reply = await self._swing(request["rad_per_s"], request["middle_rad"], request["by_rad"])
             case "line":
-                reply = await self._line(request["metres"], request["m_per_s"])
+                reply = await self._line(request["metres"], request["m_per_s"], cause)
             case _:
                 reply = await self._stop()
-        report("ended", do=request["do"], refusal=reply.refusal)
+        self._around.report("ended", do=request["do"], refusal=reply.refusal)
 
     async def _stop(self) -> CommandReply:
         """Stop, and return once the arm rests."""
-        reply = await self.robot.send(Stop(self._acceleration_rad_per_s2))
-        while reply.accepted and (await self.robot.next_state()).motion != "idle":
+        reply = await self._robot.send(Stop(self._acceleration_rad_per_s2))
+        while reply.accepted and (await self._robot.next_state()).motion != "idle":
             continue
         return reply
 
-    async def _send_speed(self, rad_per_s: float) -> CommandReply:
-        """Send a wrist speed that was decided now; report the time of the first one of a motion."""
-        decided_ns = time.monotonic_ns()
-        return await self.robot.send(WristSpeed(rad_per_s, self._acceleration_rad_per_s2, decided_ns))
+    async def _keep_turning(self, rad_per_s: float, decide: Callable[[RobotState], float]) -> CommandReply:
+        """Turn the wrist at a speed that `decide` renews with each state; it stops the wrist by 0."""
+        until_ns = self._around.now_ns() + _LONGEST_S * 1e9
+        while rad_per_s and self._around.now_ns() < until_ns:
+            speed = WristSpeed(rad_per_s, self._acceleration_rad_per_s2, self._around.now_ns())
+            reply = await self._robot.send(speed)
+            if not reply.accepted:
+                return reply
+            state = await self._robot.next_state()
+            if state.motion != "wrist":
+                return CommandReply(refusal=state.end_reason or state.blocked)
+            rad_per_s = decide(state)
+        return await self._stop()
 
     async def _turn(self, rad_per_s: float, to_rad: float, cause: str) -> CommandReply:
         """Turn the wrist past an angle and stop, unless a cause comes at full speed."""
-        until_s = time.monotonic() + _LONGEST_S
-        report("sent", rad_per_s=rad_per_s)
-        reply = await self._send_speed(rad_per_s)
-        while reply.accepted and time.monotonic() < until_s:
-            state = await self.robot.next_state()
-            if state.motion != "wrist":
-                return CommandReply(refusal=state.end_reason or state.blocked)
+        self._around.report("sent", rad_per_s=rad_per_s)
+
+        def decide(state: RobotState) -> float:
+            nonlocal cause
             if cause and abs(state.wrist_speed_rad_per_s) > _FULL * abs(rad_per_s):
-                bring_about(cause)
+                self._around.bring_about(cause)
                 cause = ""
-            if (state.wrist_rad - to_rad) * rad_per_s >= 0:
-                return await self._stop()
-            reply = await self._send_speed(rad_per_s)
-        return reply if not reply.accepted else await self._stop()
+            return 0.0 if (state.wrist_rad - to_rad) * rad_per_s >= 0 else rad_per_s
+
+        return await self._keep_turning(rad_per_s, decide)
 
     async def _swing(self, rad_per_s: float, middle_rad: float, by_rad: float) -> CommandReply:
         """Turn to and fro until something else stops the wrist."""
-        until_s = time.monotonic() + _LONGEST_S
-        reply = await self._send_speed(rad_per_s)
-        while reply.accepted and time.monotonic() < until_s:
-            state = await self.robot.next_state()
-            if state.motion != "wrist":
-                return CommandReply(refusal=state.end_reason or state.blocked)
+
+        def decide(state: RobotState) -> float:
+            nonlocal rad_per_s
             if abs(state.wrist_rad - middle_rad) > by_rad:
                 rad_per_s = abs(rad_per_s) if state.wrist_rad < middle_rad else -abs(rad_per_s)
-            reply = await self._send_speed(rad_per_s)
-        return reply if not reply.accepted else await self._stop()
+            return rad_per_s
 
-    async def _line(self, metres: float, m_per_s: float) -> CommandReply:
-        """Move along the tool's axis; a positive distance leads away from the robot."""
-        state = await self.robot.next_state()
+        return await self._keep_turning(rad_per_s, decide)
+
+    async def _line(self, metres: float, m_per_s: float, cause: str) -> CommandReply:
+        """Move along the tool's axis, unless a cause comes at full speed; a positive distance leads from the robot."""
+        if abs(metres) > LARGEST_M + _ROUNDING_M:
+            return CommandReply(
+                refusal=f"A straight move of {1e3 * metres:g} mm is longer than {1e3 * LARGEST_M:g} mm."
+            )
+        state = await self._robot.next_state()
         x, y, z, *turn = state.tcp_pose
         axis = tool_axis(state.tcp_pose)
         pose = (x + metres * axis[0], y + metres * axis[1], z + metres * axis[2], turn[0], turn[1], turn[2])
-        reply = await self.robot.send(MoveLinear(pose, m_per_s, LINE_M_PER_S2))
+        reply = await self._robot.send(MoveLinear(pose, m_per_s, LINE_M_PER_S2))
         if not reply.accepted:
             return reply
-        while (state := await self.robot.next_state()).motion == "linear":
-            self.robot.keep_moving()
+        while (state := await self._robot.next_state()).motion == "linear":
+            if cause and state.tcp_speed_m_per_s > _FULL * m_per_s:
+                self._around.bring_about(cause)
+                cause = ""
+            self._robot.keep_moving()
         return CommandReply(refusal="" if state.end_reason == ARRIVED else state.end_reason or state.blocked)
 
 
-def bring_about(cause: str) -> None:
-    """Send a cause's signals, after reporting its time."""
-    to_worker, to_self = CAUSES[cause]
-    worker = worker_pid()
-    report("cause", cause=cause)
-    if to_worker is not None and worker:
-        os.kill(worker, to_worker)
-    if to_self is not None:
-        os.kill(os.getpid(), to_self)
+class ThisProcess:
+    """The surroundings of this process: its events are lines of its output."""
+
+    def __init__(self, worker_module: str) -> None:
+        """Take the module of the robot's process."""
+        self._worker_module = worker_module.encode()
+
+    def now_ns(self) -> int:
+        """Return the monotonic time in ns."""
+        return time.monotonic_ns()
+
+    def report(self, event: str, **facts: object) -> None:
+        """Print an event with its time."""
+        sys.stdout.write(f"{json.dumps({'event': event, 't_ns': self.now_ns(), **facts})}\n")
+        sys.stdout.flush()
+
+    def bring_about(self, cause: str) -> None:
+        """Send a cause's signals, after reporting its time."""
+        to_worker, to_self = CAUSES[cause]
+        worker = self.worker_pid()
+        self.report("cause", cause=cause)
+        if to_worker is not None and worker:
+            os.kill(worker, to_worker)
+        if to_self is not None:
+            os.kill(os.getpid(), to_self)
+
+    def worker_pid(self) -> int:
+        """Return the number of this process's worker process, or 0."""
+        pid = os.getpid()
+        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+            with contextlib.suppress(OSError):
+                if self._worker_module in Path(f"/proc/{child}/cmdline").read_bytes():
+                    return int(child)
+        return 0
+
+    async def watch(self, robot: UrRobot) -> None:
+        """Report each new worker process, and each loss of the robot."""
+        losses = reported = 0
+        while True:
+            await robot.next_state()
+            worker = self.worker_pid()
+            if worker and worker != reported:
+                reported = worker
+                self.report("connected", worker=worker)
+            if robot.losses.total() != losses:
+                losses = robot.losses.total()
+                self.report("lost", sentence=robot.monitor.latest.sentence)
 
 
-def worker_pid() -> int:
-    """Return the number of this process's worker process, or 0."""
-    pid = os.getpid()
-    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-        with contextlib.suppress(OSError):
-            if b"shearloop.drivers.ur.worker" in Path(f"/proc/{child}/cmdline").read_bytes():
-                return int(child)
-    return 0
-
-
-def report(event: str, **facts: object) -> None:
-    """Print an event with its time."""
-    sys.stdout.write(f"{json.dumps({'event': event, 't_ns': time.monotonic_ns(), **facts})}\n")
-    sys.stdout.flush()
-
-
-async def main() -> None:
+async def main(worker_module: str) -> None:
     """Serve requests until the input ends."""
     loop = asyncio.get_running_loop()
     lines = asyncio.StreamReader()
@@ -177,8 +229,9 @@ async def main() -> None:
     ((_, settings),) = MessageDecoder().feed(await lines.readline())
     if not isinstance(settings, UrSettings):
         raise SystemExit(2)
-    mover = Mover(settings)
-    running = [asyncio.create_task(mover.robot.run()), asyncio.create_task(mover.watch())]
+    robot, process = UrRobot(settings, LinkMonitor(), warns=False, worker=worker_module), ThisProcess(worker_module)
+    driver = Driver(settings, robot, process)
+    running = [asyncio.create_task(robot.run()), asyncio.create_task(process.watch(robot))]
     handling: asyncio.Task[None] | None = None
     try:
         while line := await lines.readline():
@@ -186,7 +239,7 @@ async def main() -> None:
             if handling is not None and not handling.done():
                 # Only a stop comes during a motion.
                 handling.cancel()
-            handling = asyncio.create_task(mover.handle(request))
+            handling = asyncio.create_task(driver.handle(request))
     finally:
         for task in (*running, *([handling] if handling is not None else [])):
             task.cancel()
@@ -194,4 +247,4 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main())
+    asyncio.run(main(sys.argv[1] if len(sys.argv) > 1 else WORKER))

@@ -10,13 +10,13 @@ from shearloop.daemon.commissioning import Report, StageResult, identity_of
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.rig import open_settings
 from shearloop.daemon.rig_memory import lock_robot
-from shearloop.drivers.ur.control_box import query_controller
-from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
 from shearloop.tools.commission import boards, gripper, identity, motion, rtde, stops, tool, wrench
 from shearloop.tools.commission.context import Context, Counts
+from shearloop.tools.commission.limits import EMULATED
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.report import Measured, earlier_report, report_for, save_report
+from shearloop.tools.commission.rig import ConnectedRig, Rig
 
 Measure = Callable[[Context], Measured]
 
@@ -32,20 +32,22 @@ STAGES: Final[dict[str, Measure]] = {
 }
 
 
-def real_settings(config: DaemonConfig) -> UrSettings | None:
-    """Return the robot's settings with its real deadlines, also for an emulated robot; None without a robot."""
-    return open_settings(config.model_copy(update={"emulated_deadlines": "real"}))
-
-
 def commission(
-    config: DaemonConfig, path: Path, out: Path, operator: Operator, counts: Counts, only: Sequence[str] = ()
+    config: DaemonConfig,
+    path: Path,
+    out: Path,
+    operator: Operator,
+    counts: Counts,
+    only: Sequence[str] = (),
+    rig: Rig | None = None,
 ) -> tuple[Report, Path]:
     """Run the stages that the report in `out` lacks, up to the first that fails; return the report and its page.
 
-    `only` names stages by their first figures, and runs these again. The report is written after each stage. Raises
-    UserError for what keeps a stage from being measured, DriverError for a device that is not there.
+    `only` names stages by their first figures, and runs these again. `rig` has the devices, by default those of the
+    configuration. The report is written after each stage. Raises UserError for what keeps a stage from being measured,
+    DriverError for a device that is not there.
     """
-    settings = real_settings(config)
+    settings = open_settings(config)
     if settings is None:
         raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
     # Before any device is asked: it may be the name of another file.
@@ -53,25 +55,19 @@ def commission(
     with ExitStack() as opened:
         # A daemon would drive the robot at the same time.
         opened.enter_context(lock_robot(settings.host))
-        return _run(config, settings, out, earlier, operator, counts, only, opened)
+        devices = rig or ConnectedRig(config, settings)
+        controller = devices.controller()
+        report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)
+        context = Context(config, settings, devices, controller, operator, report, counts, opened)
+        return _run(context, out, only)
 
 
-def _run(
-    config: DaemonConfig,
-    settings: UrSettings,
-    out: Path,
-    earlier: Report | None,
-    operator: Operator,
-    counts: Counts,
-    only: Sequence[str],
-    opened: ExitStack,
-) -> tuple[Report, Path]:
-    controller = query_controller(settings.host, settings.connect_timeout_s)
-    report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)
-    if config.emulated:
-        operator.say("EMULATED: the report will say so.")
+def _run(context: Context, out: Path, only: Sequence[str]) -> tuple[Report, Path]:
+    operator = context.operator
+    if context.config.emulated:
+        times = ", and its limits on times are those of a busy computer" if context.limits is EMULATED else ""
+        operator.say(f"EMULATED: the report says so{times}.")
     name = operator.ask("Your name:")
-    context = Context(config, settings, controller, operator, report, counts, opened)
     for stage, measure in STAGES.items():
         done = context.report.stage(stage[0])
         if (done is not None and done.passed and stage[0] not in only) or (only and stage[0] not in only):

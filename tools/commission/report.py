@@ -3,6 +3,7 @@
 Nothing here reads a clock or a device. It is a record, not a safety function.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -36,6 +37,17 @@ def judged(what: str, value: str, limit: str, promise: str, *, passed: bool, cou
     """Return a line with a verdict."""
     verdict: Verdict = "passed" if passed else "failed"
     return Line(what=what, value=value, limit=limit, count=count, promise=promise, verdict=verdict)
+
+
+def has_failed(lines: Iterable[Line]) -> bool:
+    """Return whether a line failed."""
+    return any(line.verdict == "failed" for line in lines)
+
+
+def percentile_99(values: Iterable[float]) -> float:
+    """Return the smallest value that 99 of 100 do not exceed."""
+    ordered = sorted(values)
+    return ordered[math.ceil(0.99 * len(ordered)) - 1]
 
 
 def page_of(report: Report, unmeasured: Sequence[str] = ()) -> str:

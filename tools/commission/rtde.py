@@ -1,26 +1,18 @@
 """Stage 1: the connection to the controller, its registers and its script port. Nothing moves."""
 
-import math
 import statistics
-import time
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
 from shearloop.daemon.commissioning import Line
-from shearloop.drivers.ur.control_box import ask_dashboard, register_round_trip
-from shearloop.drivers.ur.messages import RUNTIME_PLAYING
-from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
 from shearloop.tools.commission.context import Context
+from shearloop.tools.commission.limits import TimeLimits
 from shearloop.tools.commission.observer import Seen, span_s
-from shearloop.tools.commission.report import Measured, judged
+from shearloop.tools.commission.report import Measured, judged, percentile_99
 
 STAGE: Final = "1 no motion"
-LEAST_RATE: Final = 0.99
-LONGEST_GAP_S: Final = 0.04
-# Times on one connection to the script port after which a program has to start.
-UPLOADS_AFTER_S: Final = (0.0, 5.0, 60.0)
 # A clock that counts a cycle too few here and there makes every deadline late.
 CLOCK_TOLERANCE: Final = 0.005
 _CLOCK_WINDOW_S: Final = 0.5
@@ -30,16 +22,14 @@ _WRITTEN: Final = (1, 12345, -7)
 
 def measure(context: Context) -> Measured:
     """Return the stage's lines."""
-    settings, observer = context.settings, context.observer
-    read = [
-        register_round_trip(settings.host, settings.connect_timeout_s, context.registers, value) for value in _WRITTEN
-    ]
+    observer = context.observer
+    read = [context.rig.write_register(context.registers, value) for value in _WRITTEN]
     context.operator.say(f"Listening to the controller for {context.counts.listen_s:g} s; nothing moves.")
     observer.forget()
     samples = observer.listen(context.counts.listen_s)
     if len(samples) < 2:
         raise UserError("the observer received nothing from the controller: look at its cable")
-    lines = judge_samples(samples, settings)
+    lines = judge_samples(samples, context.settings.rate_hz, context.limits)
     same = sum(one == value for one, value in zip(read, _WRITTEN, strict=True))
     lines.append(
         judged(
@@ -54,28 +44,28 @@ def measure(context: Context) -> Measured:
     return Measured([*lines, *_uploads(context)])
 
 
-def judge_samples(samples: Sequence[Seen], settings: UrSettings) -> list[Line]:
+def judge_samples(samples: Sequence[Seen], rate_hz: float, limits: TimeLimits) -> list[Line]:
     """Return the lines on the samples of one connection."""
-    rate = (len(samples) - 1) / span_s(samples) / settings.rate_hz
-    ages_s = sorted((seen.arrived_ns - seen.made_ns) / 1e9 for seen in samples)
+    rate = (len(samples) - 1) / span_s(samples) / rate_hz
+    ages_s = [(seen.arrived_ns - seen.made_ns) / 1e9 for seen in samples]
     gap_s = max((after.arrived_ns - before.arrived_ns) / 1e9 for before, after in pairwise(samples))
-    p99_s = ages_s[math.ceil(0.99 * len(ages_s)) - 1]
+    p99_s = percentile_99(ages_s)
     count = len(samples)
     return [
         judged(
             "rate",
-            f"{rate:.3f} of {settings.rate_hz:g} Hz",
-            f"at least {LEAST_RATE:g}",
+            f"{rate:.3f} of {rate_hz:g} Hz",
+            f"at least {limits.least_rate:g}",
             "states come as often as planned",
-            passed=rate >= LEAST_RATE,
+            passed=rate >= limits.least_rate,
             count=count,
         ),
         judged(
             "largest gap",
             f"{1e3 * gap_s:.0f} ms",
-            f"below {1e3 * LONGEST_GAP_S:g} ms",
+            f"below {1e3 * limits.longest_gap_s:g} ms",
             "no state is older than a deadline allows",
-            passed=gap_s < LONGEST_GAP_S,
+            passed=gap_s < limits.longest_gap_s,
             count=count,
         ),
         Line(
@@ -88,10 +78,10 @@ def judge_samples(samples: Sequence[Seen], settings: UrSettings) -> list[Line]:
 
 def _uploads(context: Context) -> list[Line]:
     """Start the control program anew at several times after the connection, and compare its clock with the robot's."""
-    operator, mover, settings = context.operator, context.mover, context.settings
+    operator, mover, clock = context.operator, context.mover, context.clock
     started = 0
     reasons: list[str] = []
-    begun_s = time.monotonic()
+    begun_ns = clock.now_ns()
     # Two processes start first.
     if refusal := mover.unlock():
         return [_uploaded(0, context, refusal)]
@@ -99,11 +89,8 @@ def _uploads(context: Context) -> list[Line]:
         operator.say(
             f"The control program is stopped and sent again {after_s:g} s after the connection; nothing moves."
         )
-        time.sleep(max(0.0, begun_s + after_s - time.monotonic()))
-        ask_dashboard(settings.host, settings.connect_timeout_s, ("stop",))
-        since_ns = time.monotonic_ns()
-        stopped = context.observer.wait_for(lambda seen: seen.outputs.runtime_state != RUNTIME_PLAYING, since_ns, 5.0)
-        refusal = mover.unlock(_STARTS_WITHIN_S) if stopped is not None else "the program did not stop"
+        clock.sleep(after_s - (clock.now_ns() - begun_ns) / 1e9)
+        refusal = mover.unlock(_STARTS_WITHIN_S) if context.stop_program() else "the program did not stop"
         started += not refusal
         reasons += [refusal] if refusal else []
     line = _uploaded(started, context, *reasons)

@@ -1,24 +1,23 @@
 """Stage 7: a tool on a known spring: signs, stiffness and delay, slip, and how well a grip repeats."""
 
-import asyncio
 import statistics
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from shearloop.daemon.commissioning import Line, Supplied
-from shearloop.daemon.config import GripperConfig
-from shearloop.daemon.rig import gripper_calibration, make_gripper_client, patience_of
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
-from shearloop.drivers.robotiq.messages import GripperCommand
+from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.ur.messages import tool_axis
 from shearloop.errors import UserError
+from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.context import Context
-from shearloop.tools.commission.listening import LoadCellListener
+from shearloop.tools.commission.curves import Curve, middle_s
+from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GRIP_N, close_fingers, open_fingers
+from shearloop.tools.commission.listening import SILENT_S
 from shearloop.tools.commission.motion import TURN_RAD
-from shearloop.tools.commission.report import Measured, judged
+from shearloop.tools.commission.report import Measured, has_failed, judged
+from shearloop.tools.commission.tactile import TactileSensor, calibrated_sessions
 from shearloop.tools.commission.wrench import read
 
 STAGE: Final = "7 tool and spring"
@@ -26,8 +25,6 @@ STIFFNESS_TOLERANCE: Final = 0.1
 # What remains of the torque after the twists, as a fraction of the largest one.
 LARGEST_SLIP: Final = 0.15
 REPEATS_MM: Final = 1.0
-_GRIP_N: Final = 60.0
-_FINGERS_MM_PER_S: Final = 60.0
 _SLOWLY_RAD_PER_S: Final = 0.1
 _HELD_S: Final = 1.0
 _SETTLES_S: Final = 0.5
@@ -35,57 +32,86 @@ _SETTLES_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """The wrist's angle, the load cell's torque, and the torque of the robot's wrench about the tool's axis."""
+    """The wrist's angle, the load cell's torque, and the torque of the robot's wrench about the tool's axis.
+
+    `tactile_nm` are the torques of the calibrated fingertips, by their names, None where there was no estimate.
+    """
 
     wrist_rad: float
     load_nm: float
     wrench_nm: float
+    tactile_nm: Mapping[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """What measures the torque of the tool."""
+
+    load: Arrivals[LoadSample]
+    rate_hz: float
+    tactile: Sequence[TactileSensor]
+
+    def load_nm(self) -> float:
+        """Return the mean torque of the next `_HELD_S`."""
+        samples = self.load.take(max(3, round(_HELD_S * self.rate_hz)), SILENT_S)
+        return statistics.fmean(sample.torque_nm for sample in samples)
 
 
 def measure(context: Context) -> Measured:
     """Return the stage's lines and the largest torque that they cover."""
-    cell, hand = context.config.load_cell, context.config.gripper
+    cell = context.config.load_cell
     if cell is None:
         raise UserError("stage 7 needs a load cell on the tool: add `load_cell` to the configuration, or leave it out")
-    operator = context.operator
-    spring = operator.number(
+    spring = context.operator.number(
         "Mount the tool on a spring of known stiffness; that of spring and pads together in N·m/rad", 0.05, 50.0
     )
-    lines = asyncio.run(_grips(context, hand)) if hand is not None else []
-    with LoadCellListener(cell) as load:
+    with ExitStack() as opened:
+        tactile = _tactile(context, opened)
+        lines = _grips(context, tactile) if context.config.gripper is not None else []
+        sensors = Sensors(opened.enter_context(context.rig.load_cell()), cell.rate_hz, tactile)
         context.ready()
-        turned = _signs(context, load)
-        held, delays_s = _twists(context, load)
+        turned = _signs(context, sensors)
+        held, delays_s = _twists(context, sensors)
     lines += [*turned, *judge_twists(held, spring)]
     delay_s = statistics.median(delays_s)
     lines.append(Line(what="torque behind the angle", value=f"{1e3 * delay_s:.0f} ms (median)", count=len(delays_s)))
     largest_nm = max(abs(one.load_nm - held[0].load_nm) for one in held)
-    passed = all(line.verdict != "failed" for line in lines)
-    return Measured(lines, Supplied(torque_nm=round(largest_nm, 4)) if passed else Supplied())
+    return Measured(lines, Supplied() if has_failed(lines) else Supplied(torque_nm=round(largest_nm, 4)))
 
 
-async def _grips(context: Context, config: GripperConfig) -> list[Line]:
-    """Grip the tool several times, and leave it gripped."""
-    hand = RobotiqGripper(make_gripper_client(config, patience_of(context.config)), gripper_calibration(config))
+def _tactile(context: Context, opened: ExitStack) -> list[TactileSensor]:
+    """Return the calibrated fingertips; without a gripper nobody shows them untouched, and there are none."""
+    config = context.config
+    sessions = calibrated_sessions(config) if config.gripper is not None else {}
+    boards = {
+        name: opened.enter_context(context.rig.fingertip(name))
+        for name in dict.fromkeys(side for _, sides in sessions.values() for side in sides)
+    }
+    return [
+        TactileSensor(name, session, {side: boards[side] for side in sides}, config.fingertips[sides[0]].frame_period_s)
+        for name, (session, sides) in sessions.items()
+    ]
+
+
+def _grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
+    """Tare the fingertips, grip the tool several times, and leave it gripped."""
     count = context.counts.starts
-    await asyncio.to_thread(
-        context.operator.allow,
-        f"the fingers close onto the tool {count} times at {_FINGERS_MM_PER_S:g} mm/s with at most {_GRIP_N:g} N, and "
-        "stay closed",
+    context.operator.allow(
+        f"the fingers open, and close onto the tool {count} times at {FINGERS_MM_PER_S:g} mm/s with at most "
+        f"{GRIP_N:g} N, and stay closed"
     )
     diameters_mm = []
-    try:
-        await hand.connect()
-        await hand.activate()
+    with context.rig.hand() as hand:
+        hand.activate()
+        open_fingers(hand, GRIP_N)
+        for sensor in tactile:
+            sensor.tare(context.clock.now_ns())
         for _ in range(count):
-            opened = GripperCommand(hand.model.stroke_mm, _FINGERS_MM_PER_S, _GRIP_N)
-            await hand.finish(await hand.move(opened))
-            closed = await hand.finish(await hand.move(GripperCommand(0.0, _FINGERS_MM_PER_S, _GRIP_N)))
+            open_fingers(hand, GRIP_N)
+            closed = close_fingers(hand, GRIP_N)
             if closed.diameter_mm is None:
                 raise UserError("the gripper holds nothing: put the tool between its fingers, and run the stage again")
             diameters_mm.append(closed.diameter_mm)
-    finally:
-        await hand.close()
     spread_mm = max(diameters_mm) - min(diameters_mm)
     return [
         judged(
@@ -99,15 +125,21 @@ async def _grips(context: Context, config: GripperConfig) -> list[Line]:
     ]
 
 
-def _hold(context: Context, load: LoadCellListener) -> Held:
-    """Return the measurements at a wrist that stands."""
-    load_nm = load.mean_nm(_HELD_S)
+def _hold(context: Context, sensors: Sensors) -> Held:
+    """Return the measurements at a wrist that stands, without those of the fingertips."""
+    load_nm = sensors.load_nm()
     outputs = context.observer.latest().outputs
     reading = read(context)
     # The sign of the loop's torques: what the wrist puts into the tool.
     axis = tool_axis(outputs.tcp_pose)
     wrench_nm = -sum(one * other for one, other in zip(axis, reading.mean[3:], strict=True))
     return Held(context.observer.latest().wrist_rad, load_nm, wrench_nm)
+
+
+def _hold_and_feel(context: Context, sensors: Sensors) -> Held:
+    """Return the measurements at a wrist that stands."""
+    held = _hold(context, sensors)
+    return replace(held, tactile_nm={sensor.name: sensor.torque_nm() for sensor in sensors.tactile})
 
 
 def _turn(context: Context, by_rad: float) -> None:
@@ -118,12 +150,12 @@ def _turn(context: Context, by_rad: float) -> None:
     context.mover.move("turn", rad_per_s=way * _SLOWLY_RAD_PER_S, to_rad=target_rad)
 
 
-def _signs(context: Context, load: LoadCellListener) -> list[Line]:
+def _signs(context: Context, sensors: Sensors) -> list[Line]:
     """Turn once by a positive angle; the operator says which way the tool turned."""
     context.operator.allow(f"wrist 3 turns the tool by +{TURN_RAD:g} rad at {_SLOWLY_RAD_PER_S:g} rad/s, and back")
-    before = _hold(context, load)
+    before = _hold_and_feel(context, sensors)
     _turn(context, TURN_RAD)
-    after = _hold(context, load)
+    after = _hold_and_feel(context, sensors)
     said = context.operator.ask(
         "Which way did the gripper turn, for an eye that faces it: clockwise or counterclockwise?"
     )
@@ -132,13 +164,19 @@ def _signs(context: Context, load: LoadCellListener) -> list[Line]:
 
 
 def judge_signs(before: Held, after: Held, said: str) -> list[Line]:
-    """Return the lines on a positive turn: command, wrist, load cell and wrench are positive."""
+    """Return the lines on a positive turn: command, wrist, load cell, wrench and estimates are positive."""
     found = {
         "command": "positive" if said.lower() == "counterclockwise" else f"negative: the operator said {said!r}",
         "wrist": _sign(after.wrist_rad - before.wrist_rad),
         "load cell": _sign(after.load_nm - before.load_nm),
         "wrench": _sign(after.wrench_nm - before.wrench_nm),
     }
+    for name, after_nm in after.tactile_nm.items():
+        before_nm = before.tactile_nm[name]
+        if after_nm is None or before_nm is None:
+            found[f"estimate of {name}"] = "no estimate in the grip"
+        else:
+            found[f"estimate of {name}"] = _sign(after_nm - before_nm)
     lines = [
         judged(
             f"sign of the {what}",
@@ -149,44 +187,38 @@ def judge_signs(before: Held, after: Held, said: str) -> list[Line]:
         )
         for what, value in found.items()
     ]
-    return [*lines, Line(what="sign of a fingertip's estimate", value="not measured by this stage")]
+    if not after.tactile_nm:
+        unmeasured = "not measured: it needs a gripper, and a fingertip with a calibration"
+        lines.append(Line(what="sign of the estimate", value=unmeasured))
+    return lines
 
 
 def _sign(change: float) -> str:
     return "positive" if change > 0 else "negative"
 
 
-def _twists(context: Context, load: LoadCellListener) -> tuple[list[Held], list[float]]:
+def _twists(context: Context, sensors: Sensors) -> tuple[list[Held], list[float]]:
     """Return what is held at the pose, at each twist's end and at the pose again, and each twist's delay in s."""
     count = context.counts.twists
     context.operator.allow(
         f"wrist 3 turns the tool {count} times by {TURN_RAD:g} rad either way at {_SLOWLY_RAD_PER_S:g} rad/s"
     )
-    held, delays_s = [_hold(context, load)], []
+    held, delays_s = [_hold(context, sensors)], []
     for number in range(count):
-        begun_ns = time.monotonic_ns()
+        begun_ns = context.clock.now_ns()
         _turn(context, TURN_RAD if number % 2 == 0 else -TURN_RAD)
         context.observer.listen(_SETTLES_S)
         angles = [(seen.made_ns, seen.wrist_rad) for seen in context.observer.since(begun_ns)]
-        torques = [(sample.t_mid_ns, sample.torque_nm) for sample in load.since(begun_ns)]
-        delays_s.append(middle_s(torques) - middle_s(angles))
-        held.append(_hold(context, load))
+        torques = [(sample.t_mid_ns, sample.torque_nm) for sample in sensors.load.since(begun_ns)]
+        delays_s.append(_middle_s(torques) - _middle_s(angles))
+        held.append(_hold(context, sensors))
     _turn(context, 0.0)
-    held.append(_hold(context, load))
+    held.append(_hold(context, sensors))
     return held, delays_s
 
 
-def middle_s(curve: Sequence[tuple[int, float]]) -> float:
-    """Return the middle of a rise in s: where a step of the same area would be. `curve` has times in ns and values.
-
-    A mean over each conversion does not move it, so that curves of different rates can be compared.
-    """
-    first, last = curve[0][1], curve[-1][1]
-    area_s = sum(
-        (after_ns - before_ns) / 1e9 * (0.5 * (before + after) - first) / (last - first)
-        for (before_ns, before), (after_ns, after) in pairwise(curve)
-    )
-    return curve[-1][0] / 1e9 - area_s
+def _middle_s(curve: Curve) -> float:
+    return middle_s(curve, curve[0][1], curve[-1][1])
 
 
 def judge_twists(held: Sequence[Held], spring: float) -> list[Line]:

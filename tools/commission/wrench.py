@@ -2,7 +2,6 @@
 
 import math
 import statistics
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -10,8 +9,6 @@ from typing import Final
 from scipy import constants
 
 from shearloop.daemon.commissioning import Line
-from shearloop.drivers.ur.control_box import ask_dashboard
-from shearloop.drivers.ur.messages import RUNTIME_PLAYING
 from shearloop.drivers.ur.settings import Six, UrSettings
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S
@@ -64,10 +61,8 @@ def measure(context: Context) -> Measured:
 
 def _after_start(context: Context) -> Reading:
     """Start the control program anew, and read the wrench."""
-    settings = context.settings
     context.ready()
-    ask_dashboard(settings.host, settings.connect_timeout_s, ("stop",))
-    context.observer.wait_for(lambda seen: seen.outputs.runtime_state != RUNTIME_PLAYING, time.monotonic_ns(), _READ_S)
+    context.stop_program()
     context.ready()
     return read(context)
 

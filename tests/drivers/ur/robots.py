@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import re
 from collections.abc import AsyncIterator, Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -50,13 +51,16 @@ def moving_asynchronously(robot: Robot) -> bool:
     return any(state & 1 << 15 for state in states)
 
 
-def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> float:
-    """Run a command until the script is ready for the next; return its duration in s."""
+def do(
+    robot: Robot, command: int, *numbers: float, asynchronous: bool = False, step: Callable[[], None] | None = None
+) -> float:
+    """Run a command until the script is ready for the next; return its duration in s. `step` makes a cycle pass."""
+    step = step or partial(robot.step, STEP_S)
     begun_s, took_s = robot.time_s, 0.0
     for written, state in ((command, 2), (0, 1)):
         send(robot, written, *numbers, asynchronous=asynchronous)
         while state not in (robot.registers[LOWER.state], robot.registers[UPPER.state]):
-            robot.step(STEP_S)
+            step()
             assert robot.program_running, robot.events[-1]
             assert robot.time_s < begun_s + 20
         took_s = took_s or robot.time_s - begun_s

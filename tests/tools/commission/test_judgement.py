@@ -7,17 +7,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.tools.commission.boards import judge_frames, judge_load
 from shearloop.tools.commission.bounds import LARGEST_RAD, LARGEST_RAD_PER_S, bounded
+from shearloop.tools.commission.curves import middle_s, step_s
 from shearloop.tools.commission.gripper import judge_widths
+from shearloop.tools.commission.limits import EMULATED, REAL
 from shearloop.tools.commission.motion import SIGMAS, Turn, judge_noise
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.rtde import judge_clock, judge_samples
 from shearloop.tools.commission.stops import Stop, judge_stops
-from shearloop.tools.commission.tool import Held, judge_signs, judge_twists, middle_s
+from shearloop.tools.commission.tap import frame_step_s, judge_clocks, load_step_s
+from shearloop.tools.commission.tool import Held, judge_signs, judge_twists
 from shearloop.tools.commission.wrench import Reading, judge_mass, judge_rest
 from tests.drivers.ur.robots import DELIVERED
 
@@ -51,7 +55,8 @@ def samples(seconds: float, late_s: float = 0.0, **changed) -> list[Seen]:
     ],
 )
 def test_lost_and_late_states_fail_their_lines(seen, lines):
-    assert failed(judge_samples(seen, DELIVERED)) == lines
+    assert failed(judge_samples(seen, DELIVERED.rate_hz, REAL)) == lines
+    assert failed(judge_samples(seen, DELIVERED.rate_hz, EMULATED)) == []
 
 
 @pytest.mark.parametrize(("rate", "lines"), [(1.0, []), (0.977, ["script's clock"]), (1.02, ["script's clock"])])
@@ -109,7 +114,7 @@ GOOD = Stop("worker killed", 0.15, 0.02, 1, "")
     ],
 )
 def test_one_bad_stop_fails_its_line(stop, lines):
-    assert failed(judge_stops([GOOD, stop], 0.2)) == lines
+    assert failed(judge_stops([GOOD, stop], "at 0.2 rad/s", "rad", REAL.rest_s(DELIVERED))) == lines
 
 
 READING = Reading(SIX, 0.5, 0.02)
@@ -191,10 +196,13 @@ def test_the_load_cell_fails_its_line(rest, loaded, lines):
         (Held(0.08, 0.05, -0.05), "counterclockwise", ["sign of the wrench"]),
         (Held(-0.08, 0.05, 0.05), "counterclockwise", ["sign of the wrist"]),
         (Held(0.08, 0.05, 0.05), "clockwise", ["sign of the command"]),
+        (Held(0.08, 0.05, 0.05, {"right": 0.04}), "counterclockwise", []),
+        (Held(0.08, 0.05, 0.05, {"right": -0.04}), "counterclockwise", ["sign of the estimate of right"]),
+        (Held(0.08, 0.05, 0.05, {"right": None}), "counterclockwise", ["sign of the estimate of right"]),
     ],
 )
 def test_each_flipped_sign_fails_its_line(after, said, lines):
-    assert failed(judge_signs(Held(0.0, 0.0, 0.0), after, said)) == lines
+    assert failed(judge_signs(Held(0.0, 0.0, 0.0, dict.fromkeys(after.tactile_nm, 0.0)), after, said)) == lines
 
 
 def held(stiffness: float, left_nm: float = 0.0) -> list[Held]:
@@ -218,7 +226,76 @@ def test_the_middle_of_a_rise_does_not_depend_on_the_rate(period_s):
     middles_s = np.arange(0.5 * period_s, 2.9, period_s)
     means = [ramp[np.abs(fine_s - middle) <= 0.5 * period_s].mean() for middle in middles_s]
     curve = [(round(middle * 1e9), 0.05 * mean) for middle, mean in zip(middles_s, means, strict=True)]
-    assert middle_s(curve) == pytest.approx(0.9, abs=0.01)
+    assert middle_s(curve, curve[0][1], curve[-1][1]) == pytest.approx(0.9, abs=0.01)
+
+
+def pressed(period_s: float, at_s: float, noise_nm: float) -> list[tuple[int, float]]:
+    """Return a curve of means over each period, of a torque that rises by 0.1 N·m within 0.1 s about a moment."""
+    fine_s = np.arange(0.0, 6.0, 1e-3)
+    torque_nm = 0.1 * np.clip((fine_s - at_s) / 0.1 + 0.5, 0.0, 1.0)
+    ends = np.arange(period_s, 6.0, period_s)
+    means = [torque_nm[(fine_s >= end - period_s) & (fine_s < end)].mean() for end in ends]
+    return [
+        (round(1e9 * (end - 0.5 * period_s)), mean + RANDOM.normal(0.0, noise_nm))
+        for end, mean in zip(ends, means, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(("period_s", "noise_nm"), [(0.008, 0.02), (0.09, 0.001), (0.02, 0.005)])
+@pytest.mark.parametrize("at_s", [2.0, 3.03, 4.2])
+def test_the_moment_of_a_press_is_found_to_a_fraction_of_the_limit(period_s, noise_nm, at_s):
+    assert step_s(pressed(period_s, at_s, noise_nm), 0.6) == pytest.approx(at_s, abs=0.03)
+
+
+def test_noise_is_no_press():
+    curve = [(number * 8_000_000, RANDOM.normal(0.0, 0.02)) for number in range(700)]
+    assert step_s(curve, 0.6) is None
+    assert load_step_s(loads(0.0)) is None
+    assert frame_step_s(frames_pressed(None), PAPER_TABLE) is None
+
+
+def frames_pressed(at_s: float | None) -> list[Frame]:
+    """Return frames whose channels, each at its injection's time, change when the tool is pressed."""
+    period_s, channels = 0.54, PAPER_TABLE.electrodes[:, 0]
+    change_v = RANDOM.normal(0.0, 0.0015, len(channels))
+    fractions = (channels + 0.5) / PAPER_TABLE.n_electrodes
+    found = []
+    for number in range(16):
+        begin_s = number * period_s
+        after = np.zeros(len(channels)) if at_s is None else begin_s + period_s * fractions >= at_s
+        volts = 0.13 + RANDOM.normal(0.0, 0.002, len(channels)) + after * change_v
+        begin_ns, mid_ns, end_ns = (round(1e9 * (begin_s + part * period_s)) for part in (0.0, 0.5, 1.0))
+        none = np.zeros(len(channels), np.bool_)
+        found.append(Frame(volts, volts, begin_ns, mid_ns, end_ns, number, none, none, repeated=False))
+    return found
+
+
+@pytest.mark.parametrize("at_s", [3.9, 4.1, 4.32, 4.6])
+def test_a_frame_shows_within_which_injection_the_tool_was_pressed(at_s):
+    assert frame_step_s(frames_pressed(at_s), PAPER_TABLE) == pytest.approx(at_s, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("right_s", "load_s", "lines"),
+    [
+        (5.04, 5.3, []),
+        (4.96, 4.97, []),
+        (5.06, 5.3, ["clock of right"]),
+        (4.94, 5.3, ["clock of right"]),
+        (None, 5.3, ["clock of right"]),
+        (5.0, 5.5, ["lag of the load cell"]),
+        (5.0, 4.9, ["lag of the load cell"]),
+        (5.0, None, ["lag of the load cell"]),
+    ],
+)
+def test_a_late_device_fails_its_line(right_s, load_s, lines):
+    assert failed(judge_clocks(("the robot's wrench", 5.0), {"right": right_s}, load_s, 10.0)) == lines
+
+
+def test_a_press_that_the_reference_does_not_see_fails_every_clock():
+    lines = judge_clocks(("the robot's wrench", None), {"right": 5.0}, 5.0, 10.0)
+    assert failed(lines) == ["clock of right", "lag of the load cell"]
+    assert "the press is not seen by the robot's wrench" in lines[0].value
 
 
 def test_five_gauges_make_a_table_of_widths():

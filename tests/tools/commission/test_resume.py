@@ -1,6 +1,7 @@
 """The order of the stages: what is measured is kept, a failed stage ends it, and a later run continues."""
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
@@ -31,13 +32,13 @@ def test_stages_are_kept_blocked_and_continued(tmp_path, monkeypatch):
         return measure
 
     monkeypatch.setattr(procedure, "STAGES", {name: stage(name) for name in verdicts})
-    monkeypatch.setattr(procedure, "query_controller", lambda *_: CONTROLLER)
+    rig = SimpleNamespace(controller=lambda: CONTROLLER)
     path, out, allowed = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml", {"0 a"}
 
     def run(only: str = "") -> list[str]:
         ran.clear()
         operator = Operator(lambda question: WORD if any(one in question for one in allowed) else "no", lambda _: None)
-        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only)
+        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only, rig)
         return list(ran)
 
     with pytest.raises(DeclinedError, match="not allowed: 1 b"):

@@ -1,0 +1,140 @@
+"""The whole procedure in simulated time with scripted answers, and each seeded fault on its own line."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from benchmarks.stop_times import write_random_bank
+from shearloop.bank.bank_file import Bank
+from shearloop.daemon.commissioning import commissioning_of
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.rig import open_settings
+from shearloop.tools.commission.context import Counts
+from shearloop.tools.commission.operator import DeclinedError
+from shearloop.tools.commission.procedure import STAGES, commission
+from tests.paper_curve import paper_curve
+from tests.tools.commission.scripted_operator import GAUGES_MM, ScriptedOperator
+from tests.tools.commission.simulated_rig import SPEED, SimulatedRig
+
+pytestmark = pytest.mark.usefixtures("ur_rtde")
+
+COUNTS = Counts(
+    listen_s=3.0,
+    uploads_after_s=(0.0, 1.0),
+    clock_s=2.0,
+    rest_s=2.0,
+    turns=4,
+    stops=1,
+    speeds_rad_per_s=(0.2,),
+    exchanges=20,
+    starts=2,
+    frames=8,
+    twists=4,
+)
+
+
+def write_rig(folder: Path, host: str, **content: object) -> Path:
+    """Write a rig with one calibrated fingertip, as the emulated one is; boards are SPEED times as fast."""
+    write_random_bank(folder / "rig.bank")
+    sigma = np.linspace(1.0, 2.0, 40)
+    curve = paper_curve(Bank.open(folder / "rig.bank").identity, torque=(sigma, (1.85 - sigma) * 0.14 / 0.6))
+    curve.save(folder / "rig.cal")
+    robot = yaml.safe_load(Path("config/demo_ur.yaml").read_text())
+    (folder / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": host}))
+    right = {"device": {"path": "eit-right"}, "bank": "rig.bank", "calibration": "rig.cal"}
+    content = {
+        "load_cell": {"device": {"path": "load-cell"}, "rate_hz": 10.9 * SPEED},
+        "fingertips": {"right": {**right, "frame_period_s": 0.5412 / SPEED}},
+        "robot": "ur.yaml",
+        "gripper": {"socket": {"host": host}},
+        **content,
+    }
+    path = folder / "rig.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+class Lab:
+    """A simulated rig and its operator."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = write_rig(folder, "127.0.0.9")
+        self.rig = SimulatedRig(load_daemon_config(self.path), folder)
+        self.operator = ScriptedOperator(self.rig.order, self.rig.stop_program)
+
+    def close(self) -> None:
+        del self.rig, self.operator
+
+    def run(self, only: str = "", counts: Counts = COUNTS):
+        config, out = load_daemon_config(self.path), self.path.with_name("report.yaml")
+        return commission(config, self.path, out, self.operator.operator, counts, only, self.rig)
+
+
+@pytest.fixture
+def lab(tmp_path) -> Iterator[Lab]:
+    lab = Lab(tmp_path)
+    yield lab
+    # The test's item keeps its fixtures longer, and the rig the bank's file.
+    lab.close()
+
+
+def failed(report) -> list[str]:
+    return [line.what for stage in report.stages for line in stage.lines if line.verdict == "failed"]
+
+
+def test_the_whole_procedure_runs_unattended_and_its_report_supplies_what_it_measured(lab):
+    lab.operator.declined = "wrist 3 turns 4 times"
+    with pytest.raises(DeclinedError, match="is kept"):
+        lab.run()
+    lab.operator.declined = ""
+    report, page = lab.run()
+    assert failed(report) == []
+    assert [stage.stage for stage in report.stages] == list(STAGES)
+    assert sum("Listening" in line for line in lab.operator.said) == 1, "a stage that passed is not run again"
+    assert "Ada" in page.read_text()
+    content = yaml.safe_load(lab.path.read_text())
+    lab.path.write_text(yaml.safe_dump({**content, "commissioned": "report.yaml"}))
+    config = load_daemon_config(lab.path)
+    found = commissioning_of(config, open_settings(config))
+    assert found.counts
+    assert len(found.supplied.widths) == len(GAUGES_MM)
+    assert 0 < found.supplied.actuation_s <= found.settings.reaction_s
+    assert found.cap.wrist_speed_rad_per_s == 0.2, "one stop of each layer raises no speed"
+
+
+FAULTS = [
+    ("slider 0.5", "0", "speed slider"),
+    ("registers-in-use", "0", "registers"),
+    ("float-clock", "1", "script's clock"),
+    ("block-scripts", "1", "uploads after 0, 1 s"),
+    ("gripper slow 32", "2", "exchange with the gripper, p99"),
+    ("velocity-noise 0.003", "3", "velocity noise at rest"),
+    ("protect-ends", "4", "safety mode after stops at 0.2 rad/s"),
+    ("slow-braking 0.5", "4", "time to rest at 0.2 rad/s"),
+    ("slow-arm 0.3", "4", "time to rest on a line at 0.05 m/s"),
+    ("watchdog-waits", "4", "watchdog alone, on a line"),
+    ("bias 8", "5", "force at rest"),
+    ("right zero-channel", "6", "dead channels of right"),
+    ("right late 1", "6", "clock of right"),
+    ("load late 8", "6", "lag of the load cell"),
+    ("flip load", "7", "sign of the load cell"),
+    ("flip right", "7", "sign of the estimate of right"),
+]
+
+
+@pytest.mark.parametrize(("fault", "stage", "line"), FAULTS)
+def test_each_seeded_fault_turns_its_own_line_red(lab, fault, stage, line):
+    lab.rig.order(fault)
+    report, _ = lab.run(stage)
+    assert failed(report) == [line]
+
+
+def test_a_faster_stop_is_raised_by_five_of_each_layer(lab):
+    report, _ = lab.run("4", replace(COUNTS, stops=5, speeds_rad_per_s=(0.05, 0.2)))
+    assert failed(report) == []
+    assert report.supplied().wrist_speed_rad_per_s == 0.2
+    assert 0 < report.supplied().stop_rad < 0.05

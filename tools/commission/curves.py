@@ -1,0 +1,88 @@
+"""When a step came, in curves of any rate. Values and times in, times out."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray
+
+# Times in ns and values.
+Curve = Sequence[tuple[int, float]]
+# A step this many standard deviations of its own statistic above noise is no accident.
+_SIGMAS = 10.0
+
+
+def middle_s(curve: Curve, before: float, after: float) -> float:
+    """Return the middle in s of a rise from one level to another: where a step of the same area would be.
+
+    A mean over each conversion does not move it, so that curves of different rates can be compared.
+    """
+    area_s = sum(
+        (later_ns - earlier_ns) / 1e9 * (0.5 * (one + other) - before) / (after - before)
+        for (earlier_ns, one), (later_ns, other) in pairwise(curve)
+    )
+    return curve[-1][0] / 1e9 - area_s
+
+
+def step_index(values: FloatArray) -> int | None:
+    """Return the first of (n, c) rows after a step, None where noise explains all differences.
+
+    The split with the largest difference of the means of both sides, in units of their noise, is the step.
+    """
+    n, c = values.shape
+    if n < 4:
+        return None
+    centred = values - values.mean(axis=0)
+    total = float((centred**2).sum())
+    sizes = np.arange(1, n)
+    sums = np.cumsum(centred, axis=0)[:-1]
+    between = (sums**2).sum(axis=1) * n / (sizes * (n - sizes))
+    best = int(np.argmax(between))
+    noise = (total - float(between[best])) / ((n - 2) * c)
+    is_noise = between[best] <= noise * (c + _SIGMAS * math.sqrt(2 * c))
+    return None if is_noise else best + 1
+
+
+def step_s(curve: Curve, window_s: float) -> float | None:
+    """Return when a curve rose or fell from one level to another; None where noise explains all.
+
+    `window_s` is the time before and after the step that a rise takes at most.
+    """
+    split = step_index(np.array([[value] for _, value in curve]))
+    if split is None:
+        return None
+    at_ns = curve[split][0]
+    window_ns = round(1e9 * window_s)
+    before = [value for t_ns, value in curve if t_ns < at_ns - window_ns]
+    after = [value for t_ns, value in curve if t_ns > at_ns + window_ns]
+    rise = [(t_ns, value) for t_ns, value in curve if abs(t_ns - at_ns) <= window_ns]
+    if not before or not after or len(rise) < 2:
+        return None
+    return middle_s(rise, float(np.mean(before)), float(np.mean(after)))
+
+
+def scanned_step_s(times_s: FloatArray, rows: FloatArray) -> float | None:
+    """Return when (n, c) rows changed from one level to another, where each value has a time of its own, (n, c) in s.
+
+    A row that the step meets has the old level before it and the new one after it: the split in time that leaves the
+    smallest differences to both levels is the step. None where noise explains all, or a level is not seen.
+    """
+    split = step_index(rows)
+    if split is None or split < 2 or split > len(rows) - 2:
+        return None
+    before, after = rows[: split - 1].mean(axis=0), rows[split + 1 :].mean(axis=0)
+    near = slice(split - 1, split + 1)
+    # How much nearer each value is to the new level than to the old one.
+    nearer = ((rows[near] - before) ** 2 - (rows[near] - after) ** 2).ravel()
+    order = np.argsort(times_s[near].ravel(), kind="stable")
+    moments_s = times_s[near].ravel()[order]
+    # Of the values from each moment on.
+    gains = np.cumsum(nearer[order][::-1])[::-1]
+    # The values of one moment belong together.
+    first = np.flatnonzero(np.diff(moments_s, prepend=-math.inf) > 0)
+    chosen = int(np.argmax(gains[first]))
+    if chosen == 0:
+        return float(moments_s[0])
+    return float(0.5 * (moments_s[first[chosen]] + moments_s[first[chosen - 1]]))

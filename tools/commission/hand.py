@@ -1,0 +1,89 @@
+"""The gripper of a commissioning: one motion after the other, each to its end."""
+
+import asyncio
+from types import TracebackType
+from typing import Final, Protocol, Self
+
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.messages import GripperCommand, GripperState
+from shearloop.drivers.robotiq.models import GripperModel
+
+FINGERS_MM_PER_S: Final = 60.0
+# For gauges and objects that are held by hand, and for a tool.
+GENTLE_N: Final = 20.0
+GRIP_N: Final = 60.0
+
+
+class Hand(Protocol):
+    """A connected gripper."""
+
+    @property
+    def model(self) -> GripperModel:
+        """The gripper's model."""
+
+    def activate(self, *, operator_confirmed: bool = False) -> None:
+        """Return once the gripper is active; see `RobotiqGripper.activate`."""
+
+    def read(self) -> GripperState:
+        """Return the gripper's present state."""
+
+    def move(self, command: GripperCommand) -> GripperState:
+        """Move the fingers, and return the state at their target or on an object."""
+
+
+class ConnectedHand:
+    """The gripper through its driver; a context, which opens and closes the connection. A grip stays."""
+
+    def __init__(self, gripper: RobotiqGripper) -> None:
+        """Take a gripper that is not connected yet."""
+        self._gripper = gripper
+        self._runner = asyncio.Runner()
+
+    def __enter__(self) -> Self:
+        """Connect; raises DriverError."""
+        try:
+            self._runner.run(self._gripper.connect())
+        except BaseException:
+            self._close()
+            raise
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        """Close the connection."""
+        self._close()
+
+    def _close(self) -> None:
+        self._runner.run(self._gripper.close())
+        self._runner.close()
+
+    @property
+    def model(self) -> GripperModel:
+        """The gripper's model."""
+        return self._gripper.model
+
+    def activate(self, *, operator_confirmed: bool = False) -> None:
+        """Return once the gripper is active."""
+        self._runner.run(self._gripper.activate(operator_confirmed=operator_confirmed))
+
+    def read(self) -> GripperState:
+        """Return the gripper's present state."""
+        return self._runner.run(self._gripper.read())
+
+    def move(self, command: GripperCommand) -> GripperState:
+        """Move the fingers, and return the state at their target or on an object."""
+        return self._runner.run(self._move(command))
+
+    async def _move(self, command: GripperCommand) -> GripperState:
+        return await self._gripper.finish(await self._gripper.move(command))
+
+
+def open_fingers(hand: Hand, force_n: float = GENTLE_N) -> None:
+    """Open the fingers over the whole stroke."""
+    hand.move(GripperCommand(hand.model.stroke_mm, FINGERS_MM_PER_S, force_n))
+
+
+def close_fingers(hand: Hand, force_n: float = GENTLE_N) -> GripperState:
+    """Close the fingers, onto something if it is there, and return the state."""
+    return hand.move(GripperCommand(0.0, FINGERS_MM_PER_S, force_n))

@@ -1,0 +1,40 @@
+"""The limits on times, which a busy computer delays: of a real rig, and of an emulated one."""
+
+from dataclasses import dataclass
+from typing import Final
+
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.rig import is_patient
+from shearloop.drivers.ur.settings import UrSettings
+
+# The wrist stands this long after the last decision (docs/safety.md).
+PROMISED_S: Final = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class TimeLimits:
+    """What the lines on rates, gaps, delays and stops pass at."""
+
+    least_rate: float
+    longest_gap_s: float
+    longest_exchange_s: float
+    # How late the computer may be on top of what the settings promise; None: what docs/safety.md promises counts.
+    late_s: float | None = None
+
+    def reaction_s(self, settings: UrSettings) -> float:
+        """Return the longest delay from a command to the motion."""
+        return settings.reaction_s + (self.late_s or 0.0)
+
+    def rest_s(self, settings: UrSettings) -> float:
+        """Return the longest time to rest."""
+        return PROMISED_S if self.late_s is None else settings.standstill_s + self.late_s
+
+
+REAL: Final = TimeLimits(least_rate=0.99, longest_gap_s=0.04, longest_exchange_s=0.08)
+# Its computer plays the devices too. What the procedure shows stays the same.
+EMULATED: Final = TimeLimits(least_rate=0.8, longest_gap_s=1.0, longest_exchange_s=1.0, late_s=1.0)
+
+
+def limits_for(config: DaemonConfig) -> TimeLimits:
+    """Return the limits for a rig; an emulated one with `emulated_deadlines: real` has the real ones."""
+    return EMULATED if is_patient(config) else REAL

@@ -1,0 +1,87 @@
+"""The observer's process, with an RTDE connection of its own, because a process cannot time its own death.
+
+`python -m shearloop.tools.commission.observer_process HOST RATE_HZ REGISTER` prints each sample.
+"""
+
+import subprocess
+import sys
+import threading
+import time
+from types import TracebackType
+from typing import Self
+
+from pydantic import TypeAdapter
+
+from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge
+from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
+from shearloop.drivers.ur.script import ScriptRegisters
+from shearloop.errors import UserError
+from shearloop.tools.commission.observer import Observer, Seen
+
+_OUTPUTS = TypeAdapter(RtdeOutputs)
+_CONNECTS_WITHIN_S = 10.0
+# An observer that lost its connection connects again after this time.
+_AGAIN_S = 0.2
+
+
+class ObserverProcess(Observer):
+    """The samples of a process; a context, which ends the process at its end."""
+
+    def __init__(self, host: str, rate_hz: float, registers: ScriptRegisters) -> None:
+        """Start the process; raises UserError where it receives nothing."""
+        super().__init__()
+        command = [sys.executable, "-m", "shearloop.tools.commission.observer_process", host]
+        command += [str(rate_hz), str(registers.first)]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE)
+        self._reader = threading.Thread(target=self._read, name="observer", daemon=True)
+        self._reader.start()
+        if self.wait_for(lambda _: True, self.clock.now_ns(), _CONNECTS_WITHIN_S) is None:
+            self.close()
+            raise UserError(f"the observer receives nothing from the controller at {host}: look at the teach pendant")
+
+    def __enter__(self) -> Self:
+        """Return the observer."""
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        """End the process."""
+        self.close()
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.wait()
+        self._reader.join()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def _read(self) -> None:
+        if self._process.stdout is None:
+            return
+        for line in self._process.stdout:
+            made_ns, arrived_ns, outputs = line.split(b" ", 2)
+            self.add(Seen(int(made_ns), int(arrived_ns), _OUTPUTS.validate_json(outputs)))
+
+
+def main(host: str, rate_hz: float, registers: ScriptRegisters) -> None:
+    """Print the samples until the reader is gone; connect again after a loss."""
+    while True:
+        try:
+            receiver = RtdeReceiver(host, rate_hz, _CONNECTS_WITHIN_S / 2, registers, writes=False)
+        except RobotLostError:
+            time.sleep(_AGAIN_S)
+            continue
+        age = SampleAge()
+        while receiver.connected:
+            receiver.wait(1.0)
+            for outputs in receiver.receive_all():
+                now_ns = time.monotonic_ns()
+                made_ns = now_ns - age.age_ns(outputs.timestamp_s, now_ns)
+                sys.stdout.buffer.write(b"%d %d %s\n" % (made_ns, now_ns, _OUTPUTS.dump_json(outputs)))
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], float(sys.argv[2]), ScriptRegisters(int(sys.argv[3])))

@@ -1,0 +1,131 @@
+"""What a commissioning measures: the rig's devices, each opened where a stage needs it."""
+
+from collections.abc import AsyncGenerator
+from contextlib import AbstractContextManager, aclosing
+from typing import Protocol
+
+from shearloop.daemon.config import DaemonConfig, LoadCellConfig
+from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, make_gripper_client, patience_of
+from shearloop.daemon.sensing.sessions import fingertip_table
+from shearloop.drivers.connection import SerialLink
+from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.load_cell import LoadCell, LoadSample
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.ur.control_box import (
+    ControllerInfo,
+    RtdeReceiver,
+    ask_dashboard,
+    query_controller,
+    register_round_trip,
+)
+from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.drivers.ur.script import ScriptRegisters
+from shearloop.drivers.ur.settings import UrSettings
+from shearloop.tools.commission.arrivals import REAL_CLOCK, Arrivals, Clock
+from shearloop.tools.commission.hand import ConnectedHand, Hand
+from shearloop.tools.commission.listening import BoardListener
+from shearloop.tools.commission.mover import Mover, MoverProcess
+from shearloop.tools.commission.observer import Observer
+from shearloop.tools.commission.observer_process import ObserverProcess
+
+
+class Rig(Protocol):
+    """The devices and their time; a simulation has the same ones in a time of its own."""
+
+    clock: Clock
+
+    def controller(self) -> ControllerInfo:
+        """Return what the controller says of itself; raises DriverError if it does not answer."""
+
+    def outputs(self, registers: ScriptRegisters) -> RtdeOutputs:
+        """Return the controller's present outputs."""
+
+    def write_register(self, registers: ScriptRegisters, value: int) -> int:
+        """Write a value into our register, and return what the controller reports of it."""
+
+    def stop_program(self) -> None:
+        """Stop the program at the controller's dashboard."""
+
+    def observer(self, registers: ScriptRegisters) -> AbstractContextManager[Observer]:
+        """Return an observer of the robot."""
+
+    def mover(self, settings: UrSettings) -> AbstractContextManager[Mover]:
+        """Return what drives the robot within the limits of these settings."""
+
+    def hand(self) -> AbstractContextManager[Hand]:
+        """Return the configured gripper."""
+
+    def load_cell(self) -> AbstractContextManager[Arrivals[LoadSample]]:
+        """Return the trusted samples of the configured load cell."""
+
+    def fingertip(self, name: str) -> AbstractContextManager[Arrivals[Frame]]:
+        """Return the frames of a configured fingertip."""
+
+
+class ConnectedRig:
+    """The devices of a configuration, over their ports."""
+
+    clock: Clock = REAL_CLOCK
+
+    def __init__(self, config: DaemonConfig, settings: UrSettings) -> None:
+        """Take the configuration and its robot's settings; nothing is opened yet."""
+        self._config, self._settings = config, settings
+
+    def controller(self) -> ControllerInfo:
+        """Return what the controller says of itself."""
+        return query_controller(self._settings.host, self._settings.connect_timeout_s)
+
+    def outputs(self, registers: ScriptRegisters) -> RtdeOutputs:
+        """Return the controller's present outputs; raises RobotLostError if it does not answer."""
+        settings = self._settings
+        receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s, registers, writes=False)
+        try:
+            return receiver.latest()
+        finally:
+            receiver.close()
+
+    def write_register(self, registers: ScriptRegisters, value: int) -> int:
+        """Write a value into our register, and return what the controller reports of it."""
+        return register_round_trip(self._settings.host, self._settings.connect_timeout_s, registers, value)
+
+    def stop_program(self) -> None:
+        """Stop the program at the controller's dashboard."""
+        ask_dashboard(self._settings.host, self._settings.connect_timeout_s, ("stop",))
+
+    def observer(self, registers: ScriptRegisters) -> ObserverProcess:
+        """Start the observer's process."""
+        return ObserverProcess(self._settings.host, self._settings.rate_hz, registers)
+
+    def mover(self, settings: UrSettings) -> MoverProcess:
+        """Return the process that drives the robot."""
+        return MoverProcess(settings)
+
+    def hand(self) -> ConnectedHand:
+        """Return the configured gripper."""
+        config = self._config.gripper
+        if config is None:
+            raise ValueError("the configuration has no gripper")
+        client = make_gripper_client(config, patience_of(self._config))
+        return ConnectedHand(RobotiqGripper(client, gripper_calibration(config)))
+
+    def load_cell(self) -> BoardListener[LoadSample]:
+        """Return the trusted samples of the configured load cell."""
+        config = self._config.load_cell
+        if config is None:
+            raise ValueError("the configuration has no load cell")
+        return BoardListener("the load cell", lambda: self._trusted(config))
+
+    async def _trusted(self, config: LoadCellConfig) -> AsyncGenerator[LoadSample]:
+        link = SerialLink(**config.device.model_dump())
+        cell = LoadCell(link, load_cell_calibration(config), config.rate_hz, patience=patience_of(self._config))
+        async with aclosing(cell.readings()) as readings:
+            async for sample in readings:
+                if sample.trusted:
+                    yield sample
+
+    def fingertip(self, name: str) -> BoardListener[Frame]:
+        """Return the frames of a configured fingertip."""
+        config = self._config.fingertips[name]
+        link, zero_slots = SerialLink(**config.device.model_dump()), fingertip_table(config).zero_slots
+        board = EitKit(link, zero_slots, config.frame_period_s, patience=patience_of(self._config))
+        return BoardListener(f"the fingertip {name}", board.readings)

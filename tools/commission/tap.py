@@ -1,0 +1,88 @@
+"""The clocks of all devices by one press on the tool: each sees the same step of the torque."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from shearloop.bank.channels import ChannelTable
+from shearloop.daemon.commissioning import Line
+from shearloop.drivers.eit_kit import Frame
+from shearloop.drivers.load_cell import LoadSample
+from shearloop.drivers.ur.messages import tool_axis
+from shearloop.tools.commission.curves import scanned_step_s, step_s
+from shearloop.tools.commission.observer import Seen
+from shearloop.tools.commission.report import judged
+
+CLOCKS_S: Final = 0.05
+# HX711 data sheet, settling time: four conversions.
+LONGEST_LAG_CONVERSIONS: Final = 4.0
+# A press by hand takes a tenth of a second; the load cell's filter another 0.4 s.
+_RISE_S: Final = 0.6
+_UNSEEN: Final = "the press is not seen"
+
+
+def robot_step_s(samples: Sequence[Seen]) -> float | None:
+    """Return when the torque about the tool's axis changed, in the wrench of the robot."""
+    curve = [(seen.made_ns, _axial_nm(seen)) for seen in samples]
+    return step_s(curve, _RISE_S)
+
+
+def load_step_s(samples: Sequence[LoadSample]) -> float | None:
+    """Return when the load cell's torque changed."""
+    return step_s([(sample.t_mid_ns, sample.torque_nm) for sample in samples], _RISE_S)
+
+
+def frame_step_s(frames: Sequence[Frame], table: ChannelTable) -> float | None:
+    """Return when the channels of a fingertip changed: a frame measures one injection after the other."""
+    if len(frames) < 4:
+        return None
+    fractions = (table.electrodes[:, 0] + 0.5) / table.n_electrodes
+    begun_s = np.array([frame.t_begin_ns for frame in frames]) / 1e9
+    took_s = np.array([2 * (frame.t_mid_ns - frame.t_begin_ns) for frame in frames]) / 1e9
+    times_s = begun_s[:, None] + took_s[:, None] * fractions
+    return scanned_step_s(times_s, np.array([frame.channels for frame in frames]))
+
+
+def _axial_nm(seen: Seen) -> float:
+    axis = tool_axis(seen.outputs.tcp_pose)
+    return sum(one * other for one, other in zip(axis, seen.outputs.wrench[3:], strict=True))
+
+
+def judge_clocks(
+    reference: tuple[str, float | None], fingertips: Mapping[str, float | None], load_s: float | None, rate_hz: float
+) -> list[Line]:
+    """Return the lines on the moments at which the devices saw a press, against that of a reference device.
+
+    A rate of 0 stands for no load cell.
+    """
+    name, at_s = reference
+    lines = [
+        judged(
+            f"clock of {fingertip}",
+            _offset(found_s, at_s, name),
+            f"within {1e3 * CLOCKS_S:g} ms",
+            "measurements of one moment are compared",
+            passed=found_s is not None and at_s is not None and abs(found_s - at_s) <= CLOCKS_S,
+        )
+        for fingertip, found_s in fingertips.items()
+    ]
+    if rate_hz > 0:
+        longest_s = LONGEST_LAG_CONVERSIONS / rate_hz + CLOCKS_S
+        lines.append(
+            judged(
+                "lag of the load cell",
+                _offset(load_s, at_s, name),
+                f"{-1e3 * CLOCKS_S:g} to {1e3 * longest_s:.0f} ms, {LONGEST_LAG_CONVERSIONS:g} conversions and "
+                f"{1e3 * CLOCKS_S:g} ms",
+                "its filter alone delays its torques",
+                passed=load_s is not None and at_s is not None and -CLOCKS_S <= load_s - at_s <= longest_s,
+            )
+        )
+    return lines
+
+
+def _offset(found_s: float | None, at_s: float | None, name: str) -> str:
+    if at_s is None:
+        return f"{_UNSEEN} by {name}"
+    return _UNSEEN if found_s is None else f"{1e3 * (found_s - at_s):+.0f} ms behind {name}"

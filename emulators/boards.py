@@ -167,6 +167,7 @@ class EitKitBoard(EmulatedBoard):
     _started = False
 
     def next_line(self, now_s: float) -> bytes:
+        """Return the line that is due now, with its faults, or nothing; StopIteration at the end of the data."""
         line = super().next_line(now_s)
         if self._lasting != "zero-channel" or not line:
             return line

@@ -16,13 +16,12 @@ from shearloop.errors import UserError
 from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GRIP_N, close_fingers, open_fingers
+from shearloop.tools.commission.limits import REAL
 from shearloop.tools.commission.listening import SILENT_S
-from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.report import Measured, judged
 from shearloop.tools.commission.tap import frame_step_s, judge_clocks, load_step_s, robot_step_s
 
 STAGE: Final = "6 boards"
-RATE_TOLERANCE: Final = 0.1
 # The converter's step is 0.8 mV; the paper's boards have some steps of noise.
 LARGEST_NOISE_V: Final = 0.02
 SCALE_TOLERANCE: Final = 0.02
@@ -46,9 +45,14 @@ def measure(context: Context) -> Measured:
         load = opened.enter_context(context.rig.load_cell()) if config.load_cell is not None else None
         for name, board in fingertips.items():
             period_s = config.fingertips[name].frame_period_s
-            lines += judge_frames(name, board.take(context.counts.frames + 1, SILENT_S + period_s), period_s)
+            lines += judge_frames(
+                name,
+                board.take(context.counts.frames + 1, SILENT_S + period_s),
+                period_s,
+                context.limits.rate_tolerance,
+            )
         if load is not None and config.load_cell is not None:
-            lines += _weigh(context.operator, load, config.load_cell.rate_hz)
+            lines += _weigh(context, load, config.load_cell.rate_hz)
         return Measured([*lines, *_clocks(context, fingertips, load)])
 
 
@@ -98,10 +102,13 @@ def _press(
         # Forces that are estimated from the joints' currents are too noisy.
         name = next(iter(found))
         reference = name, found.pop(name)
-    return judge_clocks(reference, found, load_s, config.load_cell.rate_hz if config.load_cell is not None else 0.0)
+    rate_hz = config.load_cell.rate_hz if config.load_cell is not None else 0.0
+    return judge_clocks(reference, found, load_s, rate_hz, context.limits.clocks_s)
 
 
-def judge_frames(name: str, frames: Sequence[Frame], period_s: float) -> list[Line]:
+def judge_frames(
+    name: str, frames: Sequence[Frame], period_s: float, tolerance: float = REAL.rate_tolerance
+) -> list[Line]:
     """Return the lines on the frames of one fingertip that nothing touches."""
     span_s = (frames[-1].t_arrival_ns - frames[0].t_arrival_ns) / 1e9
     rate = (len(frames) - 1) / span_s * period_s
@@ -112,9 +119,9 @@ def judge_frames(name: str, frames: Sequence[Frame], period_s: float) -> list[Li
         judged(
             f"rate of {name}",
             f"{rate:.3f} of the configured one",
-            f"1 ± {RATE_TOLERANCE:g}",
+            f"1 ± {tolerance:g}",
             "frame_period_s is right",
-            passed=abs(rate - 1.0) <= RATE_TOLERANCE,
+            passed=abs(rate - 1.0) <= tolerance,
             count=len(frames),
         ),
         judged(
@@ -136,18 +143,25 @@ def judge_frames(name: str, frames: Sequence[Frame], period_s: float) -> list[Li
     ]
 
 
-def _weigh(operator: Operator, load: Arrivals[LoadSample], rate_hz: float) -> list[Line]:
+def _weigh(context: Context, load: Arrivals[LoadSample], rate_hz: float) -> list[Line]:
     """Return the lines on the load cell, without and with a known torque."""
+    operator = context.operator
     rest = load.take(LOAD_SAMPLES, SILENT_S)
     known_nm = operator.number(
         "Load the lever with a known torque and let it rest; its size in N·m (mass × 9.81 × arm)", _LEAST_NM, 5.0
     )
     loaded = load.take(LOAD_SAMPLES, SILENT_S)
     operator.act("Take the known torque off")
-    return judge_load(rest, loaded, known_nm, rate_hz)
+    return judge_load(rest, loaded, known_nm, rate_hz, context.limits.rate_tolerance)
 
 
-def judge_load(rest: Sequence[LoadSample], loaded: Sequence[LoadSample], known_nm: float, rate_hz: float) -> list[Line]:
+def judge_load(
+    rest: Sequence[LoadSample],
+    loaded: Sequence[LoadSample],
+    known_nm: float,
+    rate_hz: float,
+    tolerance: float = REAL.rate_tolerance,
+) -> list[Line]:
     """Return the lines on the load cell, at rest and with a known torque. The sign is judged in stage 7."""
     noise_nm = statistics.stdev(sample.torque_nm for sample in rest)
     found_nm = statistics.mean(one.torque_nm for one in loaded) - statistics.mean(one.torque_nm for one in rest)
@@ -157,9 +171,9 @@ def judge_load(rest: Sequence[LoadSample], loaded: Sequence[LoadSample], known_n
         judged(
             "rate of the load cell",
             f"{rate:.3f} of the configured one",
-            f"1 ± {RATE_TOLERANCE:g}",
+            f"1 ± {tolerance:g}",
             "rate_hz is right",
-            passed=abs(rate - 1.0) <= RATE_TOLERANCE,
+            passed=abs(rate - 1.0) <= tolerance,
             count=len(rest),
         ),
         judged(

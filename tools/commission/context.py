@@ -119,6 +119,11 @@ class Context:
             raise UserError("the arm does not come to rest: look at the teach pendant")
         return seen
 
+    def turn_to(self, to_rad: float, rad_per_s: float) -> None:
+        """Turn the wrist to an angle; raises MoveRefusedError."""
+        way = 1.0 if to_rad > self.observer.latest().wrist_rad else -1.0
+        self.mover.move("turn", rad_per_s=way * rad_per_s, to_rad=to_rad)
+
     def ready(self) -> Mover:
         """Return what drives the robot once the robot is ready to move; raises UserError."""
         if refusal := self.mover.unlock():

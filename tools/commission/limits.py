@@ -15,9 +15,14 @@ PROMISED_S: Final = 0.2
 class TimeLimits:
     """What the lines on rates, gaps, delays and stops pass at."""
 
+    # Of the robot's states: their fraction, and the longest time without one.
     least_rate: float
     longest_gap_s: float
     longest_exchange_s: float
+    # Of a board: the difference of its rate from the configured one, as a fraction.
+    rate_tolerance: float
+    # Between the moments at which two devices see the same.
+    clocks_s: float
     # How late the computer may be on top of what the settings promise; None: what docs/safety.md promises counts.
     late_s: float | None = None
 
@@ -30,9 +35,13 @@ class TimeLimits:
         return PROMISED_S if self.late_s is None else settings.standstill_s + self.late_s
 
 
-REAL: Final = TimeLimits(least_rate=0.99, longest_gap_s=0.04, longest_exchange_s=0.08)
+REAL: Final = TimeLimits(
+    least_rate=0.99, longest_gap_s=0.04, longest_exchange_s=0.08, rate_tolerance=0.1, clocks_s=0.05
+)
 # Its computer plays the devices too. What the procedure shows stays the same.
-EMULATED: Final = TimeLimits(least_rate=0.8, longest_gap_s=1.0, longest_exchange_s=1.0, late_s=1.0)
+EMULATED: Final = TimeLimits(
+    least_rate=0.25, longest_gap_s=5.0, longest_exchange_s=5.0, rate_tolerance=0.5, clocks_s=0.3, late_s=3.0
+)
 
 
 def limits_for(config: DaemonConfig) -> TimeLimits:

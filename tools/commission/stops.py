@@ -22,8 +22,9 @@ START_RAD: Final = 0.085
 _SLOWLY_RAD_PER_S: Final = 0.2
 # A straight move of 20 mm takes a second: a watchdog ends it on the way.
 _WATCHED_M_PER_S: Final = 0.02
-# The tool is at the pose within this distance.
+# The arm is at the pose within these.
 _AT_POSE_M: Final = 0.0005
+_AT_POSE_RAD: Final = 0.02
 _RESTS_WITHIN_S: Final = 5.0
 # A mode that follows a stop has come by then.
 _MODE_AFTER_S: Final = 0.5
@@ -63,6 +64,10 @@ class Motion(Protocol):
         """Return where a sample is on the motion's way, in its unit."""
 
 
+def _slowly_rad_per_s(context: Context) -> float:
+    return min(_SLOWLY_RAD_PER_S, context.settings.limits.wrist_speed_rad_per_s.inner)
+
+
 class WristTurn:
     """A turn of the wrist from one end of the allowed range towards the other."""
 
@@ -76,13 +81,13 @@ class WristTurn:
 
     def prepare(self) -> None:
         """Turn to the nearer end."""
-        mover, middle_rad = self._context.ready(), self._context.pose_rad
+        self._context.ready()
+        middle_rad = self._context.pose_rad
         here_rad = self._context.observer.latest().wrist_rad
         self._sign = 1.0 if here_rad < middle_rad else -1.0
         start_rad = middle_rad - self._sign * START_RAD
         if (here_rad - start_rad) * self._sign > 0:
-            slowly = min(_SLOWLY_RAD_PER_S, self._rad_per_s)
-            mover.move("turn", rad_per_s=-self._sign * slowly, to_rad=start_rad)
+            self._context.turn_to(start_rad, min(_SLOWLY_RAD_PER_S, self._rad_per_s))
 
     def begin(self, cause: str) -> int:
         """Begin to turn towards the other end."""
@@ -108,8 +113,10 @@ class StraightMove:
         )
 
     def prepare(self) -> None:
-        """Move back to the pose."""
+        """Turn and move back to the pose: at the end of the wrist's range every straight move stops."""
         mover = self._context.ready()
+        if abs(self._context.observer.latest().wrist_rad - self._context.pose_rad) > _AT_POSE_RAD:
+            self._context.turn_to(self._context.pose_rad, _slowly_rad_per_s(self._context))
         away_m = self.place(self._context.observer.latest())
         if abs(away_m) > _AT_POSE_M:
             mover.move("line", metres=-away_m, m_per_s=self._m_per_s)
@@ -148,7 +155,7 @@ def measure(context: Context) -> Measured:
     if has_failed(found):
         return Measured(lines)
     lines += [_watchdog_at_rest(context), _watchdog_in_motion(context)]
-    lines += _by_hand(context, min(_SLOWLY_RAD_PER_S, fastest))
+    lines += _by_hand(context, _slowly_rad_per_s(context))
     enough = context.counts.stops >= STOPS_NEEDED and passed_rad_per_s > 0
     supplies = (
         Supplied(wrist_speed_rad_per_s=passed_rad_per_s, stop_rad=round(largest_rad, 4)) if enough else Supplied()

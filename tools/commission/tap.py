@@ -11,10 +11,10 @@ from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.ur.messages import tool_axis
 from shearloop.tools.commission.curves import scanned_step_s, step_s
+from shearloop.tools.commission.limits import REAL
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.report import judged
 
-CLOCKS_S: Final = 0.05
 # HX711 data sheet, settling time: four conversions.
 LONGEST_LAG_CONVERSIONS: Final = 4.0
 # A press by hand takes a tenth of a second; the load cell's filter another 0.4 s.
@@ -50,7 +50,11 @@ def _axial_nm(seen: Seen) -> float:
 
 
 def judge_clocks(
-    reference: tuple[str, float | None], fingertips: Mapping[str, float | None], load_s: float | None, rate_hz: float
+    reference: tuple[str, float | None],
+    fingertips: Mapping[str, float | None],
+    load_s: float | None,
+    rate_hz: float,
+    clocks_s: float = REAL.clocks_s,
 ) -> list[Line]:
     """Return the lines on the moments at which the devices saw a press, against that of a reference device.
 
@@ -61,22 +65,22 @@ def judge_clocks(
         judged(
             f"clock of {fingertip}",
             _offset(found_s, at_s, name),
-            f"within {1e3 * CLOCKS_S:g} ms",
+            f"within {1e3 * clocks_s:g} ms",
             "measurements of one moment are compared",
-            passed=found_s is not None and at_s is not None and abs(found_s - at_s) <= CLOCKS_S,
+            passed=found_s is not None and at_s is not None and abs(found_s - at_s) <= clocks_s,
         )
         for fingertip, found_s in fingertips.items()
     ]
     if rate_hz > 0:
-        longest_s = LONGEST_LAG_CONVERSIONS / rate_hz + CLOCKS_S
+        longest_s = LONGEST_LAG_CONVERSIONS / rate_hz + clocks_s
         lines.append(
             judged(
                 "lag of the load cell",
                 _offset(load_s, at_s, name),
-                f"{-1e3 * CLOCKS_S:g} to {1e3 * longest_s:.0f} ms, {LONGEST_LAG_CONVERSIONS:g} conversions and "
-                f"{1e3 * CLOCKS_S:g} ms",
+                f"{-1e3 * clocks_s:g} to {1e3 * longest_s:.0f} ms, {LONGEST_LAG_CONVERSIONS:g} conversions and "
+                f"{1e3 * clocks_s:g} ms",
                 "its filter alone delays its torques",
-                passed=load_s is not None and at_s is not None and -CLOCKS_S <= load_s - at_s <= longest_s,
+                passed=load_s is not None and at_s is not None and -clocks_s <= load_s - at_s <= longest_s,
             )
         )
     return lines

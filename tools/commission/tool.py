@@ -144,10 +144,7 @@ def _hold_and_feel(context: Context, sensors: Sensors) -> Held:
 
 def _turn(context: Context, by_rad: float) -> None:
     """Turn to an angle from the pose."""
-    here_rad = context.observer.latest().wrist_rad
-    target_rad = context.pose_rad + by_rad
-    way = 1.0 if target_rad > here_rad else -1.0
-    context.mover.move("turn", rad_per_s=way * _SLOWLY_RAD_PER_S, to_rad=target_rad)
+    context.turn_to(context.pose_rad + by_rad, _SLOWLY_RAD_PER_S)
 
 
 def _signs(context: Context, sensors: Sensors) -> list[Line]:

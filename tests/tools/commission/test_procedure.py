@@ -61,8 +61,8 @@ def write_rig(folder: Path, host: str, **content: object) -> Path:
 class Lab:
     """A simulated rig and its operator."""
 
-    def __init__(self, folder: Path) -> None:
-        self.path = write_rig(folder, "127.0.0.9")
+    def __init__(self, folder: Path, **content: object) -> None:
+        self.path = write_rig(folder, "127.0.0.9", **content)
         self.rig = SimulatedRig(load_daemon_config(self.path), folder)
         self.operator = ScriptedOperator(self.rig.order, self.rig.stop_program)
 
@@ -104,6 +104,22 @@ def test_the_whole_procedure_runs_unattended_and_its_report_supplies_what_it_mea
     assert len(found.supplied.widths) == len(GAUGES_MM)
     assert 0 < found.supplied.actuation_s <= found.settings.reaction_s
     assert found.cap.wrist_speed_rad_per_s == 0.2, "one stop of each layer raises no speed"
+
+
+@pytest.fixture
+def emulated_lab(tmp_path) -> Iterator[Lab]:
+    lab = Lab(tmp_path, emulated=True)
+    yield lab
+    lab.close()
+
+
+def test_an_emulated_rig_with_its_long_deadlines_passes_and_says_so(emulated_lab):
+    """The wrist turns on to the end of its range where a real one has stopped before."""
+    report, page = emulated_lab.run("4")
+    assert failed(report) == []
+    assert report.rig.emulated
+    assert "EMULATED" in page.read_text()
+    assert "limits on times" in emulated_lab.operator.said[0]
 
 
 FAULTS = [

@@ -8,13 +8,11 @@ from typing import Final
 from shearloop.daemon.commissioning import Line
 from shearloop.errors import UserError
 from shearloop.tools.commission.context import Context
-from shearloop.tools.commission.limits import TimeLimits
+from shearloop.tools.commission.limits import REAL, TimeLimits
 from shearloop.tools.commission.observer import Seen, span_s
 from shearloop.tools.commission.report import Measured, judged, percentile_99
 
 STAGE: Final = "1 no motion"
-# A clock that counts a cycle too few here and there makes every deadline late.
-CLOCK_TOLERANCE: Final = 0.005
 _CLOCK_WINDOW_S: Final = 0.5
 _STARTS_WITHIN_S: Final = 15.0
 _WRITTEN: Final = (1, 12345, -7)
@@ -96,7 +94,7 @@ def _uploads(context: Context) -> list[Line]:
     line = _uploaded(started, context, *reasons)
     if reasons:
         return [line]
-    return [line, judge_clock(context.observer.listen(context.counts.clock_s))]
+    return [line, judge_clock(context.observer.listen(context.counts.clock_s), context.limits.script_tolerance)]
 
 
 def _uploaded(started: int, context: Context, *reasons: str) -> Line:
@@ -111,7 +109,7 @@ def _uploaded(started: int, context: Context, *reasons: str) -> Line:
     )
 
 
-def judge_clock(samples: Sequence[Seen]) -> Line:
+def judge_clock(samples: Sequence[Seen], tolerance: float = REAL.script_tolerance) -> Line:
     """Return the line on the clock of the script, by which deadlines end motions.
 
     A clock that loses cycles by rounding always loses them, so that the closest window counts: a simulator that is late
@@ -129,8 +127,8 @@ def judge_clock(samples: Sequence[Seen]) -> Line:
     return judged(
         "script's clock",
         f"{ratio:.4f} of the controller's",
-        f"1 ± {CLOCK_TOLERANCE:g}",
+        f"1 ± {tolerance:g}",
         "deadlines end in time, also after hours",
-        passed=abs(ratio - 1.0) <= CLOCK_TOLERANCE,
+        passed=abs(ratio - 1.0) <= tolerance,
         count=len(ratios),
     )

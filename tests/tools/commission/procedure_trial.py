@@ -22,7 +22,7 @@ from tests.tools.commission.scripted_operator import ScriptedOperator
 from tests.tools.commission.simulated_rig import SPEED
 from tests.tools.commission.test_procedure import COUNTS, failed, write_rig
 
-pytestmark = [pytest.mark.real_time, pytest.mark.usefixtures("ur_rtde")]
+pytestmark = [pytest.mark.real_time, pytest.mark.usefixtures("ur_rtde"), pytest.mark.timeout(600)]
 
 
 class EmulatedLab:

@@ -24,6 +24,8 @@ DELIVERED = read_settings(ROOT / "config" / "demo_ur.yaml")
 # Commands of ur-rtde's client, and the cycle of the controller.
 MOVE_L, ZERO_FT, SPEED_J, SPEED_STOP, STOP_J, SET_WATCHDOG = 3, 8, 9, 15, 34, 35
 STEP_S = 0.002
+# What a script reports of itself.
+READY, DONE = 1, 2
 
 
 def control_script(settings: UrSettings | None = None) -> str:
@@ -45,6 +47,11 @@ def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False
         robot.registers.write(f"input_int_register_{first}", command, robot.time_s)
 
 
+def states(robot: Robot) -> tuple[float, float]:
+    """Return what a script reports of itself: it writes one half of the registers."""
+    return robot.registers[LOWER.state], robot.registers[UPPER.state]
+
+
 def moving_asynchronously(robot: Robot) -> bool:
     """Return whether the script reports a linear move under way."""
     states = (int(robot.registers[f"output_int_register_{half.first + 2}"]) for half in (LOWER, UPPER))
@@ -57,9 +64,9 @@ def do(
     """Run a command until the script is ready for the next; return its duration in s. `step` makes a cycle pass."""
     step = step or partial(robot.step, STEP_S)
     begun_s, took_s = robot.time_s, 0.0
-    for written, state in ((command, 2), (0, 1)):
+    for written, state in ((command, DONE), (0, READY)):
         send(robot, written, *numbers, asynchronous=asynchronous)
-        while state not in (robot.registers[LOWER.state], robot.registers[UPPER.state]):
+        while state not in states(robot):
             step()
             assert robot.program_running, robot.events[-1]
             assert robot.time_s < begun_s + 20

@@ -65,6 +65,10 @@ class ScriptedArm(FakeArm):
         return self._write(robots.SPEED_STOP, deceleration_rad_per_s2)
 
     def run_once(self, command: int, *values: float) -> bool:
+        # As ur-rtde's client does: a command that comes while the one before is being answered is lost.
+        robots.send(self.robot, 0)
+        while self.robot.program_running and robots.READY not in robots.states(self.robot):
+            self.step()
         robots.do(self.robot, command, *values, asynchronous=True, step=self.step)
         return True
 

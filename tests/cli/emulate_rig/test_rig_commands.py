@@ -20,10 +20,12 @@ class Blank:
         ("explode", "'explode' is no command; there are kick NM"),
         ("kick hard", "'hard' is no torque in N·m"),
         ("kick 0.1", "kick needs a tool in the grip"),
-        ("joint loose", "there are kick NM, slip .NM., weigh NM, flip load, joint lever.tight"),
+        ("joint loose", "there are kick NM, slip .NM., weigh NM, flip load.FINGERTIP, joint lever.tight"),
         ("unplug toaster", "there is no device 'toaster'; there are right, left, load, gripper, robot"),
         ("right explode", "there is no fault 'explode'"),
         ("gripper fault 99", "'99' is not a fault code"),
+        ("flip gripper", "'flip gripper' is no command"),
+        ("load late", "no number of lines from 0 to 100"),
     ],
 )
 def test_what_is_no_command_is_said_to_be_none(line, sentence, tmp_path):

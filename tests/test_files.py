@@ -52,3 +52,16 @@ def test_a_file_that_cannot_be_written_is_named_as_the_person_named_it(tmp_path,
     with pytest.raises(FileNotFoundError) as refused, replace_file(Path("missing") / "table.csv"):
         pass
     assert refused.value.filename == "missing/table.csv"
+
+
+def test_a_file_has_one_writer(tmp_path):
+    table = tmp_path / "table.csv"
+    with replace_file(table) as first:
+        first.write(b"first")
+        with pytest.raises(OSError, match="another program is writing it") as refused, replace_file(table):
+            pass
+    assert refused.value.filename == str(table)
+    assert table.read_bytes() == b"first"
+    with replace_file(table) as second:
+        second.write(b"second")
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("table.csv", b"second")]

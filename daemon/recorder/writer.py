@@ -6,7 +6,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError
-from shearloop.files import sync_directory
+from shearloop.files import sole_writer, sync_directory
 
 PARTIAL = ".partial"
 # Larger than the data between two flushes, so that each flush writes one chunk.
@@ -205,20 +205,37 @@ class McapFile:
 
 
 @contextmanager
-def new_recording(
-    path: Path, source: str, notes: Mapping[str, str] | None = None, table: ChannelTable = PAPER_TABLE
-) -> Iterator[McapFile]:
-    """Yield the file of a recording of data from `source`; after an error it keeps the name NAME.partial.
-
-    Raises UserError where it cannot be written.
-    """
+def _removed_on_failure(path: Path) -> Iterator[None]:
     try:
-        file, name = McapFile(io.FileIO(f"{path}{PARTIAL}", "wb")), None
-        try:
-            file.identify({**schema.basic_identity(source, table), **(notes or {})})
-            yield file
-            name = path
-        finally:
-            file.close(name)
+        yield
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def new_recording(
+    path: Path,
+    source: str,
+    notes: Mapping[str, str] | None = None,
+    table: ChannelTable = PAPER_TABLE,
+    *,
+    keep_unfinished: bool = True,
+) -> Iterator[McapFile]:
+    """Yield the file of a recording of data from `source`.
+
+    After an error it keeps the name NAME.partial, or is removed unless `keep_unfinished`. Raises UserError where it
+    cannot be written, and where another program is writing it.
+    """
+    partial = Path(f"{path}{PARTIAL}")
+    try:
+        with sole_writer(partial), nullcontext() if keep_unfinished else _removed_on_failure(partial):
+            file, name = McapFile(io.FileIO(partial, "wb")), None
+            try:
+                file.identify({**schema.basic_identity(source, table), **(notes or {})})
+                yield file
+                name = path
+            finally:
+                file.close(name)
     except OSError as error:
         raise UserError(f"{path}: the recording cannot be written: {error.strerror}; choose another --out") from error

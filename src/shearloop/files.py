@@ -1,6 +1,7 @@
 """Files that are replaced whole, so that a reader never sees half of one, and files of unknown content."""
 
 import errno
+import fcntl
 import os
 import re
 import stat
@@ -12,6 +13,9 @@ from typing import BinaryIO
 _LONGEST_DETAIL = 300
 # What file systems answer that cannot flush a folder, and what a folder answers that may be written and not read.
 _NO_FLUSH = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
+# What file systems answer that have no locks.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
+_OTHER_WRITER = "another program is writing it"
 # A variable as shells write it. Other signs after a `$` are part of a file's name.
 _VARIABLE = re.compile(r"\$(?:([A-Za-z_]\w*)|\{([A-Za-z_]\w*)\})", re.ASCII)
 
@@ -62,18 +66,47 @@ def replaced_path(path: Path) -> Iterator[Path]:
     # A fixed name: the next writer reuses the file of one that was killed.
     temporary = path.with_name(f"{path.name}.tmp")
     try:
-        yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        sync_directory(path.parent)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError) and error.filename in (temporary, str(temporary)):
+        with sole_writer(temporary):
+            try:
+                yield temporary
+                with temporary.open("rb") as file:
+                    os.fsync(file.fileno())
+                temporary.replace(path)
+                sync_directory(path.parent)
+            except BaseException:
+                with suppress(OSError):
+                    temporary.unlink()
+                raise
+    except OSError as error:
+        if error.filename in (temporary, str(temporary)):
             # A person knows the file by the name that they gave.
             error.filename = str(given)
         raise
+
+
+@contextmanager
+def sole_writer(path: Path) -> Iterator[None]:
+    """Lock a temporary file, made if it is missing, against a second program that writes the same one.
+
+    Two writers would mix their bytes, and each would name the result its own. The lock ends with the program. Raises
+    OSError where another program holds it, and where the file cannot be made.
+    """
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OSError(errno.EBUSY, _OTHER_WRITER, str(path)) from None
+        except OSError as error:
+            # Some network shares have no locks.
+            if error.errno not in _NO_LOCKS:
+                raise
+        # The one who had the lock may have given the file its name.
+        if not (path.exists() and os.path.samestat(os.fstat(handle), path.stat())):
+            raise OSError(errno.EBUSY, _OTHER_WRITER, str(path))
+        yield
+    finally:
+        os.close(handle)
 
 
 @contextmanager

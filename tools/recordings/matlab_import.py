@@ -1,5 +1,6 @@
 """Reads the paper's MATLAB files of slices, raw lines and streams; imports streams as a recording."""
 
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -42,6 +43,8 @@ _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
 _SHORTEST_FRAME_S = 0.05
 # Lines that were stamped late are fewer than this fraction.
 _MOST_LATE = 0.1
+# A cable damages fewer load values than this fraction: the two recorded cases are one in a hundred.
+_MOST_DAMAGED = 0.1
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 # Among this many frames on either side, at least one should have been read without delay.
@@ -270,19 +273,11 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
     """Write the streams of MATLAB files, or of folders of them, into one recording.
 
     The times in the files are of `time_format`, one of TIME_FORMATS. Time stamps are corrected, and damaged load values
-    are left out. Raises UserError for a file without a stream, for two streams of one side, for other times, and if
-    there are no frames.
+    are left out. Raises UserError for a file without a stream, for two streams of one side, for streams of different
+    times, for other times, for torques of another unit, and if there are no frames.
     """
     files = _mat_files(sources)
-    streams: dict[str, Stream] = {}
-    for path in files:
-        for name in find_streams(path):
-            if name in streams:
-                raise UserError(f"{path} is a second stream of {name}; import one recording at a time")
-            streams[name] = read_stream(path, name, time_format)
-    load = streams.pop("load", None)
-    if not streams:
-        raise UserError("the files hold no frames of a fingertip; name those of the right or left side as well")
+    load, streams = _read_streams(files, time_format)
     remarks: list[str] = []
     if not TIME_FORMATS[time_format].has_date:
         remarks.append("The files name no date, so the recording's times begin on 1970-01-02.")
@@ -308,7 +303,8 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
         notes["remarks"] = " ".join(remarks)
     if (diameter := _diameter_mm(files)) is not None:
         notes[DIAMETER_NOTE] = diameter
-    with new_recording(out, ", ".join(sorted(path.name for path in files)), notes) as writer:
+    source = ", ".join(sorted(path.name for path in files))
+    with new_recording(out, source, notes, keep_unfinished=False) as writer:
         for side in (side for side in SIDES if side in streams):
             rows = zip(middles[side], arrivals[side], streams[side].values, strict=True)
             for middle_ns, arrival_ns, line in rows:
@@ -317,6 +313,41 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
             writer.add_torque(round(float(t_s) * 1e9), float(torque))
     counts = {side: len(stream.unix_s) for side, stream in streams.items()}
     return ImportResult(counts, len(load.unix_s), tuple(remarks))
+
+
+def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | None, dict[str, Stream]]:
+    """Return the load cell's stream, if any, and the fingertips' by side; raises UserError as `import_mat` does."""
+    streams: dict[str, Stream] = {}
+    paths: dict[str, Path] = {}
+    for path in files:
+        for name in find_streams(path):
+            if name in streams:
+                raise UserError(f"{path} is a second stream of {name}; import one recording at a time")
+            streams[name] = read_stream(path, name, time_format)
+            paths[name] = path
+    for earlier, later in itertools.permutations(streams, 2):
+        apart_s = float(streams[later].unix_s.min() - streams[earlier].unix_s.max())
+        if apart_s > _LONGEST_STEP_S:
+            raise UserError(
+                f"{paths[later]} begins {apart_s:.0f} s after the end of {paths[earlier]}: they are of two recordings; "
+                "import the files of one recording at a time"
+            )
+    load = streams.pop("load", None)
+    if not streams:
+        raise UserError("the files hold no frames of a fingertip; name those of the right or left side as well")
+    if load is not None:
+        _check_torques(paths["load"], load.values[:, 0])
+    return load, streams
+
+
+def _check_torques(path: Path, torques: FloatArray) -> None:
+    """Raise UserError where more torques (n,) in N·m are too large than a cable damages: they have another unit."""
+    beyond = int(np.count_nonzero(np.abs(torques) > LARGEST_TORQUE_NM))
+    if beyond > max(2, _MOST_DAMAGED * len(torques)):
+        raise UserError(
+            f"{path}: {beyond} of {counted(len(torques), 'load value')} are beyond {LARGEST_TORQUE_NM:g} N·m, so they "
+            "have another unit; write them in N·m"
+        )
 
 
 def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:

@@ -1,5 +1,6 @@
 """Writes a recording for the Rerun viewer: scalars with their intervals, images of the bank's match, and the robot."""
 
+import errno
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
@@ -72,11 +73,15 @@ class _RerunFile:
             self._add_pose(f"{entity}/tool_centre", content["tcp_pose"], t_ns)
 
     def close(self) -> None:
-        """Write what waits, and the layout of the viewer."""
-        for entity in self._waiting:
-            self._send(entity)
-        self._stream.send_blueprint(self._layout())
-        self._stream.flush()
+        """Write what waits, and the layout of the viewer; raises OSError where the disk does not take it."""
+        try:
+            for entity in self._waiting:
+                self._send(entity)
+            self._stream.send_blueprint(self._layout())
+            self._stream.flush()
+        except RuntimeError as error:
+            # The SDK writes in a thread, whose error it prints and does not pass on.
+            raise OSError(errno.EIO, f"the disk does not take it, is it full? ({error})") from error
         self._stream.disconnect()
 
     def _add(self, entity: str, value: Any, t_ns: int) -> None:

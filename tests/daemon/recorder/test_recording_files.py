@@ -341,6 +341,45 @@ def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path):
     assert "2 damaged load values beyond 20 N·m" in imported.remarks[0]
 
 
+def test_torques_of_another_unit_are_refused(mat_folder, tmp_path):
+    folder = mat_folder(glitches=range(0, 353, 5))
+    with pytest.raises(
+        UserError, match=r"load\.mat: 71 of 355 load values are beyond 20 N·m, so they have another unit"
+    ):
+        import_mat([folder], tmp_path / "a.mcap")
+    assert not list(tmp_path.glob("a.mcap*"))
+
+
+@pytest.mark.parametrize("moved", ["load.mat", "device1.mat"])
+def test_streams_of_two_recordings_are_refused(moved, mat_folder, tmp_path):
+    folder, other = mat_folder(), mat_folder("other")
+    content = {name: table for name, table in loadmat(other / moved).items() if not name.startswith("__")}
+    for table in content.values():
+        table[:, 0] += 377 / 86400
+    savemat(other / moved, content)
+    sources = [path for path in folder.iterdir() if path.name != moved]
+    with pytest.raises(
+        UserError, match=rf"other/{moved} begins 34\d s after the end of .*: they are of two recordings"
+    ):
+        import_mat([*sources, other / moved], tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize("small_disk", ["64k"], indirect=True)
+def test_a_refused_import_leaves_no_file(mat_folder, small_disk):
+    with pytest.raises(UserError, match="No space left on device"):
+        import_mat([mat_folder()], small_disk / "a.mcap")
+    assert not list(small_disk.iterdir())
+
+
+def test_a_recording_has_one_writer(tmp_path):
+    with new_recording(tmp_path / "a.mcap", "first") as writer:
+        writer.add_torque(1, 1.0)
+        with pytest.raises(UserError, match="another program is writing it"), new_recording(tmp_path / "a.mcap", "b"):
+            pass
+        writer.add_torque(2, 2.0)
+    assert read_recording(tmp_path / "a.mcap").torque_nm.tolist() == [1.0, 2.0]
+
+
 def test_the_diameter_in_the_files_names_is_noted(mat_folder, tmp_path):
     folder = mat_folder()
     for path in list(folder.iterdir()):

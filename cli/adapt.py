@@ -5,6 +5,7 @@ from pathlib import Path
 
 from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, load_calibration, time_range
 from shearloop.cli.terminal import print_result
+from shearloop.errors import UserError
 from shearloop.tools.outputs import check_overwrite
 
 
@@ -35,6 +36,10 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.tools.calibrate import adapt_to_recordings
 
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
+    if args.out.exists() and args.out.samefile(args.calibration):
+        raise UserError(
+            f"--out {args.out} is CAL itself, which the next grip needs: it was not changed; choose another"
+        )
     physics = Physics(bank=Bank.open(args.bank) if args.bank else None)
     adapted, correction = adapt_to_recordings(
         load_calibration(args.calibration), args.recordings, physics,

@@ -33,7 +33,10 @@ _MEANINGS = {
     "rmse_nm": "root mean square error, N·m",
     "zero_rmse_nm": "the same of an estimate that is always 0",
     "baseline_zero_rmse_nm": "without a sensor: always 0",
-    "baseline_profile_rmse_nm": "without a sensor: the calibration's mean twist at the same phase of the motion",
+    "baseline_profile_rmse_nm": (
+        "without a sensor: the calibration's mean twist at the same phase of the motion; for slices the mean at the "
+        "same place in the sequence"
+    ),
     "baseline_ratio": "rmse_nm over the smaller of both; from 1 on the sensor adds nothing",
     "bias_nm": "mean error, N·m",
     "coverage_95": "share of the known values within their 95 % intervals",
@@ -223,13 +226,17 @@ def _lines(columns: "Mapping[str, Figures]") -> list[str]:
 
 
 def _invalid_lines(tracks: "Sequence[EstimateTrack]") -> list[str]:
-    """Return why frames have no estimate, with their numbers."""
+    """Return why frames have no estimate, or no torque though they are valid, with their numbers."""
     from shearloop.tools.evaluate import invalid_reasons
 
     lines: list[str] = []
     for reason in invalid_reasons(tracks):
         frames = f"{counted(reason.frames, 'frame'):>13} not valid{', e.g.' if reason.differ else ''}"
         lines.append(f"{frames}: {reason.sentence}")
+    for track in tracks:
+        if track.without_torque:
+            frames = f"{counted(track.without_torque, 'frame'):>13} valid without a torque"
+            lines.append(f"{frames}: {track.why_no_torque}")
     return lines
 
 

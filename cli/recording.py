@@ -108,7 +108,7 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _summary_text(found: "RecordingSummary") -> str:
-    from shearloop.daemon.recorder.schema import EMULATED, software_version
+    from shearloop.daemon.recorder.schema import EMULATED, FORMAT_VERSION, REMARKS_NOTE, software_version
 
     lines = [found.path]
     if found.first_unix_ns is not None:
@@ -117,11 +117,16 @@ def _summary_text(found: "RecordingSummary") -> str:
     lines.append(f"  source   {found.metadata.get('source', 'unknown: not a recording of shearloop')}")
     if EMULATED in found.metadata:
         lines.append("  EMULATED every device was emulated on that computer")
+    if remarks := found.metadata.get(REMARKS_NOTE):
+        lines.append(f"  import   {remarks}")
     lines += [f"  ran      {name}" for name in found.experiments]
     lines += [f"  tool     {found.tool_mm} mm"] if found.tool_mm is not None else []
     if software := found.metadata.get("software"):
         here = "the same code as here" if found.same_code else f"different code from here ({software_version()})"
         lines.append(f"  made by  shearloop {software}, {here}")
+    version = found.metadata.get("format_version", FORMAT_VERSION)
+    if version != FORMAT_VERSION:
+        lines.append(f"  It has format version {version}, expected {FORMAT_VERSION}: other commands refuse it.")
     for name, topic in found.topics.items():
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:8.2f} Hz"
         plural = " " if topic.messages == 1 else "s"
@@ -132,7 +137,8 @@ def _summary_text(found: "RecordingSummary") -> str:
         for step in found.clock_steps
     ]
     if not found.closed:
-        cure = f"`shearloop recording repair {found.path}` makes an indexed copy" if found.topics else "None is intact"
+        cure = f"`shearloop recording repair {found.path}` makes an indexed copy"
+        cure = cure if found.topics else "It holds no intact message"
         torn = counted(found.torn_bytes, "byte is", "bytes are")
         lines.append(f"  It was not closed, or is being written; {torn} incomplete. {cure}.")
     if found.damaged_chunks:

@@ -7,7 +7,7 @@ import re
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -42,6 +42,8 @@ class EstimateTrack:
     latency_ms: FloatArray
     # The torque (n,) by the calibration's mean twist at the same phase, without a sensor.
     profile_nm: FloatArray | None = None
+    # Why the held tool leaves no torque, though frames may have a diameter and be valid; empty where it does not.
+    why_no_torque: str = ""
 
     def since(self, first_frame: int) -> "EstimateTrack":
         """Return the part from a frame of the recording on."""
@@ -50,9 +52,18 @@ class EstimateTrack:
     def between(self, first: int, stop: int) -> "EstimateTrack":
         """Return rows `first` to `stop`."""
         profile_nm = None if self.profile_nm is None else self.profile_nm[first:stop]
-        return EstimateTrack(
-            self.series.between(first, stop), self.estimates[first:stop], self.latency_ms[first:stop], profile_nm
+        return replace(
+            self,
+            series=self.series.between(first, stop),
+            estimates=self.estimates[first:stop],
+            latency_ms=self.latency_ms[first:stop],
+            profile_nm=profile_nm,
         )
+
+    @property
+    def without_torque(self) -> int:
+        """The number of valid frames whose torque the held tool leaves out."""
+        return sum(one.valid and one.torque_nm is None for one in self.estimates) if self.why_no_torque else 0
 
 
 def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> EstimateTrack:
@@ -66,7 +77,7 @@ def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | 
         estimates.append(session.estimate(TactileFrame.of(float(t_s), channels)))
         latency.append(1e3 * (time.perf_counter() - begun))
     profile_nm = None if calibration.profile is None else calibration.profile.predict(chosen)
-    return EstimateTrack(chosen, tuple(estimates), np.array(latency), profile_nm)
+    return EstimateTrack(chosen, tuple(estimates), np.array(latency), profile_nm, session.why_no_torque)
 
 
 def estimate_in_worker(shared: tuple[Calibration, str | None], series: FrameSeries) -> EstimateTrack:
@@ -275,7 +286,10 @@ def _compare(frames: FloatArray, unit: str) -> Figures:
 
 
 def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:
-    """Write a CSV row for every frame of each named series; cells without a truth or an estimate are empty."""
+    """Write a CSV row for every frame of each named series; cells without a truth or an estimate are empty.
+
+    The reason is also that of a valid frame without a torque.
+    """
     values = [f"{quantity}{end}_{unit}" for quantity, unit in _UNITS.items() for end in _ENDS]
     with replace_file(path) as binary, io.TextIOWrapper(binary, newline="", encoding="utf-8") as file:
         table = csv.writer(file)
@@ -286,7 +300,10 @@ def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path:
             frames = enumerate(zip(series.t_s.tolist(), truths, track.estimates, strict=True), series.first_frame)
             for number, (t_s, truth, estimate) in frames:
                 cells = [getattr(estimate, one) for one in values]
-                table.writerow([name, number, t_s, truth, *cells, estimate.valid, "; ".join(estimate.reasons)])
+                reason = "; ".join(estimate.reasons)
+                if estimate.valid and estimate.torque_nm is None:
+                    reason = track.why_no_torque
+                table.writerow([name, number, t_s, truth, *cells, estimate.valid, reason])
 
 
 def draw_tracks(

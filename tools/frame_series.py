@@ -49,12 +49,13 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
     known = tuple(side for side in SIDES if side in recording.sides) or tuple(recording.sides)
     wanted = sides or known
     missing = [side for side in wanted if side not in recording.sides]
-    if missing or not wanted:
+    if not recording.sides:
+        raise UserError(f"{recording.path} has no frames of a fingertip; record or import them with its other data")
+    if missing:
         # Only frames of SIDES can be imported.
         cure = "import those files as well" if {*SIDES} >= {*missing} else "name a side that it has"
         raise UserError(
-            f"{recording.path} has frames of {' and '.join(recording.sides) or 'no side'}, not of "
-            f"{' and '.join(missing) or 'any'}; {cure}"
+            f"{recording.path} has frames of {' and '.join(recording.sides)}, not of {' and '.join(missing)}; {cure}"
         )
     first = recording.sides[wanted[0]]
     rows = [_nearest(first.t_mid_ns, recording.sides[side].t_mid_ns) for side in wanted]

@@ -233,9 +233,19 @@ def sentences_of(result: LeftOut, loaded_nm: float = LOADED_NM) -> list[str]:
         f"Without a sensor: {_milli(loaded['baseline_zero_rmse_nm'])} mN·m for always 0, "
         f"{_milli(loaded['baseline_profile_rmse_nm'])} mN·m for {result.clock}. Ratio to the better: "
         f"{'unknown' if ratio is None else f'{ratio:.2f}'}.",
+        *_not_judged(result),
         *_before_adapting(result, loaded_nm),
         result.advice,
     ]
+
+
+def _not_judged(result: LeftOut) -> list[str]:
+    names = [name for name, tracks in zip(result.names, result.tracks, strict=True) if _lacks_torque(tracks)]
+    return [f"No torque was estimated on {' and '.join(names)}: these figures are of the others."] if names else []
+
+
+def _lacks_torque(tracks: Sequence[EstimateTrack]) -> bool:
+    return all(estimate.torque_nm is None for track in tracks for estimate in track.estimates)
 
 
 def _before_adapting(result: LeftOut, loaded_nm: float) -> list[str]:

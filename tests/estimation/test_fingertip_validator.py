@@ -118,6 +118,10 @@ def test_too_little_is_said_to_be(recorded):
     for series, reason in (
         (replace(recorded, torque_nm=0.0 * recorded.torque_nm), "is 0 at all of these frames; record twists"),
         (replace(recorded, torque_t_s=recorded.torque_t_s + 1e4), "no torque is known for these frames"),
+        (
+            replace(recorded, torque_t_s=recorded.torque_t_s + 1e4, left_out=("9 frames, repeated by the board",)),
+            "no torque is known for these frames, and left out: 9 frames, repeated by the board; record",
+        ),
         (recorded.between(0, 0), "holds no frames of right and left together; record some frames"),
     ):
         with pytest.raises(CalibrationError, match=reason):

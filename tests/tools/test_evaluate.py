@@ -1,5 +1,6 @@
 import csv
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,3 +102,12 @@ def test_the_table_of_estimates_has_every_frame_by_its_number_in_the_recording(t
     assert (first["diameter_mm"], first["valid"], first["reason"]) == ("", "True", "")
     assert (unknown["truth_nm"], unknown["torque_nm"]) == ("", "0.05")
     assert [refused[name] for name in COLUMNS.split(",")[4:]] == [*[""] * 6, "False", "no grip; dead"]
+
+
+def test_the_table_of_estimates_says_why_a_valid_frame_has_no_torque(tmp_path):
+    track = track_of([(0.1, (0.08, 0.01, 0.02)), (0.2, None)])
+    of_diameter = Estimate(True, (), None, None, None, 12.0, 11.0, 13.0)
+    told = replace(track, estimates=(of_diameter, track.estimates[1]), why_no_torque="the tool has 10 mm")
+    write_estimates([told], ["a.mcap"], tmp_path / "e.csv")
+    with (tmp_path / "e.csv").open(newline="") as file:
+        assert [row["reason"] for row in csv.DictReader(file)] == ["the tool has 10 mm", "no grip; dead"]

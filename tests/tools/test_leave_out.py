@@ -14,7 +14,7 @@ from shearloop.studies.slices.evaluate import no_better_than_place
 from shearloop.studies.slices.leave_out import SliceRecipe, find_levels, plan_levels
 from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
-from shearloop.tools.leave_out import Recipe, advice_on, fit_without, plan_left_out, sentences_of
+from shearloop.tools.leave_out import LeftOut, Recipe, advice_on, fit_without, plan_left_out, sentences_of
 from shearloop.tools.left_out_blocks import KINDS, Span, after_twists, find_blocks, usual_kind
 from shearloop.tools.parallel import SerialExecutor
 from tests.estimation.conftest import elastic, twisting
@@ -158,6 +158,17 @@ def test_tools_are_advised_to_adapt_and_counted_by_the_recordings():
     # A tool with nothing left to judge was recorded all the same.
     assert "record four" not in advice_on("tools", recordings, tracks[1:], adapted=True)
     assert "3 tools only: record four" in advice_on("tools", recordings[1:], tracks[1:], adapted=True)
+
+
+def test_a_tool_without_a_torque_is_named():
+    """The figures are of the others, though the frames are valid for their diameter."""
+    judged, refused = off_by(of_tool(20.0, 1), 0.02), off_by(of_tool(10.0, 2), 0.0)
+    diameters = tuple(Estimate(True, (), None, None, None, 12.0, 10.0, 14.0) for _ in refused.estimates)
+    without = replace(refused, estimates=diameters, why_no_torque="the tool has 10 mm")
+    result = LeftOut("tools", ("the tool of 20 mm", "the tool of 10 mm"), ((judged,), (without,)), "advice", "a clock")
+    assert sentences_of(result)[-2] == "No torque was estimated on the tool of 10 mm: these figures are of the others."
+    assert without.between(3, 10).without_torque == 7
+    assert judged.without_torque == 0
 
 
 def test_each_grip_of_a_recording_is_left_out_in_turn():

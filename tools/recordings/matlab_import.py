@@ -12,7 +12,14 @@ from scipy.ndimage import minimum_filter1d
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.matlab_file import MatFileError, Variable, read_variables
-from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT, LOAD_DOUBT_NOTE, SIDES
+from shearloop.daemon.recorder.schema import (
+    DIAMETER_NOTE,
+    LARGEST_DIAMETER_MM,
+    LOAD_DOUBT,
+    LOAD_DOUBT_NOTE,
+    REMARKS_NOTE,
+    SIDES,
+)
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import slope_below
@@ -300,7 +307,7 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
     if delay is None and not sure:
         notes[LOAD_DOUBT_NOTE] = LOAD_DOUBT
     if remarks:
-        notes["remarks"] = " ".join(remarks)
+        notes[REMARKS_NOTE] = " ".join(remarks)
     if (diameter := _diameter_mm(files)) is not None:
         notes[DIAMETER_NOTE] = diameter
     source = ", ".join(sorted(path.name for path in files))

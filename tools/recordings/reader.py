@@ -179,7 +179,11 @@ def _checked_identity(path: Path, identity: dict[str, str] | None) -> tuple[dict
     if identity is None:
         raise unusable(path, "it is an MCAP file, but not a recording of shearloop")
     if (version := identity.get("format_version")) != schema.FORMAT_VERSION:
-        raise unusable(path, f"it has format version {version}, expected {schema.FORMAT_VERSION}")
+        reason = f"it has format version {version}, expected {schema.FORMAT_VERSION}"
+        if version and version.isdecimal() and int(version) > int(schema.FORMAT_VERSION):
+            software = identity.get("software", "unknown")
+            raise UserError(f"{path}: this recording is newer: {reason}; use shearloop {software} or later")
+        raise unusable(path, reason)
     electrodes = int(identity.get("electrodes", PAPER_TABLE.n_electrodes))
     injection: Any = identity.get("injection", PAPER_TABLE.injection)
     table = ChannelTable(electrodes, injection)

@@ -16,7 +16,7 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.recorder import daemon_identity
-from shearloop.daemon.recorder.schema import EMULATED, LOAD_DOUBT_NOTE
+from shearloop.daemon.recorder.schema import EMULATED, LOAD_DOUBT_NOTE, software_version
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.errors import UserError
 from shearloop.tools.frame_series import part_of, read_series, series_of
@@ -258,7 +258,11 @@ def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
         other.start()
         other.finish()
     # The digest is cached in the table once it is read.
-    for name, owner, key, value in (("stale", PAPER_TABLE, "digest", "0" * 64), ("old", schema, "FORMAT_VERSION", "1")):
+    for name, owner, key, value in (
+        ("stale", PAPER_TABLE, "digest", "0" * 64),
+        ("old", schema, "FORMAT_VERSION", "1"),
+        ("newer", schema, "FORMAT_VERSION", "11"),
+    ):
         with monkeypatch.context() as outdated:
             outdated.setitem(vars(owner), key, value)
             written(tmp_path / f"{name}.mcap")
@@ -268,9 +272,25 @@ def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
         ("none", "No such file"),
         ("stale", "channel table 000000000000…"),
         ("old", "format version 1, expected 2; record it again, or import it again"),
+        ("newer", f"is newer: it has format version 11, expected 2; use shearloop {software_version()} or later"),
     ):
         with pytest.raises(UserError, match=why):
             read(tmp_path / f"{name}.mcap")
+
+
+def test_a_recording_without_frames_is_refused_in_a_sentence(tmp_path):
+    with new_recording(tmp_path / "a.mcap", "x") as writer:
+        writer.add_torque(1, 1.0)
+    with pytest.raises(UserError, match=r"a\.mcap has no frames of a fingertip; record or import them"):
+        read_series(tmp_path / "a.mcap")
+
+
+def test_info_names_the_version_that_other_commands_refuse(tmp_path, monkeypatch, ran):
+    with monkeypatch.context() as outdated:
+        outdated.setattr(schema, "FORMAT_VERSION", "1")
+        written(tmp_path / "a.mcap")
+    said = ran("recording", "info", tmp_path / "a.mcap").out
+    assert "It has format version 1, expected 2: other commands refuse it." in said
 
 
 def test_an_unwritable_recording_is_an_error(tmp_path):
@@ -333,12 +353,13 @@ def test_a_loop_that_waits_for_its_load_gives_the_times_of_both(begins_s, moved_
     assert "times may be seconds off" in read_series(tmp_path / "b.mcap")[0].load_doubt
 
 
-def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path):
+def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path, ran):
     imported = import_mat([mat_folder(glitches=(0, 8))], tmp_path / "a.mcap")
     found = read_recording(tmp_path / "a.mcap")
     assert imported.torques == len(found.torque_nm) == 353
     assert np.abs(found.torque_nm).max() < 0.06
     assert "2 damaged load values beyond 20 N·m" in imported.remarks[0]
+    assert f"  import   {imported.remarks[0]}" in ran("recording", "info", tmp_path / "a.mcap").out
 
 
 def test_torques_of_another_unit_are_refused(mat_folder, tmp_path):

@@ -47,6 +47,10 @@ def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder,
     assert "twist" in mistake("adapt", calibration, recording, "--time-range", "0:0.15", *out)
     ran("calibrate", slices_folder, "--estimator", "regression", "--out", of_slices)
     assert "calibration of slices" in mistake("adapt", of_slices, recording, *out)
+    before = calibration.read_bytes()
+    said = mistake("adapt", calibration, recording, "--time-range", "0:0.38", "--out", calibration)
+    assert "1.cal is CAL itself, which the next grip needs: it was not changed" in said
+    assert calibration.read_bytes() == before
 
 
 @pytest.mark.parametrize(

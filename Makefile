@@ -47,13 +47,16 @@ system-packages:
 demo: demo-python $(VENV)/.installed
 	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--play '$(RECORDING)') || case $$? in 4|130|143) ;; *) exit 1 ;; esac
 
-# Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards, by themselves,
-# because a robot stops when its computer is busy; they may be repeated twice, and the summary names them. Status 5:
-# no test was selected.
-PYTEST := $(BIN)/pytest
+# Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot in real time wait most of
+# their time, but not for a processor: the others run beside them and let them go first. Status 5: no test was selected.
+PYTEST := $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+.PHONY: test-real-time test-others
 test: install-dev
-	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
-	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder -m real_time --reruns 2 --reruns-delay 2 -rR $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(MAKE) --no-print-directory --jobs=2 test-real-time test-others
+test-real-time:
+	$(PYTEST) -m real_time $(PYTEST_ARGS) || [ $$? -eq 5 ]
+test-others:
+	nice -n 5 $(PYTEST) -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \
@@ -65,11 +68,11 @@ FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.
 	$(addprefix tests/cli/test_cli.py::test_,bash_completes_commands_and_options every_shell_has_its_script) \
 	$(addprefix tests/daemon/test_,config_file.py process.py settings.py)
 test-fast: install-dev
-	$(PYTEST) -n 3 --dist loadfile -m 'not real_time' $(PYTEST_ARGS) $(FAST)
+	$(PYTEST) -m 'not real_time' $(PYTEST_ARGS) $(FAST)
 
 # Lines and branches that the tests run in their own process; what runs in processes of its own is not seen.
 coverage: install-dev
-	$(PYTEST) -n 2 --dist loadfile -m 'not real_time' --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(PYTEST_ARGS)
+	$(PYTEST) -m 'not real_time' --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(PYTEST_ARGS)
 
 lock: install-dev
 	{ echo '# The versions that the checks run with. `make lock` writes this file from the environment.'; \

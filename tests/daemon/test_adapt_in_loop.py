@@ -45,7 +45,7 @@ async def test_adapt_corrects_a_wrong_gain_until_the_next_grip_and_is_replayed(r
     content["fingertips"]["right"]["frame_period_s"] *= SPEED / speed
     content["load_cell"]["rate_hz"] *= speed / SPEED
     rig_config.write_text(yaml.safe_dump({**content, "recording": {"folder": "recordings"}}))
-    twist = {"do": "twist", "angles_rad": [0.1, 0.2], "speed_rad_per_s": 0.5, "hold_s": 1.0}
+    twist = {"do": "twist", "angles_rad": [0.2], "speed_rad_per_s": 0.5, "hold_s": 1.0}
     grip = {"do": "grip", "width_mm": 5, "force_n": 60}
     adapt = {"do": "adapt", "fingertip": "right"}
     steps = [twist, twist, adapt, twist, adapt | {"reference": "wrench"}, {"do": "release"}, grip, twist]

@@ -5,10 +5,10 @@ import contextlib
 import os
 import tty
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine
 from copy import copy
 from pathlib import Path
-from typing import Protocol, Self, TypeAlias
+from typing import Any, Protocol, Self, TypeAlias
 
 from shearloop.emulators.numbers import number_between
 
@@ -202,21 +202,29 @@ class PtyServer(Server):
 
 # Open connections, by the tasks that serve them.
 Connections: TypeAlias = dict[asyncio.Task[None], asyncio.StreamWriter]
+Serve: TypeAlias = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Coroutine[Any, Any, None]]
 
 
-@contextlib.contextmanager
-def connected(writer: asyncio.StreamWriter, connections: Connections) -> Iterator[None]:
-    """Register an open connection that this task serves; close it at the end, quietly when the peer breaks it."""
-    task = asyncio.current_task()
-    if task is None:
-        raise RuntimeError("a connection is served by a task")
-    connections[task] = writer
-    try:
-        with contextlib.suppress(ConnectionError):
-            yield
-    finally:
-        del connections[task]
-        writer.close()
+def accepting(serve: Serve, connections: Connections) -> Callable[[asyncio.StreamReader, asyncio.StreamWriter], None]:
+    """Return what a server calls with each new connection: a task serves it, and closes it at its end.
+
+    The connection is registered at once, so that a server that ends can wait for its task. A peer that breaks the
+    connection ends the task quietly.
+    """
+
+    async def run(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            with contextlib.suppress(ConnectionError):
+                await serve(reader, writer)
+        finally:
+            writer.close()
+
+    def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.create_task(run(reader, writer))
+        connections[task] = writer
+        task.add_done_callback(connections.pop)
+
+    return accept
 
 
 class SocketServer(Server):
@@ -235,7 +243,7 @@ class SocketServer(Server):
     async def restore(self) -> None:
         """Listen, unless it does already."""
         if self._server is None:
-            self._server = await asyncio.start_server(self._serve, self._host, self.port)
+            self._server = await asyncio.start_server(accepting(self._serve, self._connections), self._host, self.port)
             self.port = self._server.sockets[0].getsockname()[1]
             self.appearances.put_nowait(f"{self._host}:{self.port}")
 
@@ -253,11 +261,10 @@ class SocketServer(Server):
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         session = copy(self._session)
-        with connected(writer, self._connections):
-            while data := await reader.read(READ_BYTES):
-                replies = session.feed(data)
-                if replies and self._state != "silence":
-                    # The time of the measurement.
-                    await asyncio.sleep(self.answer_s)
-                    writer.write(replies)
-                    await writer.drain()
+        while data := await reader.read(READ_BYTES):
+            replies = session.feed(data)
+            if replies and self._state != "silence":
+                # The time of the measurement.
+                await asyncio.sleep(self.answer_s)
+                writer.write(replies)
+                await writer.drain()

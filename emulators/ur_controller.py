@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from shearloop.drivers.defaults import DASHBOARD_PORT, PRIMARY_PORT, RTDE_PORT, SCRIPT_PORT
 from shearloop.emulators.numbers import number_between
-from shearloop.emulators.ports import Connections, connected
+from shearloop.emulators.ports import Connections, accepting
 from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
 from shearloop.emulators.ur_rtde import RtdeSession
 from shearloop.emulators.urscript import translate
@@ -82,7 +82,7 @@ class Controller:
             ):
                 if port in self._closed_ports:
                     continue
-                server = await asyncio.start_server(serve, self._host, port)
+                server = await asyncio.start_server(accepting(serve, self._connections), self._host, port)
                 stack.push_async_callback(server.wait_closed)
                 stack.callback(self._drop_all)
                 stack.callback(server.close)
@@ -161,28 +161,26 @@ class Controller:
             writer.write(data)
 
     async def _serve_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with connected(writer, self._connections):
-            session = RtdeSession(self.robot, self._rate_hz, self.faults)
-            self._rtde[writer] = session
-            try:
-                while data := await reader.read(4096):
-                    self._send(writer, session.receive(data))
-            finally:
-                del self._rtde[writer]
+        session = RtdeSession(self.robot, self._rate_hz, self.faults)
+        self._rtde[writer] = session
+        try:
+            while data := await reader.read(4096):
+                self._send(writer, session.receive(data))
+        finally:
+            del self._rtde[writer]
 
     async def _serve_scripts(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with connected(writer, self._connections):
-            text = bytearray()
-            async for data in self._stream_states(reader, writer):
-                text += data
-                if text.endswith(SCRIPT_END):
-                    script = text.decode("utf-8", "replace")
-                    with suppress(SyntaxError):  # which `upload` reports
-                        # In a thread: it takes 40 ms, and the controller is never late.
-                        await asyncio.to_thread(translate, script)
-                    if "drop-scripts" not in self.faults:
-                        self.robot.upload(script)
-                    text.clear()
+        text = bytearray()
+        async for data in self._stream_states(reader, writer):
+            text += data
+            if text.endswith(SCRIPT_END):
+                script = text.decode("utf-8", "replace")
+                with suppress(SyntaxError):  # which `upload` reports
+                    # In a thread: it takes 40 ms, and the controller is never late.
+                    await asyncio.to_thread(translate, script)
+                if "drop-scripts" not in self.faults:
+                    self.robot.upload(script)
+                text.clear()
 
     async def _stream_states(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> AsyncIterator[bytes]:
         """Yield what a client sends, and send it a state in each cycle.
@@ -211,15 +209,14 @@ class Controller:
             yield data
 
     async def _serve_primary(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with connected(writer, self._connections):
-            self._primary_clients.add(writer)
-            try:
-                # The version comes first, and states ten times a second, which no client of ours reads.
-                self._send(writer, _package(_ROBOT_STATE, bytes(8)))
-                while await reader.read(4096):
-                    pass
-            finally:
-                self._primary_clients.discard(writer)
+        self._primary_clients.add(writer)
+        try:
+            # The version comes first, and states ten times a second, which no client of ours reads.
+            self._send(writer, _package(_ROBOT_STATE, bytes(8)))
+            while await reader.read(4096):
+                pass
+        finally:
+            self._primary_clients.discard(writer)
 
     def report_error(self, code: int, argument: int = 0, level: int = 2) -> None:
         """Send an error code to the clients of the Primary Client Interface."""
@@ -230,14 +227,13 @@ class Controller:
             self._send(writer, _package(_ROBOT_MESSAGE, content))
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with connected(writer, self._connections):
-            if "mute-dashboard" not in self.faults:
-                self._send(writer, BANNER.encode() + b"\n")
-            while line := await reader.readline():
-                if "mute-dashboard" in self.faults:
-                    continue
-                request = line.decode("utf-8", "replace").strip()
-                self._send(writer, f"{self._answer_dashboard(request)}\n".encode())
+        if "mute-dashboard" not in self.faults:
+            self._send(writer, BANNER.encode() + b"\n")
+        while line := await reader.readline():
+            if "mute-dashboard" in self.faults:
+                continue
+            request = line.decode("utf-8", "replace").strip()
+            self._send(writer, f"{self._answer_dashboard(request)}\n".encode())
 
     def _answer_dashboard(self, request: str) -> str:
         """Carry out a request as UR's page "Dashboard Server e-Series" describes it, and return the reply."""

@@ -123,7 +123,8 @@ def _values(settings: UrSettings, registers: ScriptRegisters, load: Six | None) 
     margin_rad = limits.joints.margin_rad
     return {
         "first": registers.first,
-        "longest_s": settings.command_timeout_s + _SLACK_S,
+        "longest_turn_s": settings.command_timeout_s + _SLACK_S,
+        "longest_line_s": settings.silence_timeout_s + _SLACK_S,
         "grace_s": MOVE_GRACE_S,
         "lowest_rad": limits.joints.lower_rad[5] + margin_rad,
         "highest_rad": limits.joints.upper_rad[5] - margin_rad,

@@ -269,6 +269,19 @@ def test_a_straight_move_may_begin_before_its_deadline_arrives(comes):
     assert arm.reading.rests != comes
 
 
+def test_deadline_of_an_earlier_program_ends_a_straight_move():
+    """The clock starts at 0 in each program, so that an old deadline can be hours ahead."""
+    arm = guarded_arm()
+    x, y, z, *turned = arm.robot.arm.pose
+    arm.run_once(robots.MOVE_L, x, y, z - 0.2, *turned, 0.05, 0.5)
+    arm.robot.registers.write(UPPER.deadline, 1_800_000, arm.robot.time_s)
+    for _ in range(round(PROMISED_S * 1e9 / CYCLE_NS)):
+        arm.send_heartbeat()
+        arm.cycle()
+    assert arm.reading.rests
+    assert not arm.reading.program_running
+
+
 @pytest.mark.parametrize(("silence_s", "late_s", "goes_on"), [(0.1, 0.06, True), (1.0, 0.9, True), (1.0, 1.1, False)])
 def test_a_worker_that_is_late_for_less_than_the_silence_costs_no_straight_move(silence_s, late_s, goes_on):
     """1 s is what an emulated rig allows a busy computer."""

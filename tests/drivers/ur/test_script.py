@@ -375,6 +375,7 @@ def test_another_motion_ends_the_one_before(first, second):
     trace(robot, [0], (), 0.3)
     assert robot.program_running, robot.events
     assert robot.arm.moving == (second in {"turn", "line"})
+    assert robot.arm.qd_rad_per_s[5] == pytest.approx(0.3 if second == "turn" else 0.0, abs=0.01)
 
 
 @pytest.mark.real_time

@@ -34,6 +34,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.home = x, y, z
         # The command that is written in each cycle, and until when the arm may move.
         self.command, self.numbers = 0, [0.0] * 8
+        self.is_new = True
         self.may_move_until_s = 0.0
         self.begin_program()
 
@@ -48,8 +49,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.command = 0
         self.step()
         self.command, self.numbers = command, [*numbers, *[0.0] * (8 - len(numbers))]
-        # An order that ends a motion takes its time, also after the deadline.
-        self.may_move_until_s = max(self.may_move_until_s, self.robot.time_s + BRAKING_S)
+        self.is_new = True
 
     @rule(speed=st.floats(-3.0, 3.0), acceleration=accelerations, others=st.floats(-3.0, 3.0))
     def turn(self, speed: float, acceleration: float, others: float) -> None:
@@ -84,14 +84,11 @@ class AnyOrder(RuleBasedStateMachine):
     def extend(self, seconds: float) -> None:
         until = self.robot.registers[UPPER.clock] + int(seconds / CYCLE_S)
         self.robot.registers.write(UPPER.deadline, until, self.robot.time_s)
-        allowed_s = self.robot.time_s + seconds + MOVE_GRACE_S + BRAKING_S
-        self.may_move_until_s = max(self.may_move_until_s, allowed_s)
+        self.allow(seconds + MOVE_GRACE_S)
 
     @rule(ticks=st.sampled_from([NO_MOTION_TICKS, -(1 << 31), 1_000_000, (1 << 31) - 1]))
     def leave_a_useless_deadline(self, ticks: int) -> None:
         self.robot.registers.write(UPPER.deadline, ticks, self.robot.time_s)
-        # A straight move that has just begun is not judged.
-        self.may_move_until_s = max(self.may_move_until_s, self.robot.time_s + MOVE_GRACE_S + BRAKING_S)
 
     @rule(cycles=st.integers(1, 40), writes=st.booleans())
     def run(self, cycles: int, writes: bool = True) -> None:
@@ -100,9 +97,17 @@ class AnyOrder(RuleBasedStateMachine):
         if not self.robot.program_running:
             self.begin_program()
 
+    def allow(self, seconds: float) -> None:
+        """Expect motion for this long at most, and the time to brake."""
+        self.may_move_until_s = max(self.may_move_until_s, self.robot.time_s + seconds + BRAKING_S)
+
     def step(self, *, writes: bool = True) -> None:
         if writes:
             send(self.robot, self.command, *self.numbers, asynchronous=True)
+            if self.is_new:
+                # A straight move that has just begun is not judged; an order that ends a motion takes its time.
+                self.allow(MOVE_GRACE_S)
+            self.is_new = False
         self.robot.step(CYCLE_S)
         self.keeps_its_limits()
 
@@ -118,5 +123,5 @@ class AnyOrder(RuleBasedStateMachine):
             assert not arm.moving, "it moves after its deadline"
 
 
-AnyOrder.TestCase.settings = hypothesis_settings(max_examples=40, stateful_step_count=25, deadline=None)
+AnyOrder.TestCase.settings = hypothesis_settings(max_examples=60, stateful_step_count=25, deadline=None)
 TestAnyOrder = AnyOrder.TestCase

@@ -15,6 +15,8 @@ from shearloop.emulators.ur_robot import Robot
 from tests.emulator_process import own_address
 
 HOST = own_address(6)
+# A write that takes this long has met a client that does not read.
+BLOCKED_S = 0.3
 # Longer than the buffers.
 PROGRAM = "def program():\n" + "  # a comment\n" * 3000 + "  sync()\nend\n"
 
@@ -53,9 +55,12 @@ async def test_client_that_does_not_read_is_not_heard(monkeypatch):
     drain = asyncio.StreamWriter.drain
 
     async def note(writer: asyncio.StreamWriter) -> None:
-        if writer.transport.get_write_buffer_size():
-            buffers_are_full.set()
-        await drain(writer)
+        # A buffer that is full for a moment is emptied by the kernel; one that stays so is not.
+        stays = asyncio.get_running_loop().call_later(BLOCKED_S, buffers_are_full.set)
+        try:
+            await drain(writer)
+        finally:
+            stays.cancel()
 
     monkeypatch.setattr(asyncio.StreamWriter, "drain", note)
     async with serving() as robot:

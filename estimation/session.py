@@ -35,7 +35,7 @@ from shearloop.estimation.values import Estimate, Measured, ProcessedFrame, Tact
 from shearloop.words import counted
 
 _REPEATED_FRAME = ("the board sent the same frame again",)
-_NO_IDLE_FRAME = ("the idle frame was not completed in time; tare again with nothing gripped",)
+_NO_IDLE_FRAME = ("no idle frame: it took too long, or something was gripped; tare again with nothing gripped",)
 UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _UNKNOWN = (None, None, None)
 _UNCALIBRATED = ("no calibration is configured: k and sigma have no torque",)

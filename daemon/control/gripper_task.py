@@ -83,6 +83,12 @@ class GripperTask:
         if state.fault.needs_activation:
             await self.gripper.activate(operator_confirmed=True)
 
+    @property
+    def is_holding(self) -> bool | None:
+        """Whether its latest state shows something between the fingers; None before the first state."""
+        state = self.gripper.latest
+        return None if state is None else state.diameter_mm is not None
+
     def held_tool(self, t_ns: int) -> Measured | None:
         """Return the diameter in mm of the held tool at t_ns, or None."""
         state = self.gripper.latest

@@ -110,6 +110,8 @@ class FingertipTask:
     count: int = 0
     _tare: _Tare = field(default_factory=_Tare)
     _held: Measured | None = None
+    # Whether the gripper has not said yet that nothing was held in the session's first idle frame; None at first.
+    _unconfirmed: bool | None = None
     # The source of the known torque of a correction that waits for the next frame, and its result.
     _adapting: tuple[str, asyncio.Future[None]] | None = None
 
@@ -123,6 +125,10 @@ class FingertipTask:
         if self._tare.is_due(began_ns):
             self.session.tare()
             self._record(InputKind.TARE, now_ns, tare_as_bytes(number))
+            self._unconfirmed = False
+        if self._is_of_held_tool():
+            structlog.get_logger().warning(f"{self.name} has no idle frame: the gripper holds something")
+            self._end_tare(number, now_ns)
         tool = self.gripper.held_tool(now_ns) if self.gripper is not None else None
         if tool != self._held:
             self._held = tool
@@ -164,8 +170,23 @@ class FingertipTask:
         why = self._tare.reasons or "no frame came in time"
         structlog.get_logger().warning(f"the idle frame of {self.name} was not taken: {why}")
         if self._tare.begun and self.session.taring:
-            self.session.give_up_tare()
-            self._record(InputKind.TARE, now_ns, tare_as_bytes(number, given_up=True))
+            self._end_tare(number, now_ns)
+
+    def _is_of_held_tool(self) -> bool:
+        """Return whether the idle frame is one of a held tool, as far as the gripper says."""
+        # A session of the paper's method begins with an idle frame that nobody asked for.
+        if self._unconfirmed is None:
+            self._unconfirmed = self.session.taring
+        holding = self.gripper.is_holding if self.gripper is not None else None
+        if holding is None:
+            return False
+        found = holding and (self.session.taring or self._unconfirmed)
+        self._unconfirmed = False
+        return found
+
+    def _end_tare(self, number: int, now_ns: int) -> None:
+        self.session.give_up_tare()
+        self._record(InputKind.TARE, now_ns, tare_as_bytes(number, given_up=True))
 
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new idle frame and wait until it is complete; return None, or why it is not."""

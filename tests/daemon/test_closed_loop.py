@@ -270,6 +270,9 @@ async def test_nothing_moves_after_a_restart_a_reconnection_and_an_acknowledgeme
             later = await again.until("robot.state", lambda state: state["seq"] > last + 50)
             assert later["wrist_rad"] == pytest.approx(still["wrist_rad"], abs=1e-3)
             assert again.seen["gripper.state"][-1]["width_mm"] == pytest.approx(tool["width_mm"], abs=1.0)
+            # Its first frames are of the gripped tool, and no idle frame.
+            await again.until("eit.estimate", lambda one: one["reason"].startswith("no idle frame"))
+            assert not any(one["valid"] for one in again.seen["eit.estimate"][-10:])
             assert "drops" in (await ask_again("release"))["reason"]
             reply = await ask_again("release", confirmed=True)
             assert reply["ok"], reply

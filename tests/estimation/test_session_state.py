@@ -107,7 +107,9 @@ def test_a_zero_that_is_given_up_gives_no_estimate_until_the_next(taring, proces
     for number in range(12):
         estimate = session.estimate(like(2.5 + 0.5 * number, 1.0))
         assert not estimate.valid
-        assert estimate.reasons == ("the idle frame was not completed in time; tare again with nothing gripped",)
+        assert estimate.reasons == (
+            "no idle frame: it took too long, or something was gripped; tare again with nothing gripped",
+        )
     session.tare(2)
     assert session.taring
     assert session.estimate(like(9.0, 0.0)).reasons == ("taking the idle frame, 1 of 2",)

@@ -387,6 +387,31 @@ async def test_a_tare_that_lost_its_board_on_the_way_gives_no_estimate_until_the
     assert log.said == ["the idle frame of right was not taken: 1 frame: nothing"]
 
 
+@pytest.mark.parametrize(("complete", "said"), [(False, [True]), (False, [False, True]), (True, [None, True])])
+async def test_no_idle_frame_is_of_a_gripped_tool(complete, said, log):
+    """The daemon was started again with a tool in the fingers: the paper's method takes its first frames for idle."""
+    session, raw = Taring(), list[RawEvent]()
+    gripper = SimpleNamespace(held_tool=lambda _: None, diameters=SimpleNamespace(update=lambda *_: None))
+    task = estimates("right", RecordingPublisher(), session, gripper=gripper, inputs=SimpleNamespace(record=raw.append))
+    for number, gripper.is_holding in enumerate([*said, True]):
+        await task.process(frame(number))
+        # It may have been completed before the gripper was connected.
+        session.taring = session.taring and not complete
+    assert session.given_up == 1
+    assert [tare_from_bytes(one.data) for one in raw] == [(len(said) - 1, True)], "as a replay finds it"
+    assert log.said == ["right has no idle frame: the gripper holds something"]
+
+
+async def test_an_idle_frame_outlives_the_grip_after_it():
+    session = Taring()
+    gripper = SimpleNamespace(held_tool=lambda _: None, diameters=SimpleNamespace(update=lambda *_: None))
+    task = estimates("right", RecordingPublisher(), session, gripper=gripper)
+    for number, gripper.is_holding in enumerate([False, False, True, True]):
+        await task.process(frame(number))
+        session.taring = False
+    assert session.given_up == 0
+
+
 def test_the_configured_frame_period_is_the_boards():
     assert FingertipConfig.model_fields["frame_period_s"].default == FRAME_PERIOD_S
 

@@ -40,7 +40,9 @@ RELATIVE = 1e-9
 
 
 class Gripper:
-    """Holds a tool while the number of estimates is within a range."""
+    """Holds a tool while the number of estimates is within a range, and says nothing of it else."""
+
+    is_holding = False
 
     def __init__(self, estimates: FingertipTask, tool: Measured, held: range) -> None:
         self._estimates, self._tool, self._held = estimates, tool, held

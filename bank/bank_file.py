@@ -17,6 +17,7 @@ import hashlib
 import json
 import math
 import os
+import shlex
 import struct
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -245,7 +246,8 @@ def how_to_build(path: Path) -> str:
     definitions = [folder / f"{path.stem}.yaml" for folder in folders]
     named = next((one for one in definitions if one.is_file()), None)
     example = ", from a FILE such as banks/paper.yaml" if named is None else ""
-    return f"build it with `shearloop bank build --config {named or 'FILE'} --out {path}`{example}"
+    definition = "FILE" if named is None else shlex.quote(str(named))
+    return f"build it with `shearloop bank build --config {definition} --out {shlex.quote(str(path))}`{example}"
 
 
 def _unusable(path: Path, why: str) -> BankFileError:

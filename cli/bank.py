@@ -1,6 +1,7 @@
 """`shearloop bank`: solve, design, build and inspect banks of simulated signals."""
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -105,7 +106,7 @@ def _design(args: argparse.Namespace) -> int:
         return 0
     with writing(args.out, "the design"):
         args.out.write_text(text, encoding="utf-8")
-    print(f"Build it: shearloop bank build --config {args.out} --out FILE", file=sys.stderr)
+    print(f"Build it: shearloop bank build --config {shlex.quote(str(args.out))} --out FILE", file=sys.stderr)
     return 0
 
 

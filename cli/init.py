@@ -1,6 +1,7 @@
 """`shearloop init DIR`: write a commented configuration and experiments to start from."""
 
 import argparse
+import shlex
 from importlib import resources
 from pathlib import Path
 
@@ -27,7 +28,8 @@ def run(args: argparse.Namespace) -> int:
     if present := [args.folder / path for path in files if (args.folder / path).exists()]:
         raise UserError(f"{present[0]} exists: nothing was written; choose another folder")
     write_files(args.folder, files)
-    print(f"{args.folder / 'rig.yaml'}: edit it, then run `shearloop check {args.folder / 'rig.yaml'}`")
+    rig = args.folder / "rig.yaml"
+    print(f"{rig}: edit it, then run `shearloop check {shlex.quote(str(rig))}`")
     print(f"{args.folder / 'ur.yaml'}: set the robot's address and every limit")
     return 0
 

@@ -2,8 +2,9 @@
 
 import argparse
 import json
+import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -137,7 +138,7 @@ def _summary_text(found: "RecordingSummary") -> str:
         for step in found.clock_steps
     ]
     if not found.closed:
-        cure = f"`shearloop recording repair {found.path}` makes an indexed copy"
+        cure = f"`shearloop recording repair {shlex.quote(found.path)}` makes an indexed copy"
         cure = cure if found.topics else "It holds no intact message"
         torn = counted(found.torn_bytes, "byte is", "bytes are")
         lines.append(f"  It was not closed, or is being written; {torn} incomplete. {cure}.")
@@ -221,7 +222,17 @@ def _export(args: argparse.Namespace) -> int:
                 print(f"{path}: {counted(count, 'hold')} without a slice: {reason}", file=sys.stderr)
         else:
             written = export(path, form, out, topics, progress)
+    # Slices of several recordings may share a folder.
+    if form not in (*_SINGLE_FILES, "slices") and (others := _others(written)):
+        print(f"Not of this export, and there before: {', '.join(map(str, others))}.", file=sys.stderr)
     return print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
+
+
+def _others(written: Sequence[Path]) -> list[Path]:
+    """Return files of the same kinds next to those of an export, which look like its own."""
+    kinds = {(path.parent, path.suffix) for path in written if path.is_file()}
+    found = {path for folder, ending in kinds for path in folder.glob(f"*{ending}")}
+    return sorted(found - {*written})
 
 
 def _import(args: argparse.Namespace) -> int:

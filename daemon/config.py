@@ -256,6 +256,9 @@ class DaemonConfig(ConfigModel):
         "name it in a configuration as `experiment`, or start it with `shearloop command start --experiment FILE`",
         "steps",
     )
+    _of_robot = not_of_kind("the robot's settings", "name this file in a configuration as `robot`", "host")
+    _of_fingertip = not_of_kind("a fingertip's description", "name it in a bank's as `fingertip`", "electrodes")
+    _of_bank = not_of_kind("a bank's description", "`shearloop bank build --config FILE` takes it", "sigma")
 
     name: str = Field("", max_length=60, description="name of the rig, for the page; default: that of this file")
     publish: Address = Field(addresses.PUBLISH_ADDRESS, description="ZeroMQ address of the messages")

@@ -7,6 +7,7 @@ no dates, fixed order, no compression.
 import io
 import math
 import os
+import shlex
 import types
 import zipfile
 from collections.abc import Callable
@@ -109,7 +110,7 @@ def kind_of(path: Path) -> str:
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Return header and arrays; raises CalibrationError for a file that is missing, truncated or no calibration."""
     damage = "this is not a calibration, or it is truncated or damaged ({}); calibrate again"
-    missing = f"; make one with `shearloop calibrate REC… --out {path}`"
+    missing = f"; make one with `shearloop calibrate REC… --out {shlex.quote(str(path))}`"
     with refusing_damage(path, CalibrationError, "the calibration", damage, missing):
         header, arrays = _read_members(path)
     if not isinstance(header, dict) or not str(header.get("kind")).startswith(_PREFIX):

@@ -1,6 +1,7 @@
 """Sessions of the configured fingertips: files are opened, and what the control loop knows of their torques."""
 
 import os
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from weakref import WeakValueDictionary
@@ -72,10 +73,15 @@ def open_session(config: FingertipConfig, name: str) -> Session:
         return _open(config.calibration, calibration, config)
     if config.estimator not in (None, PaperEstimator.name):
         found = "none is configured" if config.calibration is None else f"{config.calibration} does not exist"
-        options = f"--sides {name} --estimator {config.estimator} --out {config.calibration or 'CAL'}"
+        options = f"--sides {name} --estimator {config.estimator} --out {shlex.quote(str(config.calibration or 'CAL'))}"
         raise UserError(
             f"the estimator {config.estimator} of {name} needs a calibration on recordings, and {found}; make one with "
             f"`shearloop calibrate REC… {options}`"
+        )
+    if config.bank is None and config.estimator is None and config.calibration is None:
+        raise UserError(
+            f"the fingertip {name} has no calibration and no bank: add `calibration:` for its torque, or `bank:` for k "
+            "and sigma"
         )
     if config.bank is None:
         raise _without_bank(PaperEstimator.name, name)

@@ -178,18 +178,24 @@ class _Row(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    r1_ohm: float = Field(gt=0)
-    r2_ohm: float = Field(gt=0)
-    shear_n: float
+    # Larger numbers have another unit: mΩ, or mN. No source of ours feeds such a gauge, and no skin bears such a force.
+    r1_ohm: float = Field(gt=0, le=10_000)
+    r2_ohm: float = Field(gt=0, le=10_000)
+    shear_n: float = Field(ge=-100, le=100)
     # A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
-    normal_n: float = Field(ge=-0.05)
+    normal_n: float = Field(ge=-0.05, le=100)
 
 
 def read_table(path: Path) -> CalibrationTable:
     """Return the rows of a CSV file with these columns; raises CalibrationError with the line and column at fault."""
     try:
-        with open_file(path) as raw, io.TextIOWrapper(raw, newline="", encoding="utf-8") as file:
+        # Spreadsheets begin a file with a mark of its encoding.
+        with open_file(path) as raw, io.TextIOWrapper(raw, newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, restkey="a value without a column")
+            if any(";" in name for name in reader.fieldnames or ()):
+                raise CalibrationError(
+                    f"{path}: semicolons separate the columns; write commas, and points in the numbers."
+                )
             rows = [validated(row, _Row, f"{path}, line {reader.line_num}", CalibrationError) for row in reader]
     except OSError as error:
         raise CalibrationError(f"{path}: the table cannot be read: {error.strerror}.") from error

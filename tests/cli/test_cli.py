@@ -73,6 +73,9 @@ def fingertip(**changes: Any) -> dict[str, Any]:
     [
         ({"fingertips": {}}, ["fingertips"]),
         ({"fingertip": {}}, ["fingertip: is not a known key; did you mean fingertips?"]),
+        ({"host": "a"}, ["this is the robot's settings; name this file in a configuration as `robot`"]),
+        ({"electrodes": []}, ["this is a fingertip's description; name it in a bank's as `fingertip`"]),
+        ({"sigma": {}}, ["this is a bank's description; `shearloop bank build --config FILE` takes it"]),
         ({"publish": "tcp://lab-pc:7761"}, ["publish", "loopback"]),
         ({"publish": "tcp://127.0.0.1:70000"}, ["publish: must end in a port, a whole number up to 65535, as in tcp"]),
         ({"commands": "tcp://127.0.0.1:7762a"}, ["commands: must end in a port, a whole number"]),

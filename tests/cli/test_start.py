@@ -59,6 +59,10 @@ def test_schema_prints_every_kind(ran):
 def test_init_writes_files_that_load_and_changes_none(tmp_path, ran, mistake):
     folder = tmp_path / "my" / "rig"
     assert f"shearloop check {folder / 'rig.yaml'}" in ran("init", folder).out
+    spaced = tmp_path / "my rig"
+    assert f"`shearloop check '{spaced / 'rig.yaml'}'`" in ran("init", spaced).out
+    said = mistake("check", spaced / "rig.yaml")
+    assert f"bank build --config '{spaced / 'banks/paper.yaml'}' --out '{spaced / 'paper.bank'}'`" in said
     config = load_daemon_config(folder / "rig.yaml")
     assert config.robot == folder / "ur.yaml"
     assert not config.emulators

@@ -3,6 +3,7 @@
 import asyncio
 import ctypes
 import os
+import shlex
 import shutil
 import sys
 import time
@@ -92,7 +93,7 @@ def examine(
         yield from check_daemon(config, tasks, received)
     elif config.emulators:
         means = "they exist only while the daemon runs"
-        cure = f"`shearloop run {config_path}`, then run the doctor again"
+        cure = f"`shearloop run {shlex.quote(str(config_path))}`, then run the doctor again"
         yield note("devices", "the configuration emulates them", means, cure)
     else:
         yield good("daemon", "not running with this configuration: the devices are free")

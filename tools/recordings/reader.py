@@ -4,6 +4,7 @@ A file is read twice: first all of its bytes, which shows a cut or damaged file 
 by its index.
 """
 
+import shlex
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
@@ -128,7 +129,9 @@ def reading(path: Path) -> Iterator[None]:
                 f"{path}: the recording is whole, and its content cannot be used: {detail}; another program wrote or "
                 "changed it, so make it again there"
             ) from error
-        cure = f"`shearloop recording repair {path}` saves the intact part" if intact else NOTHING_INTACT
+        cure = (
+            f"`shearloop recording repair {shlex.quote(str(path))}` saves the intact part" if intact else NOTHING_INTACT
+        )
         raise UserError(f"{path}: the recording was not closed, or is damaged ({detail}); {cure}") from error
 
 

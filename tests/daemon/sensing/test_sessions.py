@@ -160,7 +160,8 @@ def test_check_and_log_say_where_the_strength_of_a_grip_is_not_checked(calibrati
         (lambda _: open_session(fingertip(estimator=NAME, calibration="no.cal"), "right"), "no.cal does not"),
         (lambda _: open_session(fingertip(estimator=NAME, calibration="c" * 300), "right"), "ccc does not exist"),
         (lambda _: open_session(fingertip(calibration=__file__), "right"), "calibrate again"),
-        (lambda _: open_session(fingertip(), "right"), "needs a bank; add `bank:`"),
+        (lambda _: open_session(fingertip(), "right"), "right has no calibration and no bank: add `calibration:` for"),
+        (lambda _: open_session(fingertip(estimator="paper"), "right"), "needs a bank; add `bank:`"),
         (lambda f: open_combined(CombinedConfig(calibration=f["combined"]), {"right": fingertip()}), "of both, and"),
     ],
 )  # fmt: skip

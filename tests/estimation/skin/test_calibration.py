@@ -262,6 +262,9 @@ def test_a_table_is_read_whatever_the_order_of_its_columns(tmp_path):
     path.write_text("shear_n,normal_n,r1_ohm,r2_ohm\n0,0,25,26\n0.5,1,26,26\n")
     table = read_table(path)
     np.testing.assert_array_equal(astuple(table), [[25, 26], [26, 26], [0, 0.5], [0, 1]])
+    # As a spreadsheet writes it.
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    np.testing.assert_array_equal(astuple(read_table(path)), astuple(table))
 
 
 @pytest.mark.parametrize(
@@ -274,6 +277,12 @@ def test_a_table_is_read_whatever_the_order_of_its_columns(tmp_path):
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0\n25,x,0,0\n", "line 3: r2_ohm: 'x' is not a number"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0\n", "line 2: normal_n: .* is not a number"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0,0\n", "line 2: a value without a column: "),
+        (
+            "r1_ohm;r2_ohm;shear_n;normal_n\n25,1;25,2;0;0\n",
+            "semicolons separate the columns; write commas, and points",
+        ),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n25000,25,0,0\n", "r1_ohm: '25000' .*; allowed: above 0 to 10000"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,500,0\n", "shear_n: '500' .*; allowed: from -100 to 100"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,inf,0,0\n", "r2_ohm: 'inf' is not a finite number"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n0,25,0,0\n", "r1_ohm: '0' .*; allowed: above 0"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0\n25,25,1,-1\n", "line 3: normal_n: '-1' .*; allowed: from -0.05"),

@@ -148,6 +148,20 @@ def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_
     )
 
 
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_files_of_an_earlier_export_are_named(form, mat_folder, tmp_path, ran):
+    if form == "parquet":
+        pytest.importorskip("pyarrow", reason="needs the extra `export`")
+    for name, sides in (("both", ("Right_Data", "Left_Data")), ("one", ("Right_Data",))):
+        ran("recording", "import", "mat", mat_folder(name, sides=sides), "--out", tmp_path / f"{name}.mcap")
+    exported = [
+        ran("recording", "export", tmp_path / f"{name}.mcap", "--format", form, "--out", tmp_path / "x").err
+        for name in ("both", "both", "one")
+    ]
+    left = tmp_path / "x" / f"eit.frame.left.{form}"
+    assert exported == ["", "", f"Not of this export, and there before: {left}.\n"]
+
+
 def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alone():
     said = [
         "outside the calibration: the Q residual is 2.1 (at most 1.5)",

@@ -1,12 +1,12 @@
 """The gripper of a commissioning: one motion after the other, each to its end."""
 
 import asyncio
-from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Protocol
 
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState
 from shearloop.drivers.robotiq.models import GripperModel
+from shearloop.tools.commission.opened import Opened
 
 FINGERS_MM_PER_S: Final = 60.0
 # For gauges and objects that are held by hand, and for a tool.
@@ -31,7 +31,7 @@ class Hand(Protocol):
         """Move the fingers, and return the state at their target or on an object."""
 
 
-class ConnectedHand:
+class ConnectedHand(Opened):
     """The gripper through its driver; a context, which opens and closes the connection. A grip stays."""
 
     def __init__(self, gripper: RobotiqGripper) -> None:
@@ -39,22 +39,12 @@ class ConnectedHand:
         self._gripper = gripper
         self._runner = asyncio.Runner()
 
-    def __enter__(self) -> Self:
+    def open(self) -> None:
         """Connect; raises DriverError."""
-        try:
-            self._runner.run(self._gripper.connect())
-        except BaseException:
-            self._close()
-            raise
-        return self
+        self._runner.run(self._gripper.connect())
 
-    def __exit__(
-        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         """Close the connection."""
-        self._close()
-
-    def _close(self) -> None:
         self._runner.run(self._gripper.close())
         self._runner.close()
 

@@ -5,10 +5,10 @@ import threading
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from operator import attrgetter
-from types import TracebackType
-from typing import Final, Protocol, Self, TypeVar
+from typing import Final, Protocol, TypeVar
 
 from shearloop.tools.commission.arrivals import Arrivals
+from shearloop.tools.commission.opened import Opened
 
 # Opening the port resets an Uno, which starts within some seconds.
 SILENT_S: Final = 15.0
@@ -24,7 +24,7 @@ class _Timed(Protocol):
 TimedT = TypeVar("TimedT", bound=_Timed)
 
 
-class BoardListener(Arrivals[TimedT]):
+class BoardListener(Arrivals[TimedT], Opened):
     """What a board sends; a context, which opens and closes its port."""
 
     def __init__(self, name: str, readings: Callable[[], AsyncGenerator[TimedT]]) -> None:
@@ -36,23 +36,13 @@ class BoardListener(Arrivals[TimedT]):
         self._task: asyncio.Task[None] | None = None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
-    def __enter__(self) -> Self:
+    def open(self) -> None:
         """Begin to listen; raises UserError where the board is silent."""
         self._thread.start()
-        try:
-            self.take(1, SILENT_S)
-        except BaseException:
-            self._close()
-            raise
-        return self
+        self.take(1, SILENT_S)
 
-    def __exit__(
-        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         """Close the port."""
-        self._close()
-
-    def _close(self) -> None:
         if self._task is not None:
             self._loop.call_soon_threadsafe(self._task.cancel)
         self._thread.join()

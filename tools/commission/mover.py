@@ -8,13 +8,13 @@ import subprocess
 import sys
 import threading
 from abc import ABC, abstractmethod
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from shearloop.drivers.ur.messages import encode
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
 from shearloop.tools.commission.arrivals import REAL_CLOCK, Arrivals, Clock
+from shearloop.tools.commission.opened import Opened
 
 Event = dict[str, Any]
 # A controller unlocks a protective stop after 5 s; a worker starts and connects within some seconds more.
@@ -97,7 +97,7 @@ class Mover(ABC):
         return asked_ns
 
 
-class MoverProcess(Mover):
+class MoverProcess(Mover, Opened):
     """Drives the robot through a process of its own, which can die; a context, which ends the process at its end."""
 
     def __init__(self, settings: UrSettings) -> None:
@@ -107,14 +107,11 @@ class MoverProcess(Mover):
         self._reader: threading.Thread | None = None
         self._worker = 0
 
-    def __enter__(self) -> Self:
+    def open(self) -> None:
         """Start the process."""
         self.start()
-        return self
 
-    def __exit__(
-        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         """Stop the arm and end the process."""
         if self._process is not None and self._process.stdin is not None:
             with contextlib.suppress(BrokenPipeError):

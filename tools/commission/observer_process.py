@@ -7,8 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-from types import TracebackType
-from typing import Self
 
 from pydantic import TypeAdapter
 
@@ -17,6 +15,7 @@ from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.errors import UserError
 from shearloop.tools.commission.observer import Observer, Seen
+from shearloop.tools.commission.opened import Opened
 
 _OUTPUTS = TypeAdapter(RtdeOutputs)
 _CONNECTS_WITHIN_S = 10.0
@@ -24,43 +23,42 @@ _CONNECTS_WITHIN_S = 10.0
 _AGAIN_S = 0.2
 
 
-class ObserverProcess(Observer):
+class ObserverProcess(Observer, Opened):
     """The samples of a process; a context, which ends the process at its end."""
 
     def __init__(self, host: str, rate_hz: float, registers: ScriptRegisters) -> None:
-        """Start the process; raises UserError where it receives nothing."""
+        """Take the controller and its registers; nothing is started yet."""
         super().__init__()
-        command = [sys.executable, "-m", "shearloop.tools.commission.observer_process", host]
-        command += [str(rate_hz), str(registers.first)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE)
-        self._reader = threading.Thread(target=self._read, name="observer", daemon=True)
+        self._host = host
+        self._command = [sys.executable, "-m", "shearloop.tools.commission.observer_process", host]
+        self._command += [str(rate_hz), str(registers.first)]
+        self._process: subprocess.Popen[bytes] | None = None
+        self._reader: threading.Thread | None = None
+
+    def open(self) -> None:
+        """Start the process; raises UserError where it receives nothing."""
+        self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE)
+        self._reader = threading.Thread(target=self._read, args=(self._process,), name="observer", daemon=True)
         self._reader.start()
         if self.wait_for(lambda _: True, self.clock.now_ns(), _CONNECTS_WITHIN_S) is None:
-            self.close()
-            raise UserError(f"the observer receives nothing from the controller at {host}: look at the teach pendant")
-
-    def __enter__(self) -> Self:
-        """Return the observer."""
-        return self
-
-    def __exit__(
-        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
-    ) -> None:
-        """End the process."""
-        self.close()
+            raise UserError(
+                f"the observer receives nothing from the controller at {self._host}: look at the teach pendant"
+            )
 
     def close(self) -> None:
         """End the process."""
-        self._process.kill()
-        self._process.wait()
-        self._reader.join()
-        if self._process.stdout is not None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        if self._reader is not None:
+            self._reader.join()
+        if self._process is not None and self._process.stdout is not None:
             self._process.stdout.close()
 
-    def _read(self) -> None:
-        if self._process.stdout is None:
+    def _read(self, process: "subprocess.Popen[bytes]") -> None:
+        if process.stdout is None:
             return
-        for line in self._process.stdout:
+        for line in process.stdout:
             made_ns, arrived_ns, outputs = line.split(b" ", 2)
             self.add(Seen(int(made_ns), int(arrived_ns), _OUTPUTS.validate_json(outputs)))
 

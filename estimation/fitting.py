@@ -221,9 +221,15 @@ def adapt(
     """Return a calibration with the gain of each fingertip corrected by recordings of known torque, and the correction.
 
     `source` describes them in words. Twists count from each recording's frame of `first_frames` on. The correction is
-    shrunk by their uncertainty. Raises CalibrationError for recordings without a torque estimate under load, and
-    for a calibration without such a gain.
+    shrunk by their uncertainty. Raises CalibrationError for recordings without a torque estimate under load, for those
+    that the calibration is adapted on already, and for a calibration without such a gain.
     """
+    adaptation = f", adapted on {source}"
+    if adaptation in calibration.source:
+        raise CalibrationError(
+            f"the calibration is adapted on {source} already, and the same twists would count twice; adapt the "
+            "calibration that was not"
+        )
     if len(tools := _tools_of(recordings)) > 1:
         raise CalibrationError("the recordings are of several tools; adapt to one at a time")
     calibration = calibration.for_tool(tools[0] if tools else None)
@@ -243,7 +249,7 @@ def adapt(
         )
     features = rows.features[:, calibration.estimator.columns["torque"]]
     adapted, correction = calibration.correct_gain(features, rows.torque_nm, is_first)
-    return replace(adapted, source=f"{calibration.source}, adapted on {source}"), correction
+    return replace(adapted, source=f"{calibration.source}{adaptation}"), correction
 
 
 def _replay(

@@ -59,6 +59,10 @@ class Recording:
     emulated: bool = False
 
 
+def _detail(error: Exception) -> str:
+    return f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
+
+
 def read_recording(path: str | Path) -> Recording:
     """Read the frames, torques and tools of a recording; raises UserError for a file that cannot be used."""
     path = Path(path)
@@ -94,7 +98,7 @@ def read_recording(path: str | Path) -> Recording:
                 elif content["kind"] == InputKind.TOOL.value:
                     tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
             except (KeyError, TypeError, ValueError) as error:
-                raise unusable(path, f"a message on {topic} does not match its schema ({error!r})") from error
+                raise unusable(path, f"a message on {topic} does not match its schema ({_detail(error)})") from error
     with reading(path):
         side_frames = {side: _side_frames(rows) for side, rows in frames.items()}
     notes = {key: value for key, value in identity.items() if key not in _IDENTITY_KEYS}

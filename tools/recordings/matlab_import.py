@@ -22,7 +22,7 @@ from shearloop.daemon.recorder.schema import (
 )
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.eit_kit import slope_below
+from shearloop.drivers.eit_kit import ADC_REFERENCE_V, slope_below
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import measured_delay
@@ -50,7 +50,7 @@ _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
 _SHORTEST_FRAME_S = 0.05
 # Lines that were stamped late are fewer than this fraction.
 _MOST_LATE = 0.1
-# A cable damages fewer load values than this fraction: the two recorded cases are one in a hundred.
+# A cable damages fewer values than this fraction: the two recorded cases are one load value in a hundred.
 _MOST_DAMAGED = 0.1
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
@@ -281,7 +281,7 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
 
     The times in the files are of `time_format`, one of TIME_FORMATS. Time stamps are corrected, and damaged load values
     are left out. Raises UserError for a file without a stream, for two streams of one side, for streams of different
-    times, for other times, for torques of another unit, and if there are no frames.
+    times, for other times, for torques or voltages of another unit, and if there are no frames.
     """
     files = _mat_files(sources)
     load, streams = _read_streams(files, time_format)
@@ -342,9 +342,21 @@ def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | Non
     load = streams.pop("load", None)
     if not streams:
         raise UserError("the files hold no frames of a fingertip; name those of the right or left side as well")
+    for side, stream in streams.items():
+        _check_volts(paths[side], stream.values)
     if load is not None:
         _check_torques(paths["load"], load.values[:, 0])
     return load, streams
+
+
+def _check_volts(path: Path, lines: FloatArray) -> None:
+    """Raise UserError where more values of lines (n, 1024) in volts are impossible than a cable damages."""
+    beyond = np.count_nonzero((lines < 0) | (lines > ADC_REFERENCE_V))
+    if beyond > _MOST_DAMAGED * lines.size:
+        raise UserError(
+            f"{path}: {beyond / lines.size:.0%} of the values are not within 0 to {ADC_REFERENCE_V:g} V, the range of "
+            "the board's converter; write them in volts"
+        )
 
 
 def _check_torques(path: Path, torques: FloatArray) -> None:

@@ -371,6 +371,16 @@ def test_torques_of_another_unit_are_refused(mat_folder, tmp_path):
     assert not list(tmp_path.glob("a.mcap*"))
 
 
+@pytest.mark.parametrize("factor", [1000, -1])
+def test_voltages_of_another_unit_are_refused(factor, mat_folder, tmp_path):
+    folder = mat_folder()
+    table = loadmat(folder / "device0.mat")["Right_Data"]
+    table[:, 1:] *= factor
+    savemat(folder / "device0.mat", {"Right_Data": table})
+    with pytest.raises(UserError, match=r"device0\.mat: 8\d% of the values are not within 0 to 2\.2 V, the range of"):
+        import_mat([folder], tmp_path / "a.mcap")
+
+
 @pytest.mark.parametrize("moved", ["load.mat", "device1.mat"])
 def test_streams_of_two_recordings_are_refused(moved, mat_folder, tmp_path):
     folder, other = mat_folder(), mat_folder("other")

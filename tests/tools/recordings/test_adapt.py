@@ -28,7 +28,9 @@ def loaded(result_of):
     ]
 
 
-def test_two_twists_of_a_grip_correct_the_calibration_of_another(calibration, cylinder, loaded, tmp_path, result_of):
+def test_two_twists_of_a_grip_correct_the_calibration_of_another(
+    calibration, cylinder, loaded, tmp_path, result_of, mistake
+):
     recording, new = cylinder("30mm_2"), tmp_path / "new.cal"
     before = loaded(calibration, recording)
     said = result_of("adapt", calibration, recording, "--time-range", "0:0.38", "--out", new)
@@ -40,6 +42,8 @@ def test_two_twists_of_a_grip_correct_the_calibration_of_another(calibration, cy
     assert after["rmse_nm"] < 0.6 * before["rmse_nm"]
     assert min(before["coverage_95"], after["coverage_95"]) >= 0.9
     assert after["winkler_nm"] < before["winkler_nm"]
+    again = mistake("adapt", new, recording, "--time-range", "0:0.38", "--out", tmp_path / "again.cal")
+    assert "is adapted on 30mm_2.mcap from 0 to 0.38 already, and the same twists would count twice" in again
 
 
 def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder, tmp_path, ran, mistake):

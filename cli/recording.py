@@ -101,10 +101,18 @@ def _local_time(unix_ns: int) -> str:
 def _info(args: argparse.Namespace) -> int:
     from shearloop.tools.recordings.summary import summarise
 
+    mistakes = []
     for path in args.recordings:
-        with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
-            found = summarise(path, progress)
-        print(json.dumps(asdict(found), ensure_ascii=False) if args.json else _summary_text(found))
+        try:
+            with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
+                found = summarise(path, progress)
+        except UserError as error:
+            # The others are readable all the same.
+            mistakes.append(str(error))
+            continue
+        print(json.dumps(asdict(found), ensure_ascii=False) if args.json else _summary_text(found), flush=True)
+    if mistakes:
+        raise UserError("\n".join(mistakes))
     return 0
 
 

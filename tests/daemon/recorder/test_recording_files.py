@@ -293,6 +293,13 @@ def test_info_names_the_version_that_other_commands_refuse(tmp_path, monkeypatch
     assert "It has format version 1, expected 2: other commands refuse it." in said
 
 
+def test_info_shows_the_recordings_beside_an_unreadable_one(tmp_path, ran):
+    written(tmp_path / "a.mcap")
+    said = ran("recording", "info", tmp_path / "none.mcap", tmp_path / "a.mcap", "--json", status=2)
+    assert json.loads(said.out)["path"] == str(tmp_path / "a.mcap")
+    assert "none.mcap: the recording cannot be read: No such file or directory" in said.err
+
+
 def test_an_unwritable_recording_is_an_error(tmp_path):
     with pytest.raises(UserError, match="choose another --out"), new_recording(tmp_path / "no" / "where.mcap", "x"):
         pass

@@ -9,6 +9,7 @@ gain only as far as twists of one recording agree.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -30,10 +31,13 @@ FIRST_SPREAD, _PRIOR_GRIPS = 0.2, 1
 TOOL_SPREAD = 0.7
 # The minimum spread of a recording's twists: a few equal ones are chance.
 _LEAST_WITHIN = 0.05
-_LEAST_NOISE, _LEAST_ZERO = 1e-3, 1e-6
+_LEAST_NOISE, _LEAST_ZERO, _LEAST_CHANGE = 1e-3, 1e-6, 1e-3
 # The gain drifts while the gel settles, so successive twists deviate alike from the later ones, by this share of the
 # variance; more twists do not average it away.
 _ALIKE = 0.8
+# Twists change the gain where the square of their deviation, in standard errors, exceeds what one more unknown gains by
+# chance (Akaike 1974).
+_BY_CHANCE = 2.0
 # Furthest diameter beyond the calibrated ones, as a ratio.
 _REACH = 1.5
 # A frame is loaded above this fraction of the largest torque.
@@ -137,39 +141,74 @@ class GainSpread:
 
         The logarithms of the factors and the offset have normal priors, and each twist is one equation, along its
         torque: errors of its shape come from delays, not from the gain. Frames of a twist share its gain, so a long
-        twist determines the gain no better than twists agree. `first` (n,) marks frames of the first twist after a
-        grip. With `bounded` a frame without load counts only while it is predicted above zero. Raises CalibrationError
-        where the twists do not follow the torque, or leave the gain as uncertain as before.
+        twist determines the gain no better than twists agree. A deviation that may be chance leaves the factors at 1:
+        on a grip with the calibration's gain, following it would only add an error. `first` (n,) marks frames of the
+        first twist after a grip. With `bounded` a frame without load counts only while it is predicted above zero.
+        Raises CalibrationError where the twists do not follow the torque, or leave the gain as uncertain as before.
         """
         loaded = np.concatenate(twists)
         is_first = np.array([first is not None and bool(first[rows].any()) for rows in twists])
         # Variances of the logarithm: the part common to successive twists, and each twist's part.
         common = _ALIKE * self.within**2
         own = self.within**2 - common + np.where(is_first, self.first_spread**2, 0.0)
-        explained = common + float(own.mean()) / len(twists)
-        spread = self._with_this(parts.sum(axis=1)[loaded], truth[loaded], explained)
-        equations = self._equations(parts, truth, twists, is_first, common, own, spread.between, bounded=bounded)
-        m = parts.shape[1]
-        x = _least_squares(equations.residuals, equations.slopes, np.zeros(m + 1))
-        if x is None:
-            raise CalibrationError("the gain of these twists does not settle; twist further, and several times")
-        factors, offset_nm = np.exp(x[:m]), float(x[m])
-        slope = equations.slopes(x)
+        whole = parts.sum(axis=1)
+        spread = self._with_this(whole[loaded], truth[loaded], common + float(own.mean()) / len(twists))
+        known = partial(self._equations, parts, truth, twists, is_first, common, own, bounded=bounded)
+        prior = known(spread.between)
+        x = prior.solve()
+        slope = prior.slopes(x)
         covariance: FloatArray = np.asarray(np.linalg.inv(slope.T @ slope))
-        before = _relative_error(np.diag(equations.prior**2), parts[loaded], factors, offset_nm)
-        left = _relative_error(covariance, parts[loaded], factors, offset_nm)
+        m = parts.shape[1]
+        before = _relative_error(np.diag(prior.prior**2), parts[loaded], x)
+        left = _relative_error(covariance, parts[loaded], x)
         if left > _MOST_LEFT * before:
             raise CalibrationError(
                 "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
                 "these are too small; twist further, and several times"
             )
+        seen = self._deviation(whole, truth, twists, is_first, common, own)
+        shrunk = known(min(spread.between, seen.beyond_chance)).solve()
+        if m > 1 and prior.misfit(shrunk) - prior.misfit(x) > _BY_CHANCE * m:
+            # The fingertips' gains have changed against each other, which their sum does not show.
+            shrunk = x
+        followed = _log_total(parts[loaded], x) - _log_total(parts[loaded], shrunk)
+        left = math.hypot(left, followed)
+        if is_first.all():
+            # How far first twists deviate is known from few grips: one that may be chance narrows nothing.
+            left = math.sqrt((1.0 - seen.unchanged) * left**2 + seen.unchanged * spread.between**2)
+        factors = np.exp(shrunk[:m])
         return GainCorrection(
             factors,
             factors * np.sqrt(np.diag(covariance))[:m],
-            offset_nm,
+            float(shrunk[m]),
             replace(spread, between=min(left, spread.between)),
             len(twists),
         )
+
+    def _deviation(
+        self,
+        whole: FloatArray,
+        truth: FloatArray,
+        twists: Sequence[IntArray],
+        is_first: BoolArray,
+        common: float,
+        own: FloatArray,
+    ) -> "_Deviation":
+        """Return the twists' deviation from the calibration's gain, of the sums `whole` (n,) of the parts.
+
+        Other parameters are as in `_equations`.
+        """
+        gains: list[float] = []
+        variances: list[float] = []
+        for rows, first, variance in zip(twists, is_first, own.tolist(), strict=True):
+            gain = log_gain(whole[rows], truth[rows])
+            if gain is not None:
+                gains.append(gain - (self.first if first else 0.0))
+                power = max(float(whole[rows] @ whole[rows]), self.noise_nm**2)
+                variances.append(variance + self.noise_nm**2 / power)
+        weights = np.linalg.solve(np.diag(variances) + common, np.ones(len(gains)))
+        variance = 1.0 / float(weights.sum())
+        return _Deviation(variance * float(weights @ np.array(gains)), variance)
 
     def _equations(
         self,
@@ -228,6 +267,24 @@ class GainSpread:
         return self._with_recordings([max(gain**2 - explained, 0.0)])
 
 
+@dataclass(frozen=True, slots=True)
+class _Deviation:
+    """The logarithm of the gain of some twists against the calibration's, and its variance."""
+
+    log_gain: float
+    variance: float
+
+    @property
+    def beyond_chance(self) -> float:
+        """The standard deviation of the gain from grip to grip that these twists show beyond chance."""
+        return max(math.sqrt(max(self.log_gain**2 - _BY_CHANCE * self.variance, 0.0)), _LEAST_CHANGE)
+
+    @property
+    def unchanged(self) -> float:
+        """How likely an unchanged gain is against a changed one, 1 within chance (Akaike's relative likelihood)."""
+        return min(1.0, math.exp((_BY_CHANCE - self.log_gain**2 / self.variance) / 2.0))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Equations:
     """What twists say of the unknowns x: the logarithms of m factors, and the offset. In standard errors.
@@ -243,6 +300,18 @@ class _Equations:
     weight: float
     prior: FloatArray
     bounded: bool
+
+    def solve(self) -> FloatArray:
+        """Return the unknowns (m + 1,); raises CalibrationError where they do not settle."""
+        x = _least_squares(self.residuals, self.slopes, np.zeros(len(self.prior)))
+        if x is None:
+            raise CalibrationError("the gain of these twists does not settle; twist further, and several times")
+        return x
+
+    def misfit(self, x: FloatArray) -> float:
+        """Return the sum of the squared residuals without those of the prior."""
+        known = self.residuals(x)[: -len(self.prior)]
+        return float(known @ known)
 
     def residuals(self, x: FloatArray) -> FloatArray:
         """Return the (k + n + m + 1,) residuals."""
@@ -370,15 +439,22 @@ def _least_squares(
     return None
 
 
-def _relative_error(covariance: FloatArray, parts: FloatArray, factors: FloatArray, offset_nm: float) -> float:
+def _relative_error(covariance: FloatArray, parts: FloatArray, x: FloatArray) -> float:
     """Return the standard error of (n, m) corrected parts as a ratio of their sum, both as root mean squares.
 
-    `covariance` (m + 1, m + 1) is that of the factors' logarithms and of the offset.
+    `covariance` (m + 1, m + 1) is that of the unknowns x: the factors' logarithms, and the offset.
     """
+    factors, offset_nm = np.exp(x[:-1]), float(x[-1])
     slopes = np.column_stack([parts * factors, np.ones(len(parts))])
     corrected = parts @ factors + offset_nm
     variances = np.einsum("ni,ij,nj->n", slopes, covariance, slopes)
     return float(np.sqrt(variances.mean() / (corrected**2).mean()))
+
+
+def _log_total(parts: FloatArray, x: FloatArray) -> float:
+    """Return the logarithm of the size of (n, m) parts that are corrected by the unknowns x."""
+    corrected = parts @ np.exp(x[:-1]) + x[-1]
+    return 0.5 * math.log(float(corrected @ corrected))
 
 
 def _pooled(prior: float, counts_as: int, squares: Sequence[float]) -> float:

@@ -96,6 +96,32 @@ def test_the_first_twist_corrects_less_than_a_later_one_and_only_from_its_own_me
     assert expected == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("gain", [0.8, 1.0, 1.25])
+def test_a_first_twist_whose_deviation_may_be_chance_changes_nothing(gain):
+    """First twists deviate by 20 %. Following one on a grip with the calibration's gain would add that error."""
+    spread = GainSpread(between=0.28, within=0.05, noise_nm=0.001)
+    parts, truth = TWISTS[:8, None] / gain, TWISTS[:8]
+    found = spread.correct(parts, truth, find_twists(truth), first=truth > 0, bounded=False)
+    assert found.factors[0] == pytest.approx(1.0, abs=0.001)
+    # It does not show either that the gain is the calibration's.
+    assert found.spread.between > 0.2
+
+
+def test_a_first_twist_that_deviates_further_than_first_twists_do_is_followed():
+    spread = GainSpread(between=0.28, within=0.05, noise_nm=0.001)
+    parts, truth = TWISTS[:8, None] / 2.0, TWISTS[:8]
+    found = spread.correct(parts, truth, find_twists(truth), first=truth > 0, bounded=False)
+    assert 1.5 < found.factors[0] < 2.0
+    assert found.spread.between < 0.22
+
+
+def test_later_twists_that_agree_with_the_calibration_narrow_the_interval():
+    spread = GainSpread(between=0.28, within=0.05, noise_nm=0.001)
+    found = spread.correct(TWISTS[:24, None] / 1.03, TWISTS[:24], find_twists(TWISTS[:24]), bounded=False)
+    assert found.factors[0] == pytest.approx(1.0, abs=0.001)
+    assert found.spread.between < 0.08
+
+
 def test_every_grip_has_a_first_twist():
     grips = np.repeat([0, 1], 40)
     assert np.flatnonzero(first_twists(TWISTS, grips)).tolist() == [3, 4, 5, 43, 44, 45]

@@ -166,16 +166,18 @@ class GainSpread:
                 "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
                 "these are too small; twist further, and several times"
             )
-        seen = self._deviation(whole, truth, twists, is_first, common, own)
-        shrunk = known(min(spread.between, seen.beyond_chance)).solve()
-        if m > 1 and prior.misfit(shrunk) - prior.misfit(x) > _BY_CHANCE * m:
-            # The fingertips' gains have changed against each other, which their sum does not show.
-            shrunk = x
-        followed = _log_total(parts[loaded], x) - _log_total(parts[loaded], shrunk)
-        left = math.hypot(left, followed)
-        if is_first.all():
-            # How far first twists deviate is known from few grips: one that may be chance narrows nothing.
-            left = math.sqrt((1.0 - seen.unchanged) * left**2 + seen.unchanged * spread.between**2)
+        shrunk = x
+        # On another tool nothing says that the gain is the calibration's.
+        if not self.zero:
+            seen = self._deviation(whole, truth, twists, is_first, common, own)
+            shrunk = known(min(spread.between, seen.beyond_chance)).solve()
+            if m > 1 and prior.misfit(shrunk) - prior.misfit(x) > _BY_CHANCE * m:
+                # The fingertips' gains have changed against each other, which their sum does not show.
+                shrunk = x
+            left = math.hypot(left, _log_total(parts[loaded], x) - _log_total(parts[loaded], shrunk))
+            if is_first.all():
+                # How far first twists deviate is known from few grips: one that may be chance narrows nothing.
+                left = math.sqrt((1.0 - seen.unchanged) * left**2 + seen.unchanged * spread.between**2)
         factors = np.exp(shrunk[:m])
         return GainCorrection(
             factors,

@@ -122,9 +122,9 @@ def test_what_no_sensor_is_needed_for_is_said(sides, kind, said):
 @pytest.mark.parametrize(("kind", "n_blocks"), [("twists", 3), ("grips", 2)])
 def test_the_first_twist_adapts_and_is_neither_fitted_nor_judged(kind, n_blocks):
     recordings = MATERIAL[kind]()
-    # The judged recording's grip has another gain than the fit expects.
+    # The judged recording's grip has another gain than the fit expects, further off than first twists are by chance.
     if kind == "grips":
-        recordings[0] = replace(recordings[0], torque_nm=1.3 * recordings[0].torque_nm)
+        recordings[0] = replace(recordings[0], torque_nm=1.4 * recordings[0].torque_nm)
     names = ["a", "b"][: len(recordings)]
     blocks = after_twists(find_blocks(kind, recordings, names), recordings, 1)
     assert len(blocks) == n_blocks

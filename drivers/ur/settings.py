@@ -306,8 +306,8 @@ class UrSettings(_Checked):
 
     @property
     def warning(self) -> str:
-        """A sentence where that is longer than docs/safety.md promises, else empty."""
-        if self.standstill_s <= _PROMISED_S:
+        """A sentence where that is longer than docs/safety.md promises, else empty. An emulated robot promises nothing."""
+        if self.standstill_s <= _PROMISED_S or is_loopback_host(self.host):
             return ""
         return (
             f"With these deadlines and accelerations the wrist may turn for {self.standstill_s:.2g} s after the last "

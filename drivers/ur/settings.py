@@ -306,7 +306,7 @@ class UrSettings(_Checked):
 
     @property
     def warning(self) -> str:
-        """A sentence where that is longer than docs/safety.md promises, else empty. An emulated robot promises nothing."""
+        """A sentence where a robot elsewhere takes longer than docs/safety.md promises, else empty."""
         if self.standstill_s <= _PROMISED_S or is_loopback_host(self.host):
             return ""
         return (

@@ -98,3 +98,5 @@ def test_watchdog_is_slower_than_any_stop(tmp_path, command_timeout_s) -> None:
 def test_deadlines_that_loosen_the_promise_are_named(tmp_path) -> None:
     slow = read_settings(changed(tmp_path, ("host: 192.168.1.10", "host: 192.168.1.10\ncommand_timeout_s: 1")))
     assert "the wrist may turn for 1 s after the last decision, longer than 0.2 s" in slow.warning
+    emulated = read_settings(changed(tmp_path, ("host: 192.168.1.10", "host: 127.0.0.1\ncommand_timeout_s: 1.0")))
+    assert emulated.warning == ""

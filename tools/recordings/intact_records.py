@@ -73,6 +73,8 @@ _KINDS: Mapping[int, Any] = MappingProxyType(
 # The name of a chunk's compression, with its length, and its place in the record.
 _COMPRESSIONS, _COMPRESSION_AT = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4"), 37
 _SEARCHED_BYTES = 1 << 20
+# So many records in a row are taken for what the file's writer wrote.
+_RECORDS_IN_A_ROW = 3
 
 
 @dataclass(slots=True)
@@ -225,11 +227,24 @@ class IntactRecords:
             return (record if checksum in (0, zlib.crc32(content[:-4])) else None), end
         return None if record is None else (record, end)
 
+    def _continues(self, file: BinaryIO, at: int) -> bool:
+        """Return whether records follow one another from `at`: bytes within a record may look like one alone."""
+        if at >= self.size:
+            return False
+        for _ in range(_RECORDS_IN_A_ROW):
+            found = self._record_at(file, at)
+            if found is None:
+                return False
+            record, at = found
+            if isinstance(record, Footer) or at == self.size:
+                return True
+        return True
+
     def _next_place(self, file: BinaryIO, at: int, places: list[int]) -> int | None:
         """Return where the next record begins after a damaged one at `at`, or None."""
         file.seek(at + 1)
         stated = at + _HEAD_BYTES + int.from_bytes(file.read(_HEAD_BYTES - 1), "little")
-        if stated < self.size and self._record_at(file, stated) is not None:
+        if self._continues(file, stated):
             return stated
         if places:
             return next((place for place in places if place > at), None)

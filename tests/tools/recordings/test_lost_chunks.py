@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoopState, wire_map
@@ -126,6 +126,30 @@ def test_a_topic_defined_in_the_first_chunk_only_is_taken_from_the_index(tmp_pat
     result = repair(path)
     assert (result.messages, result.lost) == (4, {"load.torque": 1})
     assert messages(result.path) == {("load.torque", number) for number in range(1, 5)}
+
+
+def test_bytes_of_a_damaged_chunk_that_look_like_a_record_cost_no_other_chunk(tmp_path):
+    """Where its length says one byte too few, its last byte, here the number of a message, seems to begin a record."""
+    path = tmp_path / "x.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1, compression=CompressionType.NONE)
+        writer.start("x")
+        writer.add_metadata("shearloop", basic_identity("another program"))
+        schema = writer.register_schema("load.torque", "jsonschema", b"{}")
+        channel = writer.register_channel("load.torque", "json", schema)
+        for number in range(5):
+            writer.add_message(channel, 10**18 + number, bytes(4000 + number % 2) + b"\x05", 10**18, number)
+        writer.finish()
+    content = path.read_bytes()
+    odd = [(at, inside) for at, inside in chunks(content) if inside and content[at + 1] & 1]
+    assert odd
+    for at, inside in odd:
+        damaged = bytearray(content)
+        damaged[at + 1] ^= 0x01
+        path.write_bytes(damaged)
+        repaired = tmp_path / f"{at}.mcap"
+        assert repair(path, repaired).lost == {"load.torque": 1}
+        assert messages(repaired) == {("load.torque", number) for number in range(5)} - inside
 
 
 def test_a_damaged_attachment_is_left_out_and_counted(recording, tmp_path, ran):

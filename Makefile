@@ -47,16 +47,12 @@ system-packages:
 demo: demo-python $(VENV)/.installed
 	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--play '$(RECORDING)') || case $$? in 4|130|143) ;; *) exit 1 ;; esac
 
-# Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot in real time wait most of
-# their time, but not for a processor: the others run beside them and let them go first. Status 5: no test was selected.
+# Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot in real time run by
+# themselves, because a robot stops when its computer is busy. Status 5: no test was selected.
 PYTEST := $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
-.PHONY: test-real-time test-others
 test: install-dev
-	$(MAKE) --no-print-directory --jobs=2 test-real-time test-others
-test-real-time:
 	$(PYTEST) -m real_time $(PYTEST_ARGS) || [ $$? -eq 5 ]
-test-others:
-	nice -n 5 $(PYTEST) -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \

@@ -441,7 +441,7 @@ class ControlLoop:
         else:
             velocity = wrist.turn(command.wrist, t_ns, wrist_rad, origin_rad)
         phase = "held" if held else experiment.phase.value
-        self.status = LoopStatus(phase, awaited or command.activity, velocity, decision)
+        self.status = LoopStatus(phase, awaited or experiment.command.activity, velocity, decision)
         return ControlOutput(velocity.speed_rad_per_s, interrupts_motion=still, action=action)
 
     def _awaited_torques(self, experiment: Experiment, t_ns: int) -> str | None:

@@ -35,6 +35,20 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     assert held.std() < 0.006
 
 
+def test_each_message_tells_the_step_and_its_own_activity():
+    """The end of a measurement begins the next step within the same decision."""
+    hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 1}
+    rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, hold, {"do": "release"}, torque_source="load_cell")
+    told: dict[str, set[int]] = {}
+    while phase(rig) is ExperimentPhase.RUNNING:
+        rig.step()
+        message = loop_state(rig.control_loop, 0.0, rig.t_ns)
+        told.setdefault(message.activity.split(",")[0], set()).add(message.step)
+    assert told["measuring the tool's stiffness"] == {2}
+    assert told["bringing the torque to +0.100 N·m"] == {3}
+    assert [activity for activity, steps in told.items() if len(steps) > 1] == []
+
+
 def test_tool_that_was_turned_after_an_experiment_is_identified_again():
     rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.15, "hold_s": 60})
     while not rig.control_loop.experiment.command.hold_number:

@@ -94,7 +94,7 @@ class ControllerReason(StrEnum):
     """Why the wrist does not follow the torque; the text is for the operator."""
 
     NO_SET_POINT = "no torque set point has been given"
-    NOT_MEASURED = "no torque has been measured since the start"
+    NOT_MEASURED = "the controller has just begun and waits for its first torque"
     STALE = "the torque is stale: no valid measurement has come for too long"
     NO_ANGLE = "the robot's wrist angle is missing or not a number"
     NOT_FOLLOWING = "the torque no longer follows the wrist: the grip slips, or the screw broke loose or stripped"

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
@@ -13,6 +13,11 @@ from shearloop.yaml_files import Document
 
 # No length of a tool, a grip or a lever is smaller.
 LEAST_MM = 0.1
+
+
+def _holds(annotation: Any, kind: type) -> bool:
+    """Return whether a field may hold such a value, also in a list or as an alternative."""
+    return annotation is kind or any(_holds(one, kind) for one in get_args(annotation))
 
 
 class ConfigModel(BaseModel):
@@ -25,6 +30,18 @@ class ConfigModel(BaseModel):
     what: ClassVar[str] = "configuration"
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_numbers(cls, content: Any) -> Any:
+        # Pydantic takes true for 1, which may be the largest value allowed.
+        for key, value in content.items() if isinstance(content, Mapping) else ():
+            annotation = cls.model_fields[key].annotation if key in cls.model_fields else None
+            needs_number = (_holds(annotation, int) or _holds(annotation, float)) and not _holds(annotation, bool)
+            given = value if isinstance(value, list) else [value]
+            if needs_number and any(isinstance(one, bool) for one in given):
+                raise ValueError(f"{key} is true or false, which YAML also reads from yes and no; write a number")
+        return content
 
     @field_validator("*")
     @classmethod

@@ -157,11 +157,14 @@ def adapt_to_recordings(
 ) -> tuple[Calibration, GainCorrection]:
     """Return a calibration adapted to the twists within these shares of recordings, and the correction of its gain.
 
-    Raises UserError for recordings that are given twice, and CalibrationError for those that show no gain.
+    Raises UserError for recordings that are given twice, also as copies, and CalibrationError for those that show no
+    gain.
     """
     check_paths_differ(paths)
     start, stop = time_range
-    series = [one for path in paths for one in read_series(path, calibration.sides, tool_mm)]
+    named = [(str(path), one) for path in paths for one in read_series(path, calibration.sides, tool_mm)]
+    check_no_copies(named)
+    series = [one for _, one in named]
     # Earlier frames show the session the idle fingertip.
     until = [part_of(replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s), 0.0, stop) for one in series]
     first = [part_of(one, start, stop).first_frame for one in series]

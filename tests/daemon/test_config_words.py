@@ -27,6 +27,13 @@ def test_a_text_without_quotes_is_quoted_as_it_was_written(written, tmp_path):
     assert said.endswith(f'put it in quotes: "{written}"')
 
 
+@pytest.mark.parametrize("written", ["yes", "true", "off"])
+@pytest.mark.parametrize("section", ["loop: {kp: %s}", "load_cell: {device: {path: port}, rate_hz: %s}"])
+def test_a_truth_is_no_number(section, written, tmp_path):
+    said = refusal(tmp_path, f"{section % written}\n")
+    assert "is true or false, which YAML also reads from yes and no; write a number" in said
+
+
 @pytest.mark.parametrize("written", ["no", "on", "True"])
 def test_a_name_without_quotes_is_quoted_as_it_was_written(written, tmp_path):
     said = refusal(tmp_path, f"fingertips:\n  right: {{device: {PORT}}}\n  {written}: {{device: {PORT}}}\n")

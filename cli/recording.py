@@ -51,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json(repair)
     summary = "write a recording as tables, or for MATLAB, Rerun, LeRobot or `reproduce`"
     export = add_action(parts, "export", summary, _export)
-    add_option(export, "recording", Path, "REC", "a recording (.mcap or .mcap.partial)")
+    add_option(export, "recording", Path, "REC", "a closed recording (.mcap); `recording repair` closes another")
     choices = ("csv", "parquet", "mat", "rrd", "lerobot", "slices")
     export.add_argument("--format", choices=choices, default="csv", help="files to write (default: %(default)s)")
     add_option(export, "--out", Path, "PATH", "folder to write; for mat and rrd a file (default: next to REC)")

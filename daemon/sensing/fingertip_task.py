@@ -74,9 +74,13 @@ class _Tare:
         self._from_ns = None
         self._until_ns = min(self._until_ns, now_ns)
 
+    def fail(self) -> None:
+        """End it without an idle frame: no later frame completes it."""
+        self._from_ns, self._expired = None, True
+
     def add(self, reason: str, *, taring: bool) -> None:
         """Take the reason of an estimate, and whether more frames are needed."""
-        if self.done.is_set() or self._expired or self._from_ns is not None:
+        if self.done.is_set() or self._expired or not self.begun:
             return
         if not taring:
             self.done.set()
@@ -185,6 +189,7 @@ class FingertipTask:
         return found
 
     def _end_tare(self, number: int, now_ns: int) -> None:
+        self._tare.fail()
         self.session.give_up_tare()
         self._record(InputKind.TARE, now_ns, tare_as_bytes(number, given_up=True))
 

@@ -72,6 +72,8 @@ def safety_table() -> str:
         response = RESPONSES[rule.response]
         if rule.hold_at_most_s is not None:
             response += f"; stop after {rule.hold_at_most_s:g} s"
+        if rule.stops_at_rest:
+            response += "; a stop also where nothing moved"
         rows.append((event.text, response, rule.sentence.format(detail="…").replace("….", "…"), rule.cure))
     return table(("fault", "response", "message", "what to do"), rows)
 

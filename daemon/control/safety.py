@@ -25,7 +25,7 @@ class Rule:
 
     A fault that `is_past` is detected after it is over, such as a pause of the loop. A fault that `explains` is
     reported first, and faults that only hold the wrist count as its consequences: queued data is old, and boards
-    seem lost.
+    seem lost. One that `stops_at_rest` is a stop also where nothing moved: somebody was near the arm, or touched it.
     """
 
     response: Response
@@ -34,6 +34,7 @@ class Rule:
     hold_at_most_s: float | None = None
     is_past: bool = False
     explains: bool = False
+    stops_at_rest: bool = False
 
     @property
     def kind(self) -> str:
@@ -90,11 +91,13 @@ class FaultCode(Enum):
         _KEEP,
         "the robot is in a protective stop: {detail}.",
         "Clear what the robot touched, then `shearloop command unlock`.",
+        stops_at_rest=True,
     )
     EMERGENCY_STOP = Rule(
         _KEEP,
         "the robot's emergency stop is pressed: {detail}.",
         "Release the button, power the arm on at the pendant, then `shearloop command unlock`.",
+        stops_at_rest=True,
     )
     GRIPPER_FAULT = Rule(
         _KEEP,
@@ -291,9 +294,12 @@ class SafetyMonitor:
         return decision if self._stop is None else self._with_stop(self._stop, active)
 
     def report(self, faults: Iterable[Fault]) -> SafetyDecision:
-        """Return the faults while nothing moves: a pending stop is kept, but none begins."""
+        """Return the faults while nothing moves: a pending stop is kept, and only the robot's own stops begin one."""
         active = tuple(faults)
         self._reset_timers()
+        for fault in active:
+            if fault.rule.stops_at_rest:
+                self.stop(fault)
         return SafetyDecision(Response.NOTE, active) if self._stop is None else self._with_stop(self._stop, active)
 
     def stop(self, fault: Fault) -> None:

@@ -317,6 +317,25 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged():
     assert rig.control_loop.start(file, rig.t_ns) is None
 
 
+@pytest.mark.parametrize("own_stop", ["protective_stop", "emergency_stop"])
+def test_a_stop_of_the_robot_itself_waits_for_the_operator_also_where_nothing_moved(own_stop):
+    rig = Rig(new_loop())
+    rig.run(1)
+    rig.arm = replace(rig.arm, **{own_stop: True})
+    rig.step()
+    # Somebody has cleared it at the pendant.
+    rig.arm = replace(rig.arm, **{own_stop: False})
+    rig.run(1)
+    file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "wait", "wait_s": 1}]})
+    refused = rig.control_loop.start(file, rig.t_ns)
+    assert refused is not None
+    assert "a stop has not been acknowledged" in refused
+    assert FaultCode[own_stop.upper()].value.kind in refused
+    rig.control_loop.acknowledge()
+    rig.step()
+    assert rig.control_loop.start(file, rig.t_ns) is None
+
+
 @pytest.mark.parametrize(
     ("device", "sense", "event"),
     [

@@ -25,7 +25,7 @@ from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 from shearloop.daemon.rig import Rig, build_rig, open_settings
-from shearloop.daemon.rig_memory import Remembered, lock_robot
+from shearloop.daemon.rig_memory import lock_robot
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sd_notify import notify
 from shearloop.daemon.sensing.sessions import COMBINED
@@ -124,7 +124,7 @@ class Daemon:
         try:
             await self._run_tasks(on_ready)
             if self.rig is not None and self.rig.memory is not None:
-                await self.rig.memory.save(Remembered.of(self.rig.control_loop))
+                await self.rig.memory.save_present()
             self.health.publish_end(finished=self.finished, summary=self._summary.text)
         finally:
             try:

@@ -232,6 +232,7 @@ class Sensors:
     tasks: Mapping[str, Task]
     tareable: Mapping[str, Tareable]
     combined: CombinedTask | None
+    load_cell: LoadCell | None
 
 
 def build_sensors(
@@ -285,11 +286,12 @@ def build_sensors(
         sources = {name: inputs(name) for name in ReplayedSkin.sources}
         tareable[SKIN] = tasks[SKIN] = skin = SkinTask(config.skin, publisher, clock, loop, sources)
         tasks[SKIN_CURRENT] = skin.source
+    lever: LoadCell | None = None
     if (cell := config.load_cell) is not None:
         calibration = load_cell_calibration(cell)
         lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL), patience)
         tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
-    return Sensors(tasks, tareable, pairs)
+    return Sensors(tasks, tareable, pairs, lever)
 
 
 def log_assumptions(sessions: Mapping[str, Session]) -> None:
@@ -333,7 +335,7 @@ def build_rig(
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, commissioning, gripper_model(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
-    memory = RigMemory(memory_path(settings.host), loop) if not config.autostart else None
+    memory = RigMemory(memory_path(settings.host), loop, sensors.load_cell) if not config.autostart else None
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
     if memory is not None:
         tasks["memory"] = memory

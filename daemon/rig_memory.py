@@ -1,4 +1,7 @@
-"""What must outlive the daemon's process: a stop, the experiment that runs, and the grip; a file for each robot."""
+"""What must outlive the daemon's process: a stop, the experiment that runs, and the grip with the load cell's zero.
+
+There is a file for each robot.
+"""
 
 import asyncio
 import contextlib
@@ -15,6 +18,7 @@ import structlog
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.drivers.load_cell import LoadCell
 from shearloop.errors import UserError
 from shearloop.files import replace_file
 
@@ -34,6 +38,10 @@ class Remembered:
     # The wrist's angle at the grip, and the largest force of the fingers.
     origin_rad: float | None = None
     force_n: float | None = None
+    # The load cell's zero in this grip, in the board's unit, and the torque of one unit, which names its calibration:
+    # with a tool in the fingers nobody can take another zero.
+    load_zero: float | None = None
+    load_nm_per_count: float | None = None
 
     @classmethod
     def of(cls, loop: ControlLoop) -> "Remembered":
@@ -55,10 +63,11 @@ class Remembered:
 
 @dataclass(slots=True)
 class RigMemory:
-    """Keeps a rig's state in a file, which is replaced as a whole; the task follows the control loop."""
+    """Keeps a rig's state in a file, which is replaced as a whole; the task follows loop and load cell."""
 
     path: Path
     loop: ControlLoop
+    load_cell: LoadCell | None = None
     error: str = ""
     # The experiment that is about to begin.
     starting: str = ""
@@ -70,22 +79,31 @@ class RigMemory:
         remembered = read_memory(self.path)
         remembered.restore(self.loop)
         self._written = remembered
+        cell, zero = self.load_cell, remembered.load_zero
+        if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:
+            structlog.get_logger().info("the load cell keeps the zero of the present grip")
+            cell.tare(zero)
 
     async def run(self) -> None:
         """Write every change until cancelled."""
         while True:
-            await self.save(self._present())
+            await self.save_present()
             await asyncio.sleep(FOLLOWS_S)
 
     async def begins(self, experiment: str) -> str | None:
         """Write that an experiment begins, before anything moves; return None, or why it cannot be written."""
         self.starting = experiment
-        await self.save(self._present())
+        await self.save_present()
         return self.error or None
 
-    def _present(self) -> Remembered:
+    async def save_present(self) -> None:
+        """Write the present state, unless the file has it already."""
         state = Remembered.of(self.loop)
-        return replace(state, running=state.running or self.starting)
+        state = replace(state, running=state.running or self.starting)
+        if self.load_cell is not None and self.loop.may_hold():
+            calibration = self.load_cell.calibration
+            state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)
+        await self.save(state)
 
     async def save(self, state: Remembered) -> None:
         """Write a state, unless the file has it already; a failure is logged once, and tried again."""

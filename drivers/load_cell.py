@@ -206,6 +206,11 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
         # A fast board may seem silent to a busy computer; reopening would reset it.
         super().__init__(link, 1.0 / min(rate_hz, LOAD_CELL_RATE_HZ), self._load_parser, inputs, patience)
 
+    @property
+    def calibration(self) -> LoadCalibration:
+        """The present calibration, with the zero of the latest tare."""
+        return self._load_parser.calibration
+
     def tare(self, raw_at_rest: float) -> None:
         """Make a raw value the zero of the samples to come."""
         self._dispatch(serial_sensor.InputKind.TARE, time.monotonic_ns(), repr(raw_at_rest).encode())

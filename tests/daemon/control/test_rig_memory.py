@@ -4,12 +4,14 @@ import asyncio
 import json
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.rig_memory import Remembered, RigMemory, lock_robot, memory_path, read_memory, write_memory
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.errors import UserError
 from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, started, stop
 
@@ -82,6 +84,36 @@ def test_the_angle_of_a_grip_is_remembered_and_forgotten_with_the_grip(tmp_path)
     after.force_n = 0.0
     after.run(0.1)
     assert after.control_loop.grip == (None, None)
+
+
+def load_cell(scale_n_per_count: float = 0.001) -> LoadCell:
+    return LoadCell(SimpleNamespace(), LoadCalibration(tare_counts=8000.0, scale_n_per_count=scale_n_per_count))
+
+
+async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_one(tmp_path):
+    path = tmp_path / "robot.json"
+    rig = started(Rig(new_loop()), GRIP, WAIT)
+    cell = load_cell()
+    memory = RigMemory(path, rig.control_loop, cell)
+    cell.tare(8321.5)
+    rig.run(2)
+    await memory.save_present()
+
+    after, calibrated_anew = load_cell(), load_cell(scale_n_per_count=0.002)
+    again = RigMemory(path, new_loop(), after)
+    RigMemory(path, new_loop(), calibrated_anew)
+    assert after.calibration.tare_counts == 8321.5
+    assert calibrated_anew.calibration.tare_counts == 8000.0
+    # Until the gripper answers, nobody knows of another zero.
+    await again.save_present()
+    assert read_memory(path).load_zero == 8321.5
+
+    rig.force_n = 0.0
+    stop(rig)
+    rig.run(0.6)
+    await memory.save_present()
+    RigMemory(path, new_loop(), free := load_cell())
+    assert free.calibration.tare_counts == 8000.0
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"version": 0, "stop": []}', '{"version": 1, "stop": 3}', "\x00"])

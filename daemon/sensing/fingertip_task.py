@@ -44,11 +44,14 @@ class _Tare:
         self.done.set()
         # By the reason without its numbers: the count, and the latest reason.
         self._refused: dict[str, tuple[int, str]] = {}
+        # Why it ended without an idle frame, if it did.
+        self.failure: str | None = None
 
     def begin(self, now_ns: int, within_s: float) -> None:
         """Begin, also during another tare."""
         self._from_ns, self._until_ns = now_ns, now_ns + round(within_s * 1e9)
         self.begun = self._expired = False
+        self.failure = None
         self.done.clear()
         self._refused.clear()
 
@@ -74,9 +77,10 @@ class _Tare:
         self._from_ns = None
         self._until_ns = min(self._until_ns, now_ns)
 
-    def fail(self) -> None:
+    def fail(self, reason: str) -> None:
         """End it without an idle frame: no later frame completes it."""
-        self._from_ns, self._expired = None, True
+        self._from_ns, self._expired, self.failure = None, True, reason
+        self.done.set()
 
     def add(self, reason: str, *, taring: bool) -> None:
         """Take the reason of an estimate, and whether more frames are needed."""
@@ -131,8 +135,9 @@ class FingertipTask:
             self._record(InputKind.TARE, now_ns, tare_as_bytes(number))
             self._unconfirmed = False
         if self._is_of_held_tool():
-            structlog.get_logger().warning(f"{self.name} has no idle frame: the gripper holds something")
-            self._end_tare(number, now_ns)
+            reason = f"{self.name} has no idle frame: the gripper holds something"
+            structlog.get_logger().warning(reason)
+            self._end_tare(reason, number, now_ns)
         tool = self.gripper.held_tool(now_ns) if self.gripper is not None else None
         if tool != self._held:
             self._held = tool
@@ -171,10 +176,10 @@ class FingertipTask:
 
     def _give_up_tare(self, number: int, now_ns: int) -> None:
         """Leave a tare that no frame has completed in time: later frames could be of any load."""
-        why = self._tare.reasons or "no frame came in time"
-        structlog.get_logger().warning(f"the idle frame of {self.name} was not taken: {why}")
+        reason = f"the idle frame of {self.name} was not taken: {self._tare.reasons or 'no frame came in time'}"
+        structlog.get_logger().warning(reason)
         if self._tare.begun and self.session.taring:
-            self._end_tare(number, now_ns)
+            self._end_tare(reason, number, now_ns)
 
     def _is_of_held_tool(self) -> bool:
         """Return whether the idle frame is one of a held tool, as far as the gripper says."""
@@ -188,8 +193,8 @@ class FingertipTask:
         self._unconfirmed = False
         return found
 
-    def _end_tare(self, number: int, now_ns: int) -> None:
-        self._tare.fail()
+    def _end_tare(self, reason: str, number: int, now_ns: int) -> None:
+        self._tare.fail(reason)
         self.session.give_up_tare()
         self._record(InputKind.TARE, now_ns, tare_as_bytes(number, given_up=True))
 
@@ -205,7 +210,7 @@ class FingertipTask:
         finally:
             # Frames that come later could be of any load.
             self._tare.give_up(self.clock.now_ns())
-        return None
+        return self._tare.failure
 
     async def adapt(self, reference: str) -> None:
         """Correct the gain by this source's torque during this grip; raises ActionError."""

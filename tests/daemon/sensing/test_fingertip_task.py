@@ -402,6 +402,24 @@ async def test_no_idle_frame_is_of_a_gripped_tool(complete, said, log):
     assert log.said == ["right has no idle frame: the gripper holds something"]
 
 
+async def test_whoever_waits_for_a_tare_is_told_at_once_that_the_gripper_holds_something():
+    clock, session = FixedClock(), Taring()
+    held = SimpleNamespace(held_tool=lambda _: None, diameters=SimpleNamespace(update=lambda *_: None))
+    held.is_holding = False
+    task = estimates("right", RecordingPublisher(), session, clock, gripper=held)
+    async with running(task.tare_and_wait(60.0)) as (waiting,):
+        await asyncio.sleep(0)
+        await task.process(frame(0, clock.t_ns + 2 * PERIOD_NS))
+        await asyncio.sleep(0)
+        assert not waiting.done()
+        held.is_holding = True
+        await task.process(frame(1, clock.t_ns + 3 * PERIOD_NS))
+        async with asyncio.timeout(10):
+            assert await waiting == "right has no idle frame: the gripper holds something"
+    assert session.given_up == 1
+    assert not task.taring
+
+
 async def test_an_idle_frame_outlives_the_grip_after_it():
     session = Taring()
     gripper = SimpleNamespace(held_tool=lambda _: None, diameters=SimpleNamespace(update=lambda *_: None))

@@ -1,6 +1,7 @@
 """`shearloop adapt CAL REC… --out NEW`: correct a calibration's gain by twists of known torque."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, load_calibration, time_range
@@ -33,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.bank_file import Bank
     from shearloop.estimation import Physics
     from shearloop.estimation.archive import ARCHIVE_MAGIC
+    from shearloop.estimation.learned_frames import CANNOT_TELL_FRAMES
     from shearloop.tools.calibrate import adapt_to_recordings
 
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
@@ -41,8 +43,11 @@ def run(args: argparse.Namespace) -> int:
             f"--out {args.out} is CAL itself, which the next grip needs: it was not changed; choose another"
         )
     physics = Physics(bank=Bank.open(args.bank) if args.bank else None)
+    calibration = load_calibration(args.calibration)
+    if not calibration.learned.complete:
+        print(f"Warning: {CANNOT_TELL_FRAMES}.", file=sys.stderr)
     adapted, correction = adapt_to_recordings(
-        load_calibration(args.calibration), args.recordings, physics,
+        calibration, args.recordings, physics,
         time_range=args.time_range, load_cell_delay_s=args.load_cell_delay_s, tool_mm=args.tool_mm,
     )  # fmt: skip
     adapted.save(args.out)

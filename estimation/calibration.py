@@ -18,6 +18,7 @@ from shearloop.estimation.estimator_names import estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.gain import GainCorrection, ToolLaw
 from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.learned_frames import UNKNOWN_FRAMES, LearnedFrames
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import INLINE, Measured
 
@@ -41,7 +42,7 @@ class Calibration:
 
     sides is empty where nothing is known of the fingertip (`uncalibrated`). bank_identity is empty for an estimator
     without a bank. tool_mm is the diameter of the only tool in the recordings, else NaN. With `tools` the torque is in
-    units of their gain (`for_tool`). `profile` is the torque without a sensor.
+    units of their gain (`for_tool`). `profile` is the torque without a sensor, `learned` the frames behind all of this.
     """
 
     estimator: Estimator = field(metadata=INLINE)
@@ -55,6 +56,7 @@ class Calibration:
     assumptions: tuple[Assumption, ...] = ()
     tools: ToolLaw | None = None
     profile: TorqueProfile | None = None
+    learned: LearnedFrames = UNKNOWN_FRAMES
 
     def for_tool(self, tool: Measured | None) -> Self:
         """Return the calibration for a tool, itself where it is made for that tool; else raises CalibrationError.
@@ -107,7 +109,9 @@ class Calibration:
     @classmethod
     def uncalibrated(cls, bank_identity: str, table: ChannelTable = PAPER_TABLE) -> Self:
         """Return the paper's estimator on a bank without any fit: it gives k and sigma alone."""
-        return cls(PaperEstimator(np.ones((1, table.n_channels)), table), (), "", bank_identity)
+        return cls(
+            PaperEstimator(np.ones((1, table.n_channels)), table), (), "", bank_identity, learned=LearnedFrames.of([])
+        )
 
     @property
     def table(self) -> ChannelTable:

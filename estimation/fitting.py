@@ -29,11 +29,13 @@ from shearloop.estimation.fingertip_validator import FingertipValidator, too_few
 from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, first_twists, loaded_log_gain
 from shearloop.estimation.grips import Grip, find_grips
 from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.learned_frames import LearnedFrames
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
+from shearloop.words import counted
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75
@@ -73,6 +75,7 @@ def fit(
         tool_mm=tools[0].value if len(tools) == 1 else np.nan,
         validators=material.validators,
         profile=TorqueProfile.fit(chosen),
+        learned=LearnedFrames.of(one.channels for one in chosen),
     )
     fitted = _fit_outputs(blank, chosen, physics, timing.uncertainty_s)
     return fitted if timing.references else replace(fitted, assumptions=("load timing",))
@@ -217,39 +220,51 @@ def adapt(
     physics: Physics | None = None,
     *,
     first_frames: Sequence[int] = (),
+    names: Sequence[str] = (),
 ) -> tuple[Calibration, GainCorrection]:
     """Return a calibration with the gain of each fingertip corrected by recordings of known torque, and the correction.
 
-    `source` describes them in words. Twists count from each recording's frame of `first_frames` on. The correction is
-    shrunk by their uncertainty. Raises CalibrationError for recordings without a torque estimate under load, for those
-    that the calibration is adapted on already, and for a calibration without such a gain.
+    `source` describes them in words, `names` each of them. Twists count from each recording's frame of `first_frames`
+    on. The correction is shrunk by their uncertainty. Raises CalibrationError for recordings without a torque estimate
+    under load, for frames that the calibration has learned from, and for a calibration without such a gain.
     """
-    adaptation = f", adapted on {source}"
-    if adaptation in calibration.source:
-        raise CalibrationError(
-            f"the calibration is adapted on {source} already, and the same twists would count twice; adapt the "
-            "calibration that was not"
-        )
     if len(tools := _tools_of(recordings)) > 1:
         raise CalibrationError("the recordings are of several tools; adapt to one at a time")
     calibration = calibration.for_tool(tools[0] if tools else None)
     calibration.gain_regressor()
     matcher = calibration.matcher((physics or Physics()).bank)
     check_finite(recordings)
-    rows = _replay(calibration, matcher, [one.select_sides(calibration.sides) for one in recordings])
+    recordings = [one.select_sides(calibration.sides) for one in recordings]
+    first_frames = first_frames or [0] * len(recordings)
+    rows = _replay(calibration, matcher, recordings)
     if rows is not None:
         is_first = first_twists(rows.torque_nm, rows.grip)
-        if first_frames:
-            count = rows.frame >= np.array(first_frames)[rows.recording]
-            rows, is_first = rows.where(count), is_first[count]
+        count = rows.frame >= np.array(first_frames)[rows.recording]
+        rows, is_first = rows.where(count), is_first[count]
     if rows is None or not len(rows.frame):
         raise CalibrationError(
             "no frame is gripped and undisturbed for long enough; `shearloop evaluate` lists the reasons; "
             "twist the gripped tool again"
         )
+    for number, one in enumerate(recordings):
+        name = names[number] if names else f"recording {number + 1} of {len(recordings)}"
+        _check_new(calibration.learned, one, rows.frame[rows.recording == number], name)
     features = rows.features[:, calibration.estimator.columns["torque"]]
     adapted, correction = calibration.correct_gain(features, rows.torque_nm, is_first)
-    return replace(adapted, source=f"{calibration.source}{adaptation}"), correction
+    used = [one.channels[first:] for one, first in zip(recordings, first_frames, strict=True)]
+    learned = calibration.learned.with_frames(used)
+    return replace(adapted, source=f"{calibration.source}, adapted on {source}", learned=learned), correction
+
+
+def _check_new(learned: LearnedFrames, recording: FrameSeries, frames: IntArray, name: str) -> None:
+    """Raise CalibrationError where some of these frames (n,) of a recording are among those learned from."""
+    known = frames[learned.include(recording.channels[frames])] + recording.first_frame
+    if len(known):
+        raise CalibrationError(
+            f"the calibration has used {len(known)} of {counted(len(frames), 'gripped frame')} of {name} already "
+            f"(frames {known[0]} to {known[-1]}), and they would count twice; adapt on other twists, or adapt a "
+            "calibration that has not used these"
+        )
 
 
 def _replay(

@@ -158,7 +158,7 @@ def adapt_to_recordings(
     """Return a calibration adapted to the twists within these shares of recordings, and the correction of its gain.
 
     Raises UserError for recordings that are given twice, also as copies, and CalibrationError for those that show no
-    gain.
+    gain, or frames that the calibration has learned from.
     """
     check_paths_differ(paths)
     start, stop = time_range
@@ -168,7 +168,8 @@ def adapt_to_recordings(
     # Earlier frames show the session the idle fingertip.
     until = [part_of(replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s), 0.0, stop) for one in series]
     first = [part_of(one, start, stop).first_frame for one in series]
-    return adapt(calibration, until, source_text(paths, time_range, load_cell_delay_s), physics, first_frames=first)
+    source, names = source_text(paths, time_range, load_cell_delay_s), [str(path) for path in paths]
+    return adapt(calibration, until, source, physics, first_frames=first, names=names)
 
 
 def source_text(paths: Sequence[Path], time_range: tuple[float, float], delay_s: float | None = None) -> str:

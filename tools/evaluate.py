@@ -13,15 +13,17 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.bank_file import Bank
 from shearloop.estimation import Calibration, Estimate, FrameSeries, Session, TactileFrame
 from shearloop.estimation.defaults import LOADED_NM
+from shearloop.estimation.learned_frames import CANNOT_TELL_FRAMES, LearnedFrames
 from shearloop.estimation.load_delay import load_delay_warning
 from shearloop.estimation.values import winkler_scores
 from shearloop.files import replace_file
 from shearloop.tools.frame_series import check_no_copies, part_of
 from shearloop.tools.parallel import Executor
+from shearloop.words import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -128,7 +130,8 @@ def evaluate_recordings(
         calibration.assumption_text,
         draw_stream,
         no_better_than_clock,
-        _known_data(calibration, named, time_range) + [f"{name}: {warning}" for name, warning in warned if warning],
+        known_data(calibration.learned, tracks, [path for path, _ in named])
+        + [f"{name}: {warning}" for name, warning in warned if warning],
         [
             f"{path.name}: {'; '.join(one.left_out)}"
             for (path, _), one in zip(named, parts, strict=True)
@@ -137,19 +140,29 @@ def evaluate_recordings(
     )
 
 
-def _known_data(
-    calibration: Calibration, named: Sequence[tuple[Path, FrameSeries]], time_range: tuple[float, float]
-) -> list[str]:
-    """Return a sentence for each recording that a calibration was fitted to."""
-    source = calibration.source
-    # Other parts of one recording are new data.
-    whole = time_range == (0.0, 1.0) or " from " not in source
-    return [
-        f"{path.name} has the name of a recording that the calibration was fitted to ({source}); errors on known data "
-        "are smaller than on new ones, so judge it on another recording"
-        for path, _ in named
-        if path.name in source and whole
-    ]
+def known_data(learned: LearnedFrames, tracks: Sequence[EstimateTrack], paths: Sequence[Path]) -> list[str]:
+    """Return a sentence for each track with judged frames that the calibration has learned from.
+
+    A calibration that does not tell them all is named too.
+    """
+    found = [] if learned.complete else [CANNOT_TELL_FRAMES]
+    for track, path in zip(tracks, paths, strict=True):
+        judged = track.series.channels[judged_frames(track)]
+        if known := int(learned.include(judged).sum()):
+            found.append(
+                f"the calibration has learned from {known} of {counted(len(judged), 'judged frame')} of {path}; errors "
+                "on known frames are smaller than on new ones, so judge it on others"
+            )
+    return found
+
+
+def judged_frames(track: EstimateTrack) -> BoolArray:
+    """Return which of the frames (n,) have an estimate and a known torque or diameter."""
+    judged: BoolArray = np.zeros(len(track.estimates), dtype=np.bool_)
+    for quantity in _UNITS:
+        truth, value, *_ = frames_of(track, quantity)
+        judged |= np.isfinite(truth) & np.isfinite(value)
+    return judged
 
 
 def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:

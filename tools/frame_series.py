@@ -12,6 +12,7 @@ from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM,
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
 from shearloop.estimation.calibration import LARGEST_TOOL_SHARE
+from shearloop.estimation.learned_frames import frame_digests
 from shearloop.tools.recordings.frames import Recording, read_recording
 from shearloop.words import counted
 
@@ -21,6 +22,8 @@ Series = TypeVar("Series", bound=FrameSeries)
 _LARGEST_APART = 0.75
 # Share of the time with another grip that does not count as another tool: the fingers met something or gripped again.
 _MOMENTARY = 0.05
+# Share of a recording's frames that another one may hold too: emulated rigs begin with the same idle frames.
+_MOST_SHARED = 0.5
 
 
 def read_series(
@@ -165,8 +168,19 @@ def check_paths_differ(paths: Sequence[Path]) -> None:
 
 
 def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:
-    """Raise UserError for named recordings of the same frames."""
+    """Raise UserError for named recordings of the same frames, also where some of them are missing in one."""
     refuse_copies((name, one.channels) for name, one in series)
+    known: list[tuple[str, IntArray]] = []
+    for name, one in series:
+        digests = frame_digests(one.channels)
+        for other, of_other in known:
+            shared = int(np.isin(digests, of_other).any(axis=1).sum())
+            if shared > _MOST_SHARED * min(len(digests), len(of_other)):
+                raise UserError(
+                    f"{shared} of {counted(len(digests), 'frame')} of {name} are in {other} too; leave copies out: "
+                    "they add nothing"
+                )
+        known.append((name, digests))
 
 
 def refuse_copies(measurements: Iterable[tuple[str, FloatArray]]) -> None:

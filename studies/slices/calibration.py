@@ -13,6 +13,7 @@ from shearloop.estimation.archive import Format
 from shearloop.estimation.bank_match import BankMatcher
 from shearloop.estimation.calibration import check_bank
 from shearloop.estimation.estimator import Estimator, Quantity
+from shearloop.estimation.learned_frames import UNKNOWN_FRAMES, LearnedFrames
 from shearloop.estimation.values import INLINE
 from shearloop.studies.slices.estimators import slice_estimator_class
 from shearloop.studies.slices.novelty import NoveltyDetector
@@ -41,7 +42,7 @@ class SliceCalibration:
     """An estimator with the models of its outputs; `source` describes the slices in words.
 
     sides names their fingertip. bank_identity is empty for an estimator without a bank. `profile` is the torque without
-    a sensor. assumptions are what the user guarantees.
+    a sensor, `learned` the slices behind all of this. assumptions are what the user guarantees.
     """
 
     estimator: Estimator = field(metadata=INLINE)
@@ -52,6 +53,7 @@ class SliceCalibration:
     diameter: SliceModel | None = None
     assumptions: tuple[Literal["full range"], ...] = ()
     profile: SliceProfile | None = None
+    learned: LearnedFrames = UNKNOWN_FRAMES
 
     @property
     def outputs(self) -> dict[Quantity, SliceModel]:

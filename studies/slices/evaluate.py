@@ -13,7 +13,7 @@ from shearloop.estimation.defaults import LOADED_NM
 from shearloop.studies.slices.calibration import SliceCalibration
 from shearloop.studies.slices.reader import SliceReader
 from shearloop.studies.slices.series import SliceSeries, read_parts
-from shearloop.tools.evaluate import EstimateTrack, Evaluation, beats_clock, frames_of, loaded_text
+from shearloop.tools.evaluate import EstimateTrack, Evaluation, beats_clock, frames_of, known_data, loaded_text
 from shearloop.tools.parallel import Executor
 
 if TYPE_CHECKING:
@@ -48,13 +48,15 @@ def evaluate_slices(
         Bank.open(bank)
     paths, parts = read_parts(folders, time_range)
     shared = (made, None if bank is None else str(bank.resolve()))
+    tracks = list(pool.map(estimate_in_worker, shared, parts))
     return Evaluation(
-        list(pool.map(estimate_in_worker, shared, parts)),
+        tracks,
         paths,
         f"{made.estimator.name}, fitted to {made.source}",
         made.assumption_text,
         draw_slices,
         no_better_than_place,
+        known_data(made.learned, tracks, paths),
     )
 
 

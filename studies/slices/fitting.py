@@ -11,6 +11,7 @@ from shearloop.estimation.bank_match import BankMatcher
 from shearloop.estimation.estimator import Estimator, Quantity, Reading
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.fitting import check_physics
+from shearloop.estimation.learned_frames import LearnedFrames
 from shearloop.estimation.values import ProcessedFrame
 from shearloop.studies.slices.calibration import SliceCalibration, SliceModel
 from shearloop.studies.slices.estimators import fits_of, least_slices, prepared, slice_estimator_class
@@ -65,6 +66,7 @@ def fit_slices(
         models.get("diameter"),
         ("full range",) if full_range and "torque" in models else (),
         SliceProfile.fit(recordings),
+        LearnedFrames.of(one.channels for one in recordings),
     )
 
 

@@ -1,6 +1,11 @@
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from shearloop.estimation import Calibration
+from shearloop.estimation.learned_frames import UNKNOWN_FRAMES
 
 
 @pytest.fixture
@@ -30,9 +35,7 @@ def loaded(result_of):
     ]
 
 
-def test_two_twists_of_a_grip_correct_the_calibration_of_another(
-    calibration, cylinder, loaded, tmp_path, result_of, mistake
-):
+def test_two_twists_of_a_grip_correct_the_calibration_of_another(calibration, cylinder, loaded, tmp_path, result_of):
     recording, new = cylinder("30mm_2"), tmp_path / "new.cal"
     before = loaded(calibration, recording)
     said = result_of("adapt", calibration, recording, "--time-range", "0:0.38", "--out", new)
@@ -44,8 +47,33 @@ def test_two_twists_of_a_grip_correct_the_calibration_of_another(
     assert after["rmse_nm"] < 0.6 * before["rmse_nm"]
     assert min(before["coverage_95"], after["coverage_95"]) >= 0.9
     assert after["winkler_nm"] < before["winkler_nm"]
-    again = mistake("adapt", new, recording, "--time-range", "0:0.38", "--out", tmp_path / "again.cal")
-    assert "is adapted on 30mm_2.mcap from 0 to 0.38 already, and the same twists would count twice" in again
+
+
+def test_twists_count_once_under_any_name_and_range(calibration, cylinder, tmp_path, ran, mistake):
+    first, recording, new = cylinder("30mm_1"), cylinder("30mm_2"), tmp_path / "new.cal"
+    again, renamed = ["--out", tmp_path / "again.cal"], tmp_path / "renamed.mcap"
+    fitted = mistake("adapt", calibration, first, *again)
+    assert re.search(rf"has used (\d+) of \1 gripped frames of {first} already", fitted)
+    ran("adapt", calibration, recording, "--time-range", "0:0.38", "--out", new)
+    renamed.write_bytes(recording.read_bytes())
+    for twists in (
+        [recording, "--time-range", "0:0.38"],
+        [renamed, "--time-range", "0:0.38"],
+        [recording, "--time-range", "0.3:0.5"],
+        [recording, "--time-range", "0:0.38", "--load-cell-delay-s", "0.1"],
+    ):
+        said = mistake("adapt", new, *twists, *again)
+        assert re.search(rf"has used \d+ of \d+ gripped frames of {twists[0]} already", said)
+    ran("adapt", new, recording, "--time-range", "0.38:0.6", *again)
+
+
+def test_a_calibration_without_its_frames_cannot_tell(calibration, cylinder, tmp_path, ran):
+    older, recording, new = tmp_path / "older.cal", cylinder("30mm_2"), tmp_path / "new.cal"
+    replace(Calibration.load(calibration), learned=UNKNOWN_FRAMES).save(older)
+    unknown = "Warning: the calibration's file does not hold which frames it was made from"
+    assert unknown in ran("adapt", older, recording, "--time-range", "0:0.38", "--out", new).err
+    assert unknown in ran("evaluate", older, recording).err
+    assert "which frames" not in ran("evaluate", calibration, recording).err
 
 
 def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder, tmp_path, ran, mistake):

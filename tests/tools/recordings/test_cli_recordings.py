@@ -50,7 +50,10 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     ran("evaluate", first, slices_folder, "--out", tmp_path / "named.svg")
     assert (tmp_path / "named.svg").read_text().count(f"<!-- {slices_folder.name}, right") == 2
-    text = ran("evaluate", first, slices_folder / "torque_slices").out
+    assert "learned from" not in ran("evaluate", first, slices_folder, "--time-range", "0.6:1").err
+    text, warned = ran("evaluate", first, slices_folder / "torque_slices")
+    learned = r"Warning: the calibration has learned from \d+ of \d+ judged frames of \S+torque_slices; errors"
+    assert re.search(learned, warned)
     assert re.search(r"^figure +loaded +unloaded +all +meaning$", text, re.MULTILINE)
     assert re.search(r"^interval_nm +0\.\d+ .* 0\.\d+ +median width of these intervals", text, re.MULTILINE)
     assert "diameter" not in text

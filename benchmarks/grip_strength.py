@@ -4,8 +4,9 @@
 
 RECORDINGS holds streams. The default estimator is fitted to each stream, and judges every other one of the same tool,
 with its sides as they are and exchanged. A row is a pair with valid frames where the check is off: each fingertip's
-strength as a ratio of the calibrated one (the median of the valid frames), then the fraction of valid frames, their
-loaded ones, and the coverage of these, without the check and with it. Writes grip_strength.json.
+strength that the check compares, as a ratio of the calibrated one (the median over these frames, the least and the
+largest); then the fraction of valid frames, their loaded ones, and the coverage of these, without the check and with
+it. Writes grip_strength.json.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,11 +18,11 @@ import numpy as np
 
 from benchmarks.common import parser_of, table_head, table_row, write_figures
 from benchmarks.estimator_accuracy import FINGERTIPS, STREAMS
+from shearloop.bank.arrays import BoolArray
 from shearloop.bank.errors import BankError
 from shearloop.estimation import Calibration, FrameSeries, Session, TactileFrame, fit, measure_timing
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import DEFAULT
-from shearloop.estimation.fingertip_validator import relative_change
 from shearloop.estimation.load_delay import TRUSTED
 from shearloop.tools.evaluate import EstimateTrack, estimate_series, values_of
 from shearloop.tools.frame_series import series_of
@@ -30,9 +31,12 @@ from shearloop.tools.recordings.matlab_import import import_mat
 
 CYLINDERS = ("10mm_1", "20mm_1", "30mm_1", "30mm_2", "40mm_1")
 COLUMNS = (
-    "fitted to", "judged on", "strength", "valid without the check", "loaded", "coverage", "valid with it", "loaded",
-    "coverage",
-)  # fmt: skip
+    "fitted to",
+    "judged on",
+    "strength: median (least to largest)",
+    *("valid without the check", "loaded", "coverage"),
+    *("valid with it", "loaded", "coverage"),
+)
 
 
 class Judged(NamedTuple):
@@ -41,6 +45,14 @@ class Judged(NamedTuple):
     valid: float
     loaded: int
     coverage: float | None
+
+
+class Strength(NamedTuple):
+    """The strength of one fingertip's grip over the valid frames, as a ratio of the calibrated one."""
+
+    median: float
+    least: float
+    largest: float
 
 
 def read_streams(recordings: Path, scratch: Path) -> dict[str, FrameSeries]:
@@ -103,18 +115,20 @@ def judge(track: EstimateTrack) -> Judged:
     return Judged(float(valid.mean()), n, float(inside[loaded].mean()) if n else None)
 
 
-def strengths(calibration: Calibration, series: FrameSeries) -> list[float | None]:
-    """Return each fingertip's median strength over the frames with features, as a ratio of the calibrated one."""
-    session = Session(without_check(calibration))
-    frames = zip(series.t_s.tolist(), series.channels, strict=True)
-    processed = [session.process(TactileFrame.of(t_s, channels)) for t_s, channels in frames]
-    differences = [one.difference for one in processed if not one.reasons]
-    found: list[float | None] = []
-    for layer, one in enumerate(calibration.validators):
-        known = one.strength
-        changes = [relative_change(one.idle + each[layer], one.idle) for each in differences]
-        found.append(None if known is None else float(np.median(changes @ known.weights)) / known.strongest)
-    return found
+def strengths(calibration: Calibration, series: FrameSeries, valid: BoolArray) -> list[Strength]:
+    """Return each fingertip's strength over the `valid` frames (n,), one of them at least."""
+    session = Session(calibration)
+    ratios: list[list[float]] = []
+    for t_s, channels, counts in zip(series.t_s.tolist(), series.channels, valid.tolist(), strict=True):
+        session.estimate(TactileFrame.of(t_s, channels))
+        if counts:
+            ratios.append([session.grip_strengths[side] for side in calibration.sides])
+    return [Strength(*map(float, (np.median(one), min(one), max(one)))) for one in zip(*ratios, strict=True)]
+
+
+def shown(strength: Strength) -> str:
+    """Return a strength as text."""
+    return f"{strength.median:.2f} ({strength.least:.2f} to {strength.largest:.2f})"
 
 
 def main() -> None:
@@ -126,17 +140,18 @@ def main() -> None:
     found: list[dict[str, object]] = []
     print(table_head(*COLUMNS))
     for title, name, calibration, series in pairs(read_streams(args.recordings, args.out)):
-        before = judge(estimate_series(without_check(calibration), series))
+        unchecked = estimate_series(without_check(calibration), series)
+        before = judge(unchecked)
         if not before.valid:
             continue
-        after, ratios = judge(estimate_series(calibration, series)), strengths(calibration, series)
-        shown = ", ".join("–" if ratio is None else f"{ratio:.2f}" for ratio in ratios)
-        print(table_row(title, name, shown, *before, *after), flush=True)
+        after = judge(estimate_series(calibration, series))
+        ratios = strengths(calibration, series, np.isfinite(values_of(unchecked.estimates)[0]))
+        print(table_row(title, name, ", ".join(map(shown, ratios)), *before, *after), flush=True)
         found.append(
             {
                 "fitted_to": title,
                 "judged_on": name,
-                "strength": ratios,
+                "strength": [one._asdict() for one in ratios],
                 "without": before._asdict(),
                 "with": after._asdict(),
             }

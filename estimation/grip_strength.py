@@ -1,7 +1,7 @@
 """How strong a grip is against the grips of the calibration: beyond limits the calibration does not hold for it.
 
-The same twist of a stronger grip moves the gel less, by an unknown factor. Intervals expect another grip of about the
-same strength, so they miss the truth of a much stronger or weaker one. The strength is measured along the grip's
+The same twist of a stronger grip moves the gel otherwise, by an unknown factor. Intervals expect another grip of about
+the same strength, so they miss the truth of a much stronger or weaker one. The strength is measured along the grip's
 discriminant, which ignores twists.
 """
 
@@ -14,9 +14,9 @@ from typing import Self
 from shearloop.bank.arrays import FloatArray
 
 # On pairs of recorded grips where the calibration of one carries over to the other, the strength is 0.43 to 2.07 times
-# the calibrated one; where it does not, at most 0.17 or at least 2.47 (docs/decisions/0048). The limits lie between.
+# the calibrated one; on others at most 0.17 or at least 2.47 (docs/decisions/0048). The limits lie between.
 WEAKEST_RATIO, STRONGEST_RATIO = 0.25, 2.25
-# Frames (a minute) in the median strength of a grip: the grip closes, and twists come and go, within it.
+# The latest frames in the median strength of a grip, 65 s of them: the grip closes, and twists come and go, within it.
 _FRAMES = 120
 
 

@@ -98,8 +98,8 @@ class Session:
         self.difference: FloatArray | None = None
         self._latest: FloatArray = np.full(self.calibration.estimator.scale.shape, np.nan)
         self._gain = GripGain()
-        # Why the calibration does not hold for the strength of the last grip, none if it does.
-        self._strength_reasons: tuple[str, ...] = ()
+        # The strength of the last grip by side, as a ratio of the calibrated ones.
+        self._strengths: dict[str, float] = {}
 
     def _begin(self, idle_frames: int) -> None:
         """Forget all frames."""
@@ -145,9 +145,14 @@ class Session:
         """
         if self._tool_reasons:
             raise CalibrationError(self._tool_reasons[0])
-        if self._strength_reasons:
-            raise CalibrationError(self._strength_reasons[0])
+        if reasons := strength_reasons(self._strengths):
+            raise CalibrationError(reasons[0])
         return self._gain.correct(self._calibration, self._tool, self.calibration, torque_nm)
+
+    @property
+    def grip_strengths(self) -> dict[str, float]:
+        """The strength of the last grip by side, as a ratio of the calibrated ones."""
+        return dict(self._strengths)
 
     def heatmap(self) -> FloatArray | None:
         """Return the (K, S) scores of the first side's last difference, None without a bank or a difference."""
@@ -250,9 +255,8 @@ class Session:
         memory = self._memory
         # Motion is read in volts: after a release a gel's idle voltages recover for minutes, which is no gain.
         recent = memory.remember(channels, from_idle, difference, missing)
-        ratios = {one.side: grip.strength.ratio for one, grip in zip(sides, self._grips, strict=True)}
-        self._strength_reasons = strength_reasons(ratios)
-        if reasons := (recent,) if recent else self._strength_reasons:
+        self._strengths = {one.side: grip.strength.ratio for one, grip in zip(sides, self._grips, strict=True)}
+        if reasons := (recent,) if recent else strength_reasons(self._strengths):
             return ProcessedFrame(difference, reasons, usable)
         return ProcessedFrame(
             difference, (), usable, memory.mean_difference, memory.features, memory.held_frames, idle.complete

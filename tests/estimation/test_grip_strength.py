@@ -86,7 +86,7 @@ def test_the_next_grip_is_judged_by_itself(motion_calibration, grip):
 
 
 def test_a_short_squeeze_leaves_a_grip_valid(motion_calibration):
-    """A twist may move the score for some seconds: the median over a minute decides."""
+    """A twist may move the score for some seconds: the median over 120 frames decides."""
     guards = motion_calibration.validators
     idle, gripped = (np.array([getattr(guard, name) for guard in guards]) for name in ("idle", "gripped"))
     session, squeeze = Session(motion_calibration), [*np.linspace(1, 2.8, 15), *[2.8] * 5, *np.linspace(2.8, 1, 15)]

@@ -176,8 +176,8 @@ def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) 
 
 def with_connection(text: str, args: argparse.Namespace, default: str) -> str:
     """Return a text whose `shearloop command …` have the options of the connection that this command was given."""
-    given = {"--connect": args.connect if args.connect != default else None, "--key": args.key}
-    given["--server-key"] = args.server_key
+    connect = None if args.connect == default else args.connect
+    given = {"--connect": connect, "--key": args.key, "--server-key": args.server_key}
     options = "".join(f" {name} {shlex.quote(str(value))}" for name, value in given.items() if value is not None)
     return re.sub(r"`(shearloop command [^`]+)`", lambda found: f"`{found[1]}{options}`", text)
 

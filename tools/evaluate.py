@@ -224,7 +224,7 @@ def no_better_than_clock(tracks: Sequence[EstimateTrack], loaded_nm: float = LOA
 
 @dataclass(frozen=True, slots=True)
 class InvalidReason:
-    """Why `frames` were not valid: the most frequent sentence, an example if the numbers in it `differ`."""
+    """Why `frames` were not valid: all reasons of the most frequent such frame, an example if numbers `differ`."""
 
     frames: int
     sentence: str
@@ -232,12 +232,21 @@ class InvalidReason:
 
 
 def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
-    """Return why frames were not valid, the most frequent first; sentences that differ in numbers count as one."""
+    """Return why frames were not valid, the most frequent first; sentences that differ in numbers count as one.
+
+    A frame counts once, with all of its reasons.
+    """
     kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
-    for reason in (reason for track in tracks for estimate in track.estimates for reason in estimate.reasons):
-        kinds[_NUMBER.sub("#", reason)][reason] += 1
+    for estimate in (estimate for track in tracks for estimate in track.estimates):
+        if estimate.reasons:
+            sentence = _joined(estimate.reasons)
+            kinds[_NUMBER.sub("#", sentence)][sentence] += 1
     found = [InvalidReason(counts.total(), counts.most_common(1)[0][0], len(counts) > 1) for counts in kinds.values()]
     return sorted(found, key=lambda reason: -reason.frames)
+
+
+def _joined(reasons: Sequence[str]) -> str:
+    return "; ".join(reasons)
 
 
 def _baselines(frames: FloatArray) -> Figures:
@@ -313,7 +322,7 @@ def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path:
             frames = enumerate(zip(series.t_s.tolist(), truths, track.estimates, strict=True), series.first_frame)
             for number, (t_s, truth, estimate) in frames:
                 cells = [getattr(estimate, one) for one in values]
-                reason = "; ".join(estimate.reasons)
+                reason = _joined(estimate.reasons)
                 if estimate.valid and estimate.torque_nm is None:
                     reason = track.why_no_torque
                 table.writerow([name, number, t_s, truth, *cells, estimate.valid, reason])

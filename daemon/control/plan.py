@@ -68,7 +68,10 @@ class Plan:
     def torque_nm(self) -> float | None:
         """The largest torque that a step asks for; None if none does and a step turns the tool by an angle."""
         known = [step.torque_nm for step in self.steps if step.torque_nm is not None]
-        return max(known, default=0.0) or (0.0 if self.torque_is_known else None)
+        largest_nm = max(known, default=0.0)
+        if largest_nm == 0.0 and not self.torque_is_known:
+            return None
+        return largest_nm
 
     @property
     def torque_is_known(self) -> bool:

@@ -95,8 +95,8 @@ class SkinTask:
         self._radius_m = _radius_m(config)
         self._zero_timeout_s = max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples * config.daq.sample_period_s)
         self._sampled = asyncio.Event()
-        # When the latest zero was asked for.
-        self._asked_ns = -(2**63)
+        # When the latest zero was asked for, None before the first.
+        self._asked_ns: int | None = None
         self._reason = ""
         self._valid = 0
 
@@ -114,7 +114,8 @@ class SkinTask:
 
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""
-        now_ns = self._asked_ns = self._clock.now_ns()
+        now_ns = self._clock.now_ns()
+        self._asked_ns = now_ns
         if self._inputs is not None:
             self._inputs.record(RawEvent(InputKind.TARE, now_ns))
         self._skin.restart_average()
@@ -123,6 +124,8 @@ class SkinTask:
     @property
     def taring(self) -> bool:
         """Whether the next samples belong to a zero that was asked for a short time ago."""
+        if self._asked_ns is None:
+            return False
         waited_s = (self._clock.now_ns() - self._asked_ns) / 1e9
         return self._estimator.zero is None and not self._estimator.refused and waited_s < self._zero_timeout_s
 

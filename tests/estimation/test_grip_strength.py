@@ -20,18 +20,27 @@ TOO_WEAK = re.compile(r"the grip at the .* fingertip is too weak: (0\.\d\d)(?: a
 
 
 @pytest.fixture
-def grip(motion_calibration):
-    """Return what grips as strongly as given by side, as multiples of the calibrated grip, and the last estimate."""
+def frames(motion_calibration):
+    """Return what gives frames of these strengths in turn, as multiples of the calibrated grip at each side."""
     guards = motion_calibration.validators
     idle, gripped = (np.array([getattr(guard, name) for guard in guards]) for name in ("idle", "gripped"))
 
+    def played(shares, sides=(1.0, 1.0), begin=0):
+        moved = np.array(sides)[:, None] * (gripped - idle)
+        # No two frames are the same to the last digit.
+        return [TactileFrame.of(0.5 * i, idle + one * moved + 1e-13 * i) for i, one in enumerate(shares, begin)]
+
+    return played
+
+
+@pytest.fixture
+def grip(motion_calibration, frames):
+    """Return what grips as strongly as given by side, as multiples of the calibrated grip, and the last estimate."""
+
     def play(strengths, calibration=motion_calibration):
         session = Session(calibration)
-        shares = [*np.zeros(12), *UP, *np.ones(HELD)]
-        moved = np.array(strengths)[:, None] * (gripped - idle)
-        # No two frames are the same to the last digit.
-        frames = [TactileFrame.of(0.5 * i, idle + one * moved + 1e-13 * i) for i, one in enumerate(shares)]
-        return session, [session.estimate(frame) for frame in frames][-1]
+        estimates = [session.estimate(frame) for frame in frames([*np.zeros(12), *UP, *np.ones(HELD)], strengths)]
+        return session, estimates[-1]
 
     return play
 
@@ -73,27 +82,22 @@ def test_twists_of_known_torque_do_not_cure_another_strength(grip):
         session.adapt(np.zeros(len(session.grip_t_s)))
 
 
-def test_the_next_grip_is_judged_by_itself(motion_calibration, grip):
-    guards = motion_calibration.validators
-    idle, gripped = (np.array([getattr(guard, name) for guard in guards]) for name in ("idle", "gripped"))
+def test_the_next_grip_is_judged_by_itself(frames, grip):
     session, estimate = grip((2.8, 2.8))
     assert not estimate.valid
     shares = [*2.8 * UP[::-1], *np.zeros(12), *UP, *np.ones(HELD)]
-    frames = [
-        TactileFrame.of(50.0 + 0.5 * i, idle + one * (gripped - idle) + 1e-12 * i) for i, one in enumerate(shares)
-    ]
-    assert [session.estimate(frame) for frame in frames][-1].valid
+    assert [session.estimate(frame) for frame in frames(shares, begin=12 + len(UP) + HELD)][-1].valid
 
 
-def test_a_short_squeeze_leaves_a_grip_valid(motion_calibration):
+def test_a_short_squeeze_leaves_a_grip_valid(motion_calibration, frames):
     """A twist may move the score for some seconds: the median over 120 frames decides."""
-    guards = motion_calibration.validators
-    idle, gripped = (np.array([getattr(guard, name) for guard in guards]) for name in ("idle", "gripped"))
     session, squeeze = Session(motion_calibration), [*np.linspace(1, 2.8, 15), *[2.8] * 5, *np.linspace(2.8, 1, 15)]
-    shares = [*np.zeros(12), *UP, *np.ones(HELD), *squeeze]
-    frames = [TactileFrame.of(0.5 * i, idle + one * (gripped - idle) + 1e-13 * i) for i, one in enumerate(shares)]
-    reasons = [why for frame in frames for why in session.estimate(frame).reasons]
-    assert not any("too strong" in why for why in reasons)
+    held, then = [*np.zeros(12), *UP, *np.ones(HELD)], [*squeeze, *np.ones(HELD)]
+    assert [session.estimate(frame) for frame in frames(held)][-1].valid, "or there is no grip to squeeze"
+    estimates = [session.estimate(frame) for frame in frames(then, begin=len(held))]
+    assert not any("no grip" in why or "too strong" in why for one in estimates for why in one.reasons)
+    assert max(session.grip_strengths.values()) < 1.1
+    assert estimates[-1].valid
 
 
 def test_grips_of_several_strengths_widen_the_range():
@@ -125,7 +129,7 @@ def test_a_file_without_the_strength_loads_and_says_that_it_is_not_checked(motio
     assert Calibration.load(tmp_path / "new.cal").assumption_text == ""
 
 
-def test_a_calibration_reads_its_own_recording_as_before(motion_calibration, recorded):
+def test_the_check_changes_no_estimate_of_the_calibrated_grip(motion_calibration, recorded):
     unknown = [replace(one, strength=None) for one in motion_calibration.validators]
     older = replace(motion_calibration, validators=tuple(unknown))
     assert follow(motion_calibration, recorded) == follow(older, recorded)

@@ -184,6 +184,19 @@ def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alon
     ]
 
 
+def test_a_frame_of_two_reasons_counts_once():
+    nothing, channels = np.full(4, np.nan), np.zeros((4, 1, 896))
+    series = FrameSeries(("right",), np.arange(4.0), channels, nothing[:0], nothing[:0], nothing)
+    said = (("too far: 2 mm", "too fast: 3 mm/s"), ("too far: 2 mm", "too fast: 4 mm/s"), ("too far: 1 mm",), ())
+    estimates = tuple(Estimate(valid=not reasons, reasons=reasons) for reasons in said)
+    found = invalid_reasons([EstimateTrack(series, estimates, np.zeros(4))])
+    assert sum(one.frames for one in found) == 3
+    assert found == [
+        InvalidReason(2, "too far: 2 mm; too fast: 3 mm/s", differ=True),
+        InvalidReason(1, "too far: 1 mm", differ=False),
+    ]
+
+
 def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, tmp_path, ran):
     calibration, slices = tmp_path / "a.cal", str(slices_folder / "torque_slices")
     assert main(["calibrate", slices, "--out", str(calibration)]) == 0

@@ -193,10 +193,13 @@ async def trace_calibration(rig: Path, folder: Path) -> Way:
     return trace.take()
 
 
-def loaded_by_run() -> Loaded:
+def loaded_by_run(*, robot: bool) -> Loaded:
     """Return the package's modules that `shearloop run` loads, in a separate interpreter."""
+    modules = ["shearloop.cli.run", "shearloop.daemon.app"]
+    if robot:
+        modules += ["shearloop.daemon.rig", "shearloop.daemon.configured_experiment"]
     listing = (
-        "import json, sys, shearloop.cli.run, shearloop.daemon.app; "
+        f"import json, sys, {', '.join(modules)}; "
         "print(json.dumps({name: module.__file__ for name, module in sys.modules.items() "
         "if name.split('.')[0] == 'shearloop' and module.__file__}))"
     )
@@ -249,9 +252,12 @@ def measure(rig: Path) -> dict[str, Any]:
             way = ways[kind] = result.result()
             print("A {}: {functions} functions in {modules} modules".format(kind, **counts(way)))
             print(diagram(way), end="\n\n", flush=True)
-    loaded = loaded_by_run()
+    loaded = {
+        "shearloop run, sensors alone": loaded_by_run(robot=False),
+        "shearloop run, with a robot": loaded_by_run(robot=True),
+    }
     return {kind: counts(way) for kind, way in ways.items()} | {
-        "shearloop run": {"modules": len(loaded.modules), "lines": loaded.lines}
+        rig: {"modules": len(found.modules), "lines": found.lines} for rig, found in loaded.items()
     }
 
 

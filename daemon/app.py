@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import structlog
 import zmq
@@ -14,7 +15,6 @@ import zmq.asyncio
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Answered, Commands
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.messaging.callers import caller_of
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import ClientAuthenticator, load_server_keys
@@ -24,13 +24,18 @@ from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
-from shearloop.daemon.rig import Rig, build_rig, open_settings
-from shearloop.daemon.rig_memory import lock_robot
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sd_notify import notify
 from shearloop.daemon.sensing.sessions import COMBINED
+from shearloop.daemon.sensors import build_sensors, open_sessions
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH, HealthReporter, Reporter, Supervisor, Task, TaskFacts
 from shearloop.printable import printable
+
+if TYPE_CHECKING:
+    # Only a rig with a robot loads them.
+    from shearloop.daemon.configured_experiment import ConfiguredExperiment
+    from shearloop.daemon.rig import Rig
+    from shearloop.drivers.ur.settings import UrSettings
 
 # The end waits this long for the report of an experiment that it has stopped; a dead loop reports none.
 REPORTED_WITHIN_S = 0.2
@@ -41,7 +46,7 @@ class RecordingTask:
     """Writes the recording, and hands its errors to the control loop."""
 
     recorder: Recorder
-    rig: Rig | None
+    rig: "Rig | None"
 
     async def run(self) -> None:
         """Write until cancelled."""
@@ -70,8 +75,7 @@ class Daemon:
             clients = config.curve.clients if config.curve is not None and config.network_addresses else None
             authenticator = ClientAuthenticator(context, clients, refusals)
             opened.callback(authenticator.close)
-            if (settings := open_settings(config)) is not None:
-                opened.enter_context(lock_robot(settings.host))
+            settings = _take_robot(config, opened)
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
             self.publisher.add_listener(self._summary)
             self.recorder: Recorder | None = None
@@ -80,21 +84,12 @@ class Daemon:
                 self.publisher.add_listener(self.recorder.record_message)
                 opened.callback(self.recorder.close)
             self.health = HealthReporter(self.publisher, self.supervisor, clock, config.emulated, config.name)
-            self.sensors, self.rig = build_rig(config, self.publisher, clock, self.recorder, self.supervisor)
-            if self.rig is not None:
-                if self.rig.commissioning is not None:
-                    self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
-                self.health.refusals |= {
-                    "tare": self.rig.control_loop.tare_refusal,
-                    "start": self.rig.runner.start_refusal,
-                    "release": self.rig.runner.release_refusal,
-                }
+            self.rig: Rig | None = None
             self._experiment: ConfiguredExperiment | None = None
-            if config.experiment is not None and self.rig is not None:
-                daemon_end = self.ending if config.stop_when_done else None
-                self._experiment = ConfiguredExperiment(
-                    config.experiment, self.rig, autostart=config.autostart, daemon_end=daemon_end
-                )
+            if settings is not None:
+                self._build_rig(config, settings, clock)
+            else:
+                self.sensors = build_sensors(config, self.publisher, clock, self.recorder, open_sessions(config))
             self.commands = Commands(
                 self.rig, self.sensors, self._experiment, self.health, self.ending, partial(self._report, clock)
             )
@@ -118,6 +113,28 @@ class Daemon:
         for name, part in {**self.tasks, COMBINED: self.sensors.combined, "commands": refusals}.items():
             if isinstance(part, Reporter):
                 self.health.reporters[name] = part
+
+    def _build_rig(self, config: DaemonConfig, settings: "UrSettings", clock: Clock) -> None:
+        """Build robot, gripper and control loop, and the sensors that drive it."""
+        # Only a rig with a robot loads their modules.
+        from shearloop.daemon.configured_experiment import ConfiguredExperiment
+        from shearloop.daemon.rig import build_rig
+
+        self.sensors, self.rig = build_rig(
+            config, settings, open_sessions(config), self.publisher, clock, self.recorder, self.supervisor
+        )
+        if self.rig.commissioning is not None:
+            self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
+        self.health.refusals |= {
+            "tare": self.rig.control_loop.tare_refusal,
+            "start": self.rig.runner.start_refusal,
+            "release": self.rig.runner.release_refusal,
+        }
+        if config.experiment is not None:
+            daemon_end = self.ending if config.stop_when_done else None
+            self._experiment = ConfiguredExperiment(
+                config.experiment, self.rig, autostart=config.autostart, daemon_end=daemon_end
+            )
 
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Run until `stop`, then end every task and close the sockets; `on_ready` is called once the tasks run."""
@@ -190,6 +207,22 @@ class Daemon:
     def finished(self) -> bool:
         """Whether the experiment that ends the daemon is done; True without one."""
         return self._experiment is None or self._experiment.finished
+
+
+def _take_robot(config: DaemonConfig, opened: contextlib.ExitStack) -> "UrSettings | None":
+    """Return the settings of the configured robot, None without one; no other daemon drives it while this one is open.
+
+    Raises DriverError for settings that cannot be used, and UserError for a robot that another daemon drives.
+    """
+    if config.robot is None:
+        return None
+    from shearloop.daemon.rig import open_settings
+    from shearloop.daemon.rig_memory import lock_robot
+
+    settings = open_settings(config)
+    if settings is not None:
+        opened.enter_context(lock_robot(settings.host))
+    return settings
 
 
 async def run_daemon(

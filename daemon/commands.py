@@ -6,25 +6,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from shearloop.daemon.configured_experiment import ConfiguredExperiment
-from shearloop.daemon.control.experiment_schema import first_motion
-from shearloop.daemon.control.plan import plan_of
-from shearloop.daemon.control.state_publisher import loop_state
-from shearloop.daemon.experiment_files import InvalidExperimentError
+from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
-from shearloop.daemon.rig import Rig, Sensors
+from shearloop.daemon.sensors import Sensors
 from shearloop.daemon.supervisor import HealthReporter
 from shearloop.errors import UserError
 
+if TYPE_CHECKING:
+    # Only a rig with a robot loads them.
+    from shearloop.daemon.configured_experiment import ConfiguredExperiment
+    from shearloop.daemon.rig import Rig
+
 EXPERIMENTS = "experiments"
 STOP_DELAY_S = 0.05
-# What `status` shows of `loop.state`.
-LOOP_KEYS = (
-    *("phase", "run", "experiment", "step", "steps", "step_name", "activity", "progress"),
-    *("cause", "faults", "reasons"),
-)
 
 
 class Answered(NamedTuple):
@@ -42,9 +38,9 @@ class Commands:
     `experiment` is the configured one; setting `daemon_end` ends the daemon.
     """
 
-    rig: Rig | None
+    rig: "Rig | None"
     sensors: Sensors
-    experiment: ConfiguredExperiment | None
+    experiment: "ConfiguredExperiment | None"
     health: HealthReporter
     daemon_end: asyncio.Event
     # Receives each answered command, except questions.
@@ -105,12 +101,8 @@ class Commands:
         try:
             if request.get("ask"):
                 _refuse_if(rig.runner.start_refusal())
-                file = (await rig.experiments.read(Path(path))).file
-                motion = first_motion(file)
-                robot = rig.experiments.robot
-                plan = plan_of(file, robot.settings.limits if robot is not None else None, rig.experiments.gripper)
-                question = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}."
-                return {"question": question, "plan": list(plan.sentences())}
+                question, plan = await rig.start_question(Path(path))
+                return {"question": question, "plan": plan}
             _refuse_if(await rig.start(Path(path)))
         except InvalidExperimentError as error:
             raise CommandRefusedError(str(error), invalid=True) from error
@@ -160,9 +152,7 @@ class Commands:
         daemon = {"process": os.getpid(), "folder": os.getcwd(), "rig": self.health.rig}
         if self.rig is None:
             return {"tasks": tasks, "daemon": daemon}
-        state = loop_state(self.rig.control_loop, 0.0, 0)
-        loop = {key: getattr(state, key) for key in LOOP_KEYS}
-        return {"tasks": tasks, "daemon": daemon, "loop": loop, "cap": self.health.cap()}
+        return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}
 
     async def _stop(self, request: Request) -> Reply:
         spare_daemon = bool(request.get("spare_daemon"))
@@ -181,7 +171,7 @@ class Commands:
         return {"ended": True}
 
 
-def required_rig(rig: Rig | None) -> Rig:
+def required_rig(rig: "Rig | None") -> "Rig":
     """Return the rig; raises CommandRefusedError without a rig."""
     if rig is None:
         raise CommandRefusedError("the configuration has no robot; add `robot: ur.yaml` to it")

@@ -18,6 +18,7 @@ import structlog
 from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.control.experiment_check import check_devices, check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
+from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.errors import UserError
 from shearloop.files import read_file
@@ -31,10 +32,6 @@ _LONGEST_NAME = 300
 # Files of a folder that are looked at for the list.
 MOST_LISTED = 500
 Found = TypeVar("Found")
-
-
-class InvalidExperimentError(UserError):
-    """A file that can be read is no valid experiment; the message has none of its content."""
 
 
 def read_experiment(path: Path) -> ExperimentFile:

@@ -18,7 +18,7 @@ from shearloop.drivers.connection import LinkEvent
 from shearloop.printable import own_stream, printable
 
 if TYPE_CHECKING:
-    from shearloop.daemon.control.control_loop import ControlLoop
+    from shearloop.daemon.torques import SensorListener
 
 # Texts beyond this number are dropped.
 MOST_WAITING = 10_000
@@ -132,7 +132,7 @@ class LinkReporter:
     """Logs the losses and returns of one device, and hands them to the control loop, where there is one."""
 
     device: str
-    loop: "ControlLoop | None" = None
+    loop: "SensorListener | None" = None
 
     def on_link_event(self, event: LinkEvent) -> None:
         """Log a return as info, a loss as warning, a repeated loss as debug."""

@@ -1,65 +1,57 @@
-"""The rig: builds sensors, gripper, robot and control loop from the configuration, and checks its experiment."""
+"""The rig: builds robot, gripper and control loop from the configuration, and checks its experiment."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-
-import structlog
+from typing import Any
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, commissioning_of, measured_widths
-from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
+from shearloop.daemon.config import DaemonConfig, GripperConfig
 from shearloop.daemon.control import experiment_check, experiment_schema
-from shearloop.daemon.control.action_executor import LONGEST_TARE_S, Tareable
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
+from shearloop.daemon.control.experiment_schema import first_motion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
-from shearloop.daemon.control.samples import TorqueSource
+from shearloop.daemon.control.plan import plan_of
+from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.experiment_files import ExperimentFiles, read_document, without_mistakes
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.rig_memory import RigMemory, memory_path
-from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask
-from shearloop.daemon.sensing.frame_pairing import FramePairing
-from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
-from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, torque_sources
+from shearloop.daemon.sensing.sessions import COMBINED, torque_sources
+from shearloop.daemon.sensors import (
+    EMULATED_PATIENCE,
+    EMULATED_STALE_S,
+    Sensors,
+    Sessions,
+    build_sensors,
+    is_patient,
+    patience_of,
+)
 from shearloop.daemon.supervisor import Supervisor, Task
+from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.calibration_files import load_device_calibration
-from shearloop.drivers.connection import LinkMonitor, SerialLink
-from shearloop.drivers.eit_kit import EitKit
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.hosts import is_loopback_host
-from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.models import MODELS, GripperModel
 from shearloop.drivers.robotiq.socket_client import REPLY_DEADLINE_S, SocketClient
-from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
-from shearloop.estimation import Session
 
-# An emulated rig cannot hurt: its deadlines are longer by this factor, so that it survives a busy computer.
-EMULATED_PATIENCE = 10.0
-# A torque of an emulated sensor, and a state of an emulated robot, is fresh for this long.
-EMULATED_STALE_S = 5.0
-
-
-def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
-    """Return the load cell's calibration; raises DriverError if it cannot be used."""
-    if config.calibration is None:
-        return LoadCalibration.of_torque_lines()
-    return load_device_calibration(config.calibration, LoadCalibration)
-
-
-def patience_of(config: DaemonConfig) -> float:
-    """Return the factor on the deadlines of a rig's devices: above 1 for an emulated rig alone."""
-    return EMULATED_PATIENCE if is_patient(config) else 1.0
+# What `status` shows of `loop.state`.
+LOOP_KEYS = (
+    *("phase", "run", "experiment", "step", "steps", "step_name", "activity", "progress"),
+    *("cause", "faults", "reasons"),
+)
 
 
 def make_gripper_client(config: GripperConfig, patience: float = 1.0) -> RobotiqClient:
@@ -115,11 +107,6 @@ def open_settings(config: DaemonConfig) -> UrSettings | None:
             "`emulated: true`: take that out for a real robot, or give 127.0.0.1 for an emulated one"
         )
     return with_emulated_deadlines(settings) if is_patient(config) else settings
-
-
-def is_patient(config: DaemonConfig) -> bool:
-    """Return whether deadlines fit a busy computer: nothing that is emulated can hurt."""
-    return config.emulated and config.emulated_deadlines == "patient"
 
 
 def with_emulated_deadlines(settings: UrSettings) -> UrSettings:
@@ -221,110 +208,39 @@ class Rig:
             self.recorder.record_experiment(experiment.file.name, attached, experiment.file.tool_mm)
         return reason
 
+    async def start_question(self, path: Path) -> tuple[str, list[str]]:
+        """Return the question before a start, with the first motion, and the plan; raises UserError as `start` does."""
+        file = (await self.experiments.read(path)).file
+        motion = first_motion(file)
+        robot = self.experiments.robot
+        plan = plan_of(file, robot.settings.limits if robot is not None else None, self.experiments.gripper)
+        return f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.", list(plan.sentences())
 
-@dataclass(frozen=True, slots=True)
-class Sensors:
-    """All configured sensors; no device is open yet.
-
-    `tasks` are by their names in `health`; `tareable` is everything that has a zero.
-    """
-
-    tasks: Mapping[str, Task]
-    tareable: Mapping[str, Tareable]
-    combined: CombinedTask | None
-    load_cell: LoadCell | None
-
-
-def build_sensors(
-    config: DaemonConfig,
-    publisher: Publisher,
-    clock: Clock,
-    recorder: Recorder | None,
-    loop: ControlLoop | None,
-    sessions: Mapping[str, Session],
-    combined: Session | None,
-    gripper: GripperTask | None,
-) -> Sensors:
-    """Return all sensors, which publish, are recorded, and drive the control loop, where there is one.
-
-    The gripper gives the held tool, and receives the fingertips' diameters.
-    """
-
-    def inputs(source: str) -> InputRecorder | None:
-        return recorder.input_recorder(source) if recorder is not None else None
-
-    def link(name: str, device: SerialDevice) -> SerialLink:
-        return SerialLink(**device.model_dump(), monitor=LinkMonitor(LinkReporter(name, loop)))
-
-    patience = patience_of(config)
-    pairs: CombinedTask | None = None
-    if combined is not None:
-        sides = combined.calibration.sides
-        period_s = config.fingertips[sides[0]].frame_period_s
-        pairs = CombinedTask(
-            COMBINED, combined, publisher, clock, loop, gripper, inputs(COMBINED),
-            longest_tare_s=_longest_tare_s(config.fingertips[sides[0]]),
-            period_s=period_s, pairing=FramePairing(sides, period_s), sides=[inputs(side) for side in sides],
-        )  # fmt: skip
-    tasks: dict[str, Task] = {}
-    tareable: dict[str, Tareable] = {}
-    for name, session in sessions.items():
-        own = config.fingertips[name]
-        zero_slots = session.calibration.table.zero_slots
-        board = EitKit(link(name, own.device), zero_slots, own.frame_period_s, inputs(name), patience)
-        task = BoardTask(
-            name, session, publisher, clock, loop, gripper, inputs(name), longest_tare_s=_longest_tare_s(own),
-            board=board, combined=pairs, always_heatmap=own.heatmap == "always",
-        )  # fmt: skip
-        tasks[name] = tareable[name] = task
-    if pairs is not None:
-        tareable[COMBINED] = pairs
-    if config.skin is not None:
-        # Only a rig with a skin loads its modules.
-        from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, ReplayedSkin, SkinTask
-
-        sources = {name: inputs(name) for name in ReplayedSkin.sources}
-        tareable[SKIN] = tasks[SKIN] = skin = SkinTask(config.skin, publisher, clock, loop, sources)
-        tasks[SKIN_CURRENT] = skin.source
-    lever: LoadCell | None = None
-    if (cell := config.load_cell) is not None:
-        calibration = load_cell_calibration(cell)
-        lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL), patience)
-        tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
-    return Sensors(tasks, tareable, pairs, lever)
-
-
-def log_assumptions(sessions: Mapping[str, Session]) -> None:
-    """Log what the estimates of each session rest on that nothing checks."""
-    for name, session in sessions.items():
-        if assumed := session.calibration.assumption_text:
-            structlog.get_logger().warning(f"the calibration of {name} assumes that {assumed}")
-
-
-def _longest_tare_s(fingertip: FingertipConfig) -> float:
-    """Return the time within which a fingertip's tare must be complete: three times that of its frames."""
-    return max(LONGEST_TARE_S, 3.0 * fingertip.baseline_frames * fingertip.frame_period_s)
+    def state(self) -> Mapping[str, Any]:
+        """Return what `status` shows of the control loop."""
+        state = loop_state(self.control_loop, 0.0, 0)
+        return {key: getattr(state, key) for key in LOOP_KEYS}
 
 
 def build_rig(
-    config: DaemonConfig, publisher: Publisher, clock: Clock, recorder: Recorder | None, supervisor: Supervisor
-) -> tuple[Sensors, Rig | None]:
-    """Return all sensors, and robot, gripper and control loop, if there is a robot."""
-    sessions = {name: open_session(fingertip, name) for name, fingertip in config.fingertips.items()}
-    combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
-    log_assumptions(sessions if combined is None else {**sessions, COMBINED: combined})
-    sources = torque_sources(config, sessions, combined)
-    settings = open_settings(config)
-    commissioning = commissioning_of(config, settings) if settings is not None else None
+    config: DaemonConfig,
+    settings: UrSettings,
+    sessions: Sessions,
+    publisher: Publisher,
+    clock: Clock,
+    recorder: Recorder | None,
+    supervisor: Supervisor,
+) -> tuple[Sensors, Rig]:
+    """Return robot, gripper and control loop, and all sensors, which drive it; `settings` are the robot's."""
+    sources = torque_sources(config, sessions.fingertips, sessions.combined)
+    commissioning = commissioning_of(config, settings)
     check_experiment(config, sources, commissioning)
-    if commissioning is None:
-        return build_sensors(config, publisher, clock, recorder, None, sessions, combined, None), None
     settings, supplied = commissioning.settings, commissioning.supplied
     loop = make_loop(config, settings, sources, supervisor.dead, supplied)
     gripper = None
     if config.gripper is not None:
         gripper = make_gripper(config.gripper, loop, publisher, patience_of(config), supplied)
-    sensors = build_sensors(config, publisher, clock, recorder, loop, sessions, combined, gripper)
+    sensors = build_sensors(config, publisher, clock, recorder, sessions, loop, gripper)
     robot = UrRobot(
         settings,
         LinkMonitor(LinkReporter("robot", loop)),

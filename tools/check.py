@@ -51,10 +51,10 @@ class Parts:
 
 def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulators) -> Parts:
     """Return what each part of the configuration in this file is; opens every file that it names."""
-    from shearloop.daemon.control.samples import TorqueSource
     from shearloop.daemon.experiment_files import read_document
     from shearloop.daemon.rig import check_experiment, experiment_mistakes, gripper_model
     from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, torque_sources
+    from shearloop.daemon.torques import TorqueSource
 
     parts, sessions, combined = Parts(), {}, None
     with parts.of("emulators"):
@@ -151,7 +151,8 @@ def _torque(calibration: "Calibration") -> str:
 def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
     """Check load cell, gripper and robot; return the robot's settings with their cap, if there are any."""
     from shearloop.daemon.commissioning import commissioning_of
-    from shearloop.daemon.rig import gripper_calibration, load_cell_calibration, open_settings
+    from shearloop.daemon.rig import gripper_calibration, open_settings
+    from shearloop.daemon.sensors import load_cell_calibration
 
     if (cell := config.load_cell) is not None:
         with parts.of("load_cell"):

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import structlog
 
@@ -15,6 +15,7 @@ from shearloop.daemon.control.experiment_schema import AdaptStep, ApproachStep, 
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.supervisor import error_text
+from shearloop.daemon.torques import LONGEST_TARE_S, Adaptable, Tareable
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import (
@@ -34,33 +35,9 @@ RELEASED_WITHIN_S = 7.0
 LINEAR_ACCELERATION_M_PER_S2 = 0.3
 # The arm rests within this time after a stop, unless something else moves it.
 COMES_TO_REST_S = 2.0
-# The paper's ten frames take 5.4 s.
-LONGEST_TARE_S = 30.0
 # A tare gives up this much before its step is overdue, so that the sensors' reasons are reported.
 GIVES_UP_BEFORE_S = 0.1
 UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
-
-
-class Tareable(Protocol):
-    """A sensor with a zero."""
-
-    @property
-    def taring(self) -> bool:
-        """Whether a zero that was asked for is being taken."""
-
-    def tare(self) -> None:
-        """Take a new zero from later measurements."""
-
-    async def tare_and_wait(self, within_s: float) -> str | None:
-        """Take a new zero and wait until it is done; return None, or why it was not taken."""
-
-
-@runtime_checkable
-class Adaptable(Protocol):
-    """A sensor that another sensor's torque can correct."""
-
-    async def adapt(self, reference: str) -> None:
-        """Correct the gain by this source's torque during this grip; raises ActionError."""
 
 
 @dataclass(slots=True)

@@ -3,7 +3,7 @@
 A plain object without I/O or clock: inputs come in, `ControlOutput` go out, and events report their results.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -21,10 +21,11 @@ from shearloop.daemon.control.experiment_schema import (
 )
 from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
-from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs, TorqueSample, TorqueSource
+from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import Compute, WristController, at_once
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.torques import TorqueSample, TorqueSource
 
 # A torque below this counts as drift: a tare needs no confirmation.
 LOADED_NM = 0.05
@@ -131,6 +132,10 @@ class ControlLoop:
         self.inputs.add_torque(torque)
         if (wrist := self._wrists.get(torque.source)) is not None:
             wrist.on_torque(torque)
+
+    def torques_of(self, source: str) -> tuple[Sequence[int], Sequence[float]]:
+        """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m."""
+        return self.inputs.history.get(source, ([], []))
 
     def on_arm(self, arm: ArmStatus) -> None:
         """Take a state of the robot."""

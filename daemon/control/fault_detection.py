@@ -7,9 +7,10 @@ from enum import Enum
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.safety import Fault, FaultCode
-from shearloop.daemon.control.samples import LatestInputs, TorqueSample, TorqueSource
+from shearloop.daemon.control.samples import LatestInputs
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import stale_after_s
+from shearloop.daemon.torques import TorqueSample, TorqueSource
 
 # 2.5 periods of their topics.
 ARM_STALE_S = stale_after_s("robot.state")

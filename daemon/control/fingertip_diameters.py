@@ -6,20 +6,6 @@ from shearloop.estimation import Estimate, Measured, combine
 STALE_AFTER_NS = round(stale_after_s("eit.estimate") * 1e9)
 
 
-def tool_as_bytes(frame: int, tool: Measured | None) -> bytes:
-    """Return the raw event's data: the tool that is held from a frame on."""
-    return (str(frame) if tool is None else f"{frame} {tool.value!r} {tool.half_width!r}").encode()
-
-
-def tool_from_bytes(data: bytes) -> tuple[int, Measured | None]:
-    """Return the frame and the tool of a raw event; raises ValueError for other data."""
-    frame, *tool = data.decode().split()
-    if not tool:
-        return int(frame), None
-    value, half_width = map(float, tool)
-    return int(frame), Measured(value, half_width)
-
-
 class FingertipDiameters:
     """The latest diameter of each fingertip, and of all together."""
 

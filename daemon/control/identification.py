@@ -7,9 +7,9 @@ from statistics import fmean
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.control.wrist_limit import WristLimit
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
 
 # The grid of the torque's lag behind its stamp.

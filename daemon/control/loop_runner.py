@@ -7,7 +7,7 @@ from contextlib import suppress
 import structlog
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.action_executor import UNLOCKING, ActionExecutor, Tareable
+from shearloop.daemon.control.action_executor import UNLOCKING, ActionExecutor
 from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import Experiment, ExperimentPhase
@@ -15,11 +15,12 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.safety import Fault, FaultCode
-from shearloop.daemon.control.samples import ArmStatus, TorqueSample, TorqueSource
+from shearloop.daemon.control.samples import ArmStatus
 from shearloop.daemon.control.state_publisher import PUBLISH_EVERY, StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import error_text
+from shearloop.daemon.torques import Tareable, TorqueSample, TorqueSource
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState

@@ -1,39 +1,14 @@
-"""What the control loop takes: torque samples, the states of arm and gripper with times, and the latest of each."""
+"""What the control loop takes: the states of arm and gripper with times, and the latest of each input."""
 
-import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
+from shearloop.daemon.torques import TorqueSample
 
 # Torques between two ticks; more come only while the loop stands still.
 MOST_UNJUDGED = 256
-
-
-@dataclass(frozen=True, slots=True)
-class TorqueSample:
-    """One torque of one source, with the time of its measurement (`t_mid_ns`) and of its arrival (`t_ns`).
-
-    `torque_nm` is None if it is not valid, for `reason`. `low_nm` and `high_nm` bound the friction band that
-    hides the torque.
-    """
-
-    source: str
-    torque_nm: float | None
-    reason: str
-    t_mid_ns: int
-    t_ns: int
-    low_nm: float | None = None
-    high_nm: float | None = None
-
-    def __post_init__(self) -> None:
-        """Treat NaN and infinity as no torque."""
-        if self.torque_nm is not None and not math.isfinite(self.torque_nm):
-            object.__setattr__(self, "reason", f"it measured {self.torque_nm}, which is no number")
-            object.__setattr__(self, "torque_nm", None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,30 +40,6 @@ class GripperStatus:
     moving: bool
     fault: str = ""
     uncertain: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TorqueSource:
-    """A source of torques: its period and the averaging window of one torque.
-
-    `has_friction_band`: friction hides the torque within a band; the wrist turns through it without a change.
-    `from_robot`: the torque comes with the robot's state, so its age is checked there. `measures_torque` is False for a
-    fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
-    the first torque; 0 for a source that measures without a grip. `has_gain`: an `adapt` step can correct its gain.
-    """
-
-    name: str
-    period_s: float
-    window_s: float = 0.0
-    has_friction_band: bool = False
-    from_robot: bool = False
-    measures_torque: bool = True
-    warm_up_s: float = 0.0
-    has_gain: bool = False
-
-    def fresh_s(self, config: LoopConfig) -> float:
-        """Return how long after its arrival a torque is fresh."""
-        return max(STALE_AFTER_PERIODS * self.period_s, config.stale_after_s)
 
 
 @dataclass(slots=True)

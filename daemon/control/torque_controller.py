@@ -33,8 +33,8 @@ from statistics import fmean
 
 import numpy as np
 
-from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.control.wrist_limit import WristLimit
+from shearloop.daemon.torques import TorqueSample
 from shearloop.errors import UserError
 
 # The ramp does not catch up when the loop was late for longer than this.

@@ -12,7 +12,6 @@ from shearloop.daemon.control.experiment import ConstantVelocity, Hold, MoveToAn
 from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.margins import JudgedGain, gain_for_noise, integral_gain, judged_gain
-from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.control.torque_controller import (
     LONGEST_STEP_NS,
     ControllerReason,
@@ -22,6 +21,7 @@ from shearloop.daemon.control.torque_controller import (
 )
 from shearloop.daemon.control.wrist_limit import WristLimit
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.torques import TorqueSample, TorqueSource
 
 # Begins a computation that would make the loop late, and returns its future.
 Compute: TypeAlias = Callable[[Callable[[], JudgedGain]], "Future[JudgedGain]"]

@@ -8,7 +8,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame
 from shearloop.drivers.eit_kit import Frame
-from shearloop.estimation import Adaptation, Estimate
+from shearloop.estimation import Adaptation, Estimate, Measured
 
 _GIVEN_UP = " given up"
 
@@ -87,3 +87,17 @@ def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, n
         frame=frames[0].seq,
         latency_s=(now_ns - max(map(attrgetter("t_arrival_ns"), frames))) / 1e9,
     )
+
+
+def tool_as_bytes(frame: int, tool: Measured | None) -> bytes:
+    """Return the raw event's data: the tool that is held from a frame on."""
+    return (str(frame) if tool is None else f"{frame} {tool.value!r} {tool.half_width!r}").encode()
+
+
+def tool_from_bytes(data: bytes) -> tuple[int, Measured | None]:
+    """Return the frame and the tool of a raw event; raises ValueError for other data."""
+    frame, *tool = data.decode().split()
+    if not tool:
+        return int(frame), None
+    value, half_width = map(float, tool)
+    return int(frame), Measured(value, half_width)

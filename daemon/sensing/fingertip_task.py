@@ -3,25 +3,23 @@
 import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 import structlog
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.action_executor import LONGEST_TARE_S
-from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
-from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.fingertip_messages import (
     adapted_message,
     estimate_message,
     tare_as_bytes,
+    tool_as_bytes,
     torques_as_bytes,
 )
 from shearloop.daemon.sensing.snapshots import record_state
+from shearloop.daemon.torques import LONGEST_TARE_S, SensorListener, TorqueSample
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.errors import ActionError
@@ -30,6 +28,28 @@ from shearloop.words import counted
 
 # A correction of the gain begins with a frame.
 _LONGEST_WAIT_S = 5.0
+
+
+class DiameterListener(Protocol):
+    """Takes the fingertips' diameters."""
+
+    def update(self, source: str, estimate: Estimate, t_ns: int) -> None:
+        """Take a source's estimate at t_ns."""
+
+
+class ToolHolder(Protocol):
+    """What presses the fingertips on the tool, where there is one: the gripper."""
+
+    @property
+    def diameters(self) -> DiameterListener:
+        """Who takes the fingertips' diameters."""
+
+    @property
+    def is_holding(self) -> bool | None:
+        """Whether something is between the fingers; None while that is not known."""
+
+    def held_tool(self, t_ns: int) -> Measured | None:
+        """Return the diameter of the held tool at t_ns, None if it is not known."""
 
 
 class _Tare:
@@ -110,8 +130,8 @@ class FingertipTask:
     session: Session
     publisher: Publisher
     clock: Clock
-    loop: ControlLoop | None = None
-    gripper: GripperTask | None = None
+    loop: SensorListener | None = None
+    gripper: ToolHolder | None = None
     inputs: InputRecorder | None = None
     # The longest time of a tare that nobody waits for.
     longest_tare_s: float = LONGEST_TARE_S
@@ -227,7 +247,7 @@ class FingertipTask:
             self._adapting = None
 
     def _adapt(self, reference: str, frames: tuple[Frame, ...], now_ns: int) -> None:
-        times_ns, torques_nm = self.loop.inputs.history.get(reference, ([], [])) if self.loop else ([], [])
+        times_ns, torques_nm = self.loop.torques_of(reference) if self.loop is not None else ([], [])
         torque_nm = torque_at(self.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
         adaptation = self.session.adapt(torque_nm)
         self._record(InputKind.ADAPT, now_ns, torques_as_bytes(frames[0].seq, reference, torque_nm))

@@ -7,11 +7,10 @@ from collections.abc import Mapping
 import structlog
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
+from shearloop.daemon.torques import SensorListener, TorqueSample
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 LOAD_CELL = "load_cell"
@@ -27,7 +26,7 @@ class LoadCellTask:
     """Connects the load cell's board to the publisher and the control loop."""
 
     def __init__(
-        self, board: LoadCell, publisher: Publisher, clock: Clock, loop: ControlLoop | None, rate_hz: float
+        self, board: LoadCell, publisher: Publisher, clock: Clock, loop: SensorListener | None, rate_hz: float
     ) -> None:
         self._period_s = 1.0 / rate_hz
         self._timeout_s = max(ZERO_TIMEOUT_S, 2.0 * (ZERO_SAMPLES + SETTLING_PERIODS) / rate_hz)

@@ -11,9 +11,9 @@ from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
-from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
 from shearloop.estimation import Calibration, Session
 from shearloop.estimation.bank_match import PaperMatcher

@@ -8,13 +8,12 @@ from types import MappingProxyType
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
-from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.sensing.snapshots import record_state, restored
+from shearloop.daemon.torques import SensorListener, TorqueSample, TorqueSource
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import (
@@ -71,7 +70,7 @@ class SkinTask:
         config: SkinConfig,
         publisher: Publisher,
         clock: Clock,
-        loop: ControlLoop | None = None,
+        loop: SensorListener | None = None,
         inputs: Mapping[str, InputRecorder | None] = MappingProxyType({}),
     ) -> None:
         """Build everything, not yet open; `inputs` keeps the inputs of each source, by its name.

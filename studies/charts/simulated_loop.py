@@ -19,11 +19,11 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.experiment import TrackTorque
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.margins import integral_gain
-from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController, WristCommand
 from shearloop.daemon.control.wrist_controller import controller_settings
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.run_summary import BAND, recovered_s
+from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 PERIOD_S = 0.008

@@ -19,10 +19,11 @@ from matplotlib.figure import Figure
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
-from shearloop.daemon.control.samples import ArmStatus, TorqueSample, TorqueSource
+from shearloop.daemon.control.samples import ArmStatus
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
+from shearloop.daemon.torques import TorqueSample, TorqueSource
 from shearloop.drivers.shear_skin.skin import SkinSample
 from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration

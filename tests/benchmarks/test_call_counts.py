@@ -6,20 +6,29 @@ from benchmarks.call_counts import counts, loaded_by_run
 from benchmarks.call_trace import Trace, WayTrace
 from shearloop import units
 
-# Of the package, in all modules that `shearloop run` loads.
-MOST_LINES = 22_000
+# Of the package, in all modules that `shearloop run` loads: for sensors alone, and with a robot.
+MOST_LINES, MOST_LINES_WITH_ROBOT = 15_000, 22_500
 NOT_ON_THE_ROBOTS_PC = ("emulators", "tools", "studies")
 
 
 def test_the_daemon_loads_nothing_but_what_runs_on_the_robots_pc():
-    loaded = loaded_by_run()
+    loaded = loaded_by_run(robot=True)
     strangers = [name for name in loaded.modules if name.split(".")[1:2] and name.split(".")[1] in NOT_ON_THE_ROBOTS_PC]
     assert strangers == []
     assert "shearloop.daemon.control.control_loop" in loaded.modules
     assert loaded.lines > 1000
-    assert loaded.lines <= MOST_LINES
+    assert loaded.lines <= MOST_LINES_WITH_ROBOT
     assert [name for name in loaded.modules if "skin" in name] == [], "only a rig with a skin loads its modules"
     assert "shearloop.drivers.ur.control_box" not in loaded.modules, "the robot's process talks to the control box"
+
+
+def test_sensors_alone_load_neither_control_loop_nor_drivers_of_robot_and_gripper():
+    loaded = loaded_by_run(robot=False)
+    # The summary of a run knows the faults, and the configuration the grippers' models.
+    known = ["daemon.control", "daemon.control.safety", "drivers.robotiq", "drivers.robotiq.models"]
+    robots = ("shearloop.daemon.control", "shearloop.drivers.ur", "shearloop.drivers.robotiq")
+    assert [name.removeprefix("shearloop.") for name in loaded.modules if name.startswith(robots)] == known
+    assert loaded.lines <= MOST_LINES
 
 
 @pytest.fixture

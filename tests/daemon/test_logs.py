@@ -7,9 +7,9 @@ import threading
 from contextlib import closing
 
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.logs import LinkReporter, NonBlockingWriter
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.connection import LinkEvent
 
 PROGRAM = """

@@ -10,9 +10,11 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import Watched, detect_faults
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyMonitor
-from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs, TorqueSource
+from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.rig import EMULATED_PATIENCE, make_loop, open_settings
+from shearloop.daemon.rig import make_loop, open_settings
+from shearloop.daemon.sensors import EMULATED_PATIENCE
+from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.errors import UserError
 from tests.fixtures.daemons import robot_at

@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
-from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.rig import check_experiment
+from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
 
 SERIAL = {"device": {"path": "port"}}

@@ -12,10 +12,10 @@ import yaml
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment import TrackTorque
 from shearloop.daemon.control.experiment_schema import IdentifyStep
-from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.control.wrist_controller import WristController, controller_settings
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.rig import make_loop, robot_settings
+from shearloop.daemon.torques import TorqueSource
 from tests.daemon.control.test_margins import FOUND
 
 PACKAGE = Path(__file__).parents[2]

@@ -12,8 +12,8 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import BankError
 from shearloop.daemon.config import AdcConfig, FingertipConfig, LoadCellConfig, SerialDevice
-from shearloop.daemon.rig import load_cell_calibration
 from shearloop.daemon.sensing.sessions import fingertip_table
+from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.drivers.connection import SerialPort, find_port
 from shearloop.drivers.eit_kit import START, Frame, FrameParser
 from shearloop.drivers.errors import DriverError

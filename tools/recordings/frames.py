@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydantic_core import from_json
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
-from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
 from shearloop.daemon.recorder import schema
+from shearloop.daemon.sensing.fingertip_messages import tool_from_bytes
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import Measured
 from shearloop.tools.recordings.reader import open_recording, reading, unusable

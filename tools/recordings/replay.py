@@ -21,16 +21,15 @@ import structlog
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.clock import Clock, ClockReading
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.control.fingertip_diameters import tool_from_bytes
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder import schema
-from shearloop.daemon.rig import load_cell_calibration
 from shearloop.daemon.sensing.fingertip_messages import (
     adapted_message,
     estimate_message,
     frame_message,
     tare_from_bytes,
+    tool_from_bytes,
     torques_from_bytes,
 )
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
@@ -39,6 +38,7 @@ from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session
 from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
 from shearloop.daemon.sensing.snapshots import SnapshotError, restored
+from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent

@@ -10,8 +10,8 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, TareStep
 from shearloop.daemon.control.safety import FaultCode, Response
-from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.control.state_publisher import loop_state
+from shearloop.daemon.torques import TorqueSample
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, started, stop
 
 

@@ -15,8 +15,8 @@ from shearloop.daemon.control.identification import (
     StiffnessExcitation,
     identify,
 )
-from shearloop.daemon.control.samples import TorqueSource
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.torques import TorqueSource
 
 WINDOW_S = 0.5412
 

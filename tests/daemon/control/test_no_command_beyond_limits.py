@@ -12,7 +12,8 @@ from shearloop.daemon.control.control_loop import ControlOutput
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.safety import Response
-from shearloop.daemon.control.samples import GripperStatus, TorqueSample
+from shearloop.daemon.control.samples import GripperStatus
+from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 from shearloop.emulators.scene import Twin, TwinSettings
 from tests.daemon.control.cell import GRIP, Cell, Gripper, driven

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.control.torque_controller import AngleHistory, ControllerReason, JumpDetector, TorqueController
+from shearloop.daemon.torques import TorqueSample
 from shearloop.errors import UserError
 
 from .conftest import Bench

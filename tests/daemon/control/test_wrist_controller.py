@@ -10,9 +10,9 @@ from shearloop.daemon.control.experiment import MoveToAngle, TrackTorque
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
 from shearloop.daemon.control.margins import JudgedGain
-from shearloop.daemon.control.samples import TorqueSample, TorqueSource
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.torques import TorqueSample, TorqueSource
 from tests.daemon.control.cell import Cell, driven
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 

@@ -13,13 +13,13 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
-from shearloop.daemon.control.samples import TorqueSample
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes
 from shearloop.daemon.sensing.fingertip_messages import tare_from_bytes
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.sessions import COMBINED
+from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, RawEvent

@@ -11,9 +11,9 @@ from structlog.testing import capture_logs
 
 from shearloop.bank.errors import BankError
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
-from shearloop.daemon.rig import log_assumptions
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
 from shearloop.daemon.sensing.sessions import open_combined, open_session
+from shearloop.daemon.sensors import log_assumptions
 from shearloop.drivers.eit_kit import Frame
 from shearloop.errors import UserError
 from shearloop.estimation import Calibration, Estimate, FrameSeries, Session, fit

@@ -2,12 +2,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.fingertip_diameters import (
-    STALE_AFTER_NS,
-    FingertipDiameters,
-    tool_as_bytes,
-    tool_from_bytes,
-)
+from shearloop.daemon.control.fingertip_diameters import STALE_AFTER_NS, FingertipDiameters
+from shearloop.daemon.sensing.fingertip_messages import tool_as_bytes, tool_from_bytes
 from shearloop.estimation import Estimate, Measured
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.fingertip_diameters import tool_as_bytes
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
 from shearloop.daemon.recorder.recorder import Identity, Recorder
 from shearloop.daemon.recorder.schema import basic_identity
+from shearloop.daemon.sensing.fingertip_messages import tool_as_bytes
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.estimation import Measured

@@ -1,0 +1,94 @@
+"""What sensors and control loop exchange: torques with their sources, zeros, and known torques."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
+
+# The paper's ten frames take 5.4 s.
+LONGEST_TARE_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueSample:
+    """One torque of one source, with the time of its measurement (`t_mid_ns`) and of its arrival (`t_ns`).
+
+    `torque_nm` is None if it is not valid, for `reason`. `low_nm` and `high_nm` bound the friction band that
+    hides the torque.
+    """
+
+    source: str
+    torque_nm: float | None
+    reason: str
+    t_mid_ns: int
+    t_ns: int
+    low_nm: float | None = None
+    high_nm: float | None = None
+
+    def __post_init__(self) -> None:
+        """Treat NaN and infinity as no torque."""
+        if self.torque_nm is not None and not math.isfinite(self.torque_nm):
+            object.__setattr__(self, "reason", f"it measured {self.torque_nm}, which is no number")
+            object.__setattr__(self, "torque_nm", None)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TorqueSource:
+    """A source of torques: its period and the averaging window of one torque.
+
+    `has_friction_band`: friction hides the torque within a band; the wrist turns through it without a change.
+    `from_robot`: the torque comes with the robot's state, so its age is checked there. `measures_torque` is False for a
+    fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
+    the first torque; 0 for a source that measures without a grip. `has_gain`: an `adapt` step can correct its gain.
+    """
+
+    name: str
+    period_s: float
+    window_s: float = 0.0
+    has_friction_band: bool = False
+    from_robot: bool = False
+    measures_torque: bool = True
+    warm_up_s: float = 0.0
+    has_gain: bool = False
+
+    def fresh_s(self, config: LoopConfig) -> float:
+        """Return how long after its arrival a torque is fresh."""
+        return max(STALE_AFTER_PERIODS * self.period_s, config.stale_after_s)
+
+
+class SensorListener(Protocol):
+    """Takes what all sensors report, where there is a robot: the control loop."""
+
+    def on_link(self, device: str, sentence: str, *, up: bool) -> None:
+        """Take the return or the loss of a device, with a sentence."""
+
+    def on_torque(self, torque: TorqueSample) -> None:
+        """Take a torque of any source."""
+
+    def torques_of(self, source: str) -> tuple[Sequence[int], Sequence[float]]:
+        """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m."""
+
+
+class Tareable(Protocol):
+    """A sensor with a zero."""
+
+    @property
+    def taring(self) -> bool:
+        """Whether a zero that was asked for is being taken."""
+
+    def tare(self) -> None:
+        """Take a new zero from later measurements."""
+
+    async def tare_and_wait(self, within_s: float) -> str | None:
+        """Take a new zero and wait until it is done; return None, or why it was not taken."""
+
+
+@runtime_checkable
+class Adaptable(Protocol):
+    """A sensor that another sensor's torque can correct."""
+
+    async def adapt(self, reference: str) -> None:
+        """Correct the gain by this source's torque during this grip; raises ActionError."""

@@ -56,6 +56,11 @@ def frame_of_pose(pose: Sequence[float] | Vector) -> Matrix:
     return frame
 
 
+def _pose_of_frame(frame: Matrix) -> Vector:
+    """Return the pose (6,) of a frame (4, 4)."""
+    return np.concatenate([frame[:3, 3], Rotation.from_matrix(frame[:3, :3]).as_rotvec()])
+
+
 def joints_within(
     lower_rad: Sequence[float],
     upper_rad: Sequence[float],
@@ -194,18 +199,23 @@ class Arm:
         self.bias_n = np.zeros(3)
         # Of what hangs on the tool.
         self.hung_kg = 0.0
-        self._framed_q_rad, self._last_frame = self.q_rad, tool_frames(self.q_rad, self._tool)[-1]
+        self._framed_q_rad, self._last_frames = self.q_rad, tool_frames(self.q_rad, self._tool)
+        self._posed_q_rad, self._last_pose = self.q_rad, _pose_of_frame(self._last_frames[-1])
         self._plant = plant
         self.load = np.zeros(6)
         self._wrench_zero = np.zeros(6)
         self._noise, self._random = np.zeros(6), np.random.default_rng(0)
 
+    # Frames and pose only where they are needed: they take longer than all else in a cycle. A motion makes new angles.
+    @property
+    def _frames(self) -> list[Matrix]:
+        if self._framed_q_rad is not self.q_rad:
+            self._framed_q_rad, self._last_frames = self.q_rad, tool_frames(self.q_rad, self._tool)
+        return self._last_frames
+
     @property
     def _frame(self) -> Matrix:
-        # Only where it is needed: it takes longer than all else in a cycle. A motion makes new angles.
-        if self._framed_q_rad is not self.q_rad:
-            self._framed_q_rad, self._last_frame = self.q_rad, tool_frames(self.q_rad, self._tool)[-1]
-        return self._last_frame
+        return self._frames[-1]
 
     @property
     def moving(self) -> bool:
@@ -215,12 +225,14 @@ class Arm:
     @property
     def pose(self) -> Vector:
         """The tool's pose (6,)."""
-        return np.concatenate([self._frame[:3, 3], Rotation.from_matrix(self._frame[:3, :3]).as_rotvec()])
+        if self._posed_q_rad is not self.q_rad:
+            self._posed_q_rad, self._last_pose = self.q_rad, _pose_of_frame(self._frame)
+        return self._last_pose
 
     @property
     def speed(self) -> Vector:
         """The tool's linear and angular velocity (6,) in base coordinates."""
-        return np.asarray(jacobian(tool_frames(self.q_rad, self._tool)) @ self.qd_rad_per_s)
+        return np.asarray(jacobian(self._frames) @ self.qd_rad_per_s)
 
     @property
     def wrench(self) -> Vector:
@@ -273,7 +285,10 @@ class Arm:
     def advance(self, dt_s: float) -> None:
         """Move for one cycle; `PathError` where the motion leads nowhere."""
         if self.motion is not None:
-            self.q_rad, self.qd_rad_per_s, finished = self.motion.advance(self.q_rad, self.qd_rad_per_s, dt_s)
+            q_rad, self.qd_rad_per_s, finished = self.motion.advance(self.q_rad, self.qd_rad_per_s, dt_s)
+            # An arm that is held at rest keeps its angles, and with them its frames and its pose.
+            if not np.array_equal(q_rad, self.q_rad):
+                self.q_rad = q_rad
             self.motion = None if finished else self.motion
 
     def feel(self, dt_s: float, *, noisy: bool = False) -> None:

@@ -24,7 +24,7 @@ from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS, FakeArm, HandlerB
 
 SPEED_M_PER_S = 0.1
 # A state is read, decided on and answered, and an action goes on, within this number of turns of the event loop.
-TURNS = 20
+TURNS = 8
 # Steps of experiments.
 MOVE = {"do": "approach", "along_tool_m": 0.1, "speed_m_per_s": SPEED_M_PER_S}
 GRIP = {"do": "grip", "width_mm": 10.0}

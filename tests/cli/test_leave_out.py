@@ -24,15 +24,15 @@ def test_a_recipe_is_judged_from_the_command_line(shared, tmp_path, result_of, r
 @pytest.mark.parametrize("limit_s", [0.0, 1e6])
 def test_calibrate_judges_or_names_the_command(limit_s, slices_folder, tmp_path, result_of, monkeypatch):
     monkeypatch.setattr("shearloop.cli.calibrate.recording.LEFT_OUT_WITHIN_S", limit_s)
-    made = ["calibrate", slices_folder / "torque_slices", "--estimator", "regression", "--out", tmp_path / "a.cal"]
-    result = result_of(*made)
+    recipe = ["--estimator", "regression", "--time-range", "0:0.5"]
+    result = result_of("calibrate", slices_folder / "torque_slices", *recipe, "--out", tmp_path / "a.cal")
     if limit_s:
         assert result["left_out"]["left_out"] == "levels"
     else:
         assert result["left_out"] is None
         command = result["left_out_command"].split()
         assert command[:4] == ["shearloop", "evaluate", "--leave-out", "levels"]
-        assert command[-2:] == ["--estimator", "regression"]
+        assert command[-4:] == recipe
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ import pytest
 from shearloop.estimation import Calibration
 from shearloop.estimation.learned_frames import UNKNOWN_FRAMES
 
+pytestmark = pytest.mark.usefixtures("unjudged")
+
 
 @pytest.fixture
 def cylinder(shared, tmp_path, ran):
@@ -79,7 +81,7 @@ def test_a_calibration_without_its_frames_cannot_tell(calibration, cylinder, tmp
 def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder, tmp_path, ran, mistake):
     recording, out, of_slices = cylinder("30mm_2"), ["--out", tmp_path / "new.cal"], tmp_path / "s.cal"
     assert "twist" in mistake("adapt", calibration, recording, "--time-range", "0:0.15", *out)
-    ran("calibrate", slices_folder, "--estimator", "regression", "--out", of_slices)
+    ran("calibrate", slices_folder / "torque_slices", "--estimator", "regression", "--out", of_slices)
     assert "calibration of slices" in mistake("adapt", of_slices, recording, *out)
     copy = tmp_path / "another name.mcap"
     copy.write_bytes(Path(recording).read_bytes())

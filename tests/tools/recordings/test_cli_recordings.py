@@ -24,6 +24,7 @@ from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.calibrate import CalibrationResult
 from shearloop.tools.evaluate import EstimateTrack, InvalidReason, draw_stream, draw_tracks, figures_of, invalid_reasons
 
+pytestmark = pytest.mark.usefixtures("unjudged")
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
 KEYS |= {"latency_ms_p50", "latency_ms_p99", "winkler_nm", "zero_rmse_nm", "loaded", "unloaded"}
 

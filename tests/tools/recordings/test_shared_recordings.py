@@ -283,6 +283,7 @@ def test_the_load_goes_with_the_frames_and_a_quarter_of_a_second_beside_is_refus
             fit("motion_regression", [replace(part, torque_t_s=part.torque_t_s + late_s)], "shifted")
 
 
+@pytest.mark.usefixtures("unjudged")
 def test_calibrate_says_how_late_the_load_is_unless_somebody_vouches_for_it(twists_file, tmp_path, ran, result_of):
     calibrate = ["calibrate", str(twists_file), "--time-range", "0:0.5", "--out", str(tmp_path / "a.cal")]
     assert "The load is stamped 0.27 s after the frames move." in ran(*calibrate).out
@@ -316,6 +317,7 @@ def test_a_fingertip_that_the_lever_hardly_moves_has_its_times_from_the_other_on
         measure_timing([late.select_sides(("left",))], [late])
 
 
+@pytest.mark.usefixtures("unjudged")
 def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, ran, result_of):
     calibrate = ["calibrate", str(twists_file), "--time-range", f"0:{THIRD}", "--out", str(tmp_path / "a.cal")]
     printed = ran(*calibrate).out

@@ -2,12 +2,18 @@
 
 import argparse
 import sys
-from functools import partial
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from shearloop.cli.options import add_option
+from shearloop.cli.run import EMULATED
 from shearloop.errors import UserError
+
+if TYPE_CHECKING:
+    from shearloop.cli.emulator_processes import EmulatedDevices
+    from shearloop.daemon.config import DaemonConfig
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -16,6 +22,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--out", Path, "FILE", "the report, a YAML file; an earlier one is continued", required=True)
     add_option(parser, "--stages", str, "FIGURES", "run only these stages, also again: 34 for 3 and 4", default="")
     add_option(parser, "--stops", int, "N", "stops by each layer at each speed; fewer than 5 raise no speed")
+    text = (
+        "rehearse it: emulate every device of this configuration; no real device is opened, and none needs your hands"
+    )
+    parser.add_argument("--emulate", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the report as JSON; questions go to stderr")
     parser.epilog = (
         "Each motion is shown with its speed and travel, and needs a typed word. It stays within 0.1 rad of the pose "
@@ -35,20 +45,59 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.tools.commission.operator import Operator
     from shearloop.tools.commission.procedure import commission
 
-    said = sys.stderr if args.json else sys.stdout
     counts = Counts() if args.stops is None else replace(Counts(), stops=args.stops)
-    operator = Operator(partial(_answer, said), partial(print, file=said, flush=True))
-    report, page = commission(load_daemon_config(args.config), args.config, args.out, operator, counts, args.stages)
-    print_result(
-        report.model_dump(mode="json", exclude_none=True), [f"{args.out} and {page} are written."], as_json=args.json
-    )
+    terminal = _Terminal(sys.stderr if args.json else sys.stdout)
+    with ExitStack() as emulating:
+        config = load_daemon_config(args.config)
+        operator = Operator(terminal.answer, terminal.say)
+        if args.emulate:
+            config, devices = emulating.enter_context(_emulated(config, args.config, terminal))
+            operator = Operator(terminal.answer, terminal.say, devices.order)
+        elif config.emulated:
+            terminal.label = f"{EMULATED}: "
+        report, page = commission(config, args.config, args.out, operator, counts, args.stages)
+    written = f"{terminal.label}{args.out} and {page} are written."
+    print_result(report.model_dump(mode="json", exclude_none=True), [written], as_json=args.json)
     return 0 if report.passed else 1
 
 
-def _answer(said: TextIO, question: str) -> str:
-    """Return the operator's line; raises UserError at the end of the input."""
-    print(question, file=said, flush=True)
-    line = sys.stdin.readline()
-    if not line:
-        raise UserError("the input ended before all was answered; run it again to continue, and answer each question")
-    return line
+@contextmanager
+def _emulated(
+    config: "DaemonConfig", path: Path, terminal: "_Terminal"
+) -> "Iterator[tuple[DaemonConfig, EmulatedDevices]]":
+    """Run the emulators of all devices; yield the configuration that names them."""
+    from shearloop.cli.emulator_processes import EmulatedDevices
+    from shearloop.cli.rehearsal import rehearsal
+
+    if config.robot is None:
+        raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
+    with rehearsal(config, path) as rehearsed, EmulatedDevices(rehearsed.config.emulators, path.parent) as devices:
+        terminal.label = f"{EMULATED}: "
+        for sentence in rehearsed.sentences:
+            terminal.say(sentence)
+        if config.gripper is not None:
+            # Its tool comes between the fingers when the operator says so.
+            devices.order("object none")
+        yield rehearsed.config, devices
+
+
+class _Terminal:
+    """Where the operator reads and types; each line begins with `label`."""
+
+    def __init__(self, said: TextIO) -> None:
+        self.label = ""
+        self._said = said
+
+    def say(self, line: str) -> None:
+        """Print a line."""
+        print(f"{self.label}{line}", file=self._said, flush=True)
+
+    def answer(self, question: str) -> str:
+        """Return the operator's line; raises UserError at the end of the input."""
+        self.say(question)
+        line = sys.stdin.readline()
+        if not line:
+            raise UserError(
+                "the input ended before all was answered; run it again to continue, and answer each question"
+            )
+        return line

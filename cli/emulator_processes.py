@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 # An emulator prints a line once its ports are open, which takes about two seconds.
 READY_S, POLL_S = 20.0, 0.02
+# A device carries out a command within this, on a busy computer.
+OBEYS_S = 10.0
 # A process needs some of it to remove its port's link, to close its sockets, or to end its workers.
 STOP_S = 2.0
 SHEARLOOP = (sys.executable, "-m", "shearloop")
@@ -75,6 +77,7 @@ class EmulatedDevices:
         self._folder = folder
         self._recording = recording
         self._waiting: list[tuple[EventConfig, subprocess.Popen[bytes]]] = []
+        self._devices: list[tuple[subprocess.Popen[bytes], IO[bytes]]] = []
         self._since_ns: dict[int, int] = {}
         self.truth: Path | None = None
         self._stack = contextlib.ExitStack()
@@ -98,6 +101,7 @@ class EmulatedDevices:
             for process, output in devices:
                 while time.monotonic() < until_s and process.poll() is None and not os.fstat(output.fileno()).st_size:
                     time.sleep(POLL_S)
+            self._devices = devices
             self._stack = stack.pop_all()
         return self
 
@@ -124,6 +128,23 @@ class EmulatedDevices:
         table = np.array(rows, dtype=float).reshape(-1, 2)
         return TorqueSeries(table[:, 0], table[:, 1])
 
+    def order(self, command: str) -> None:
+        """Have the emulated robot's process carry out a command; raises UserError where it does not.
+
+        The robot is played by the last of the devices.
+        """
+        process, output = self._devices[-1]
+        begin = os.fstat(output.fileno()).st_size
+        # A process that has died has said why.
+        with contextlib.suppress(BrokenPipeError):
+            if process.stdin is not None and process.poll() is None:
+                process.stdin.write(f"{command}\n".encode())
+        until_s = time.monotonic() + OBEYS_S
+        while not _has_obeyed(os.pread(output.fileno(), os.fstat(output.fileno()).st_size - begin, begin), command):
+            if time.monotonic() > until_s or process.poll() is not None:
+                raise UserError(f"the emulated devices did not carry out `{command}`: run it again")
+            time.sleep(POLL_S)
+
     def _command(self, emulator: "EmulatorConfig") -> list[str]:
         source = emulator.synthetic
         if self._recording is not None and emulator.device == "eit-kit":
@@ -142,3 +163,9 @@ class EmulatedDevices:
                 if process.stdin is not None and process.poll() is None:
                     process.stdin.write(f"{event.command}\n".encode())
                     self.sent.append((time.monotonic_ns(), event.command))
+
+
+def _has_obeyed(printed: bytes, command: str) -> bool:
+    """Return whether an emulator has printed that it carried out a command; its last line may be incomplete."""
+    lines = [line for line in printed.rpartition(b"\n")[0].splitlines() if line.startswith(b"{")]
+    return any((event := json.loads(line))["event"] == "obeyed" and event["detail"] == command for line in lines)

@@ -45,6 +45,25 @@ def rehearsal(config: "DaemonConfig", path: Path) -> Iterator[Rehearsal]:
         yield _Stage(config, path, Path(folder)).rehearsal()
 
 
+def sentences_of_run(config: "DaemonConfig") -> Iterator[str]:
+    """Yield what a run with a rehearsed configuration starts and records, and the cap of its robot.
+
+    Raises UserError for a report that cannot be read.
+    """
+    from shearloop.daemon.commissioning import commissioning_of
+    from shearloop.daemon.rig import open_settings
+
+    if (settings := open_settings(config)) is not None:
+        yield commissioning_of(config, settings).sentence
+    if config.experiment is not None:
+        yield f"{config.experiment} starts by itself, and ends the rehearsal"
+    elif settings is not None:
+        reached = f" --connect {config.commands}" if config.commands != COMMAND_ADDRESS else ""
+        yield f"no `experiment` is configured: start one with `shearloop command start{reached}`"
+    if config.recording is not None:
+        yield f"recordings go into {config.recording.folder}"
+
+
 class _Stage:
     """Replaces one device after the other."""
 
@@ -54,13 +73,15 @@ class _Stage:
         self._folder = folder
         # As a file has it, to be checked again once every device is replaced.
         self._content: dict[str, Any] = config.model_dump()
+        # A report supplies what is not given.
+        self._content["loop"] = config.loop.model_dump(exclude_unset=True)
         self._emulators: list[dict[str, Any]] = []
         self._sentences = ["every device is played on this computer; none of the real ones is opened"]
         self._host = _free_loopback() if config.robot is not None else LOOPBACKS[0]
 
     def rehearsal(self) -> Rehearsal:
         """Replace all devices."""
-        from shearloop.daemon.config import DaemonConfig
+        from shearloop.daemon.config import RehearsedConfig
 
         config = self._config
         robot = self._robot(config.robot) if config.robot is not None else None
@@ -75,16 +96,10 @@ class _Stage:
             self._rig(robot)
         if config.experiment is not None:
             self._content |= {"autostart": True, "stop_when_done": True}
-            self._sentences.append(f"{config.experiment} starts by itself, and ends the rehearsal")
-        elif config.robot is not None:
-            reached = f" --connect {config.commands}" if config.commands != COMMAND_ADDRESS else ""
-            self._sentences.append(f"no `experiment` is configured: start one with `shearloop command start{reached}`")
         if config.recording is not None:
-            folder = config.recording.folder / "emulated"
-            self._content["recording"] = {"folder": folder}
-            self._sentences.append(f"recordings go into {folder}")
+            self._content["recording"] = {"folder": config.recording.folder / "emulated"}
         self._content |= {"emulated": True, "emulators": self._emulators}
-        return Rehearsal(DaemonConfig.model_validate(self._content), tuple(self._sentences))
+        return Rehearsal(RehearsedConfig(config, self._content), tuple(self._sentences))
 
     def _robot(self, source: Path) -> "UrSettings":
         """Write the robot's settings of a file with a loopback address, and return them."""

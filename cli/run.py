@@ -83,11 +83,12 @@ def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[
     with ExitStack() as rehearsing:
         config = _config(args)
         if args.emulate:
-            from shearloop.cli.rehearsal import rehearsal
+            from shearloop.cli.rehearsal import rehearsal, sentences_of_run
 
             rehearsed = rehearsing.enter_context(rehearsal(config, args.config))
             config = rehearsed.config
-            out.write("".join(f"{EMULATED}: {sentence}\n" for sentence in rehearsed.sentences))
+            sentences = [*rehearsed.sentences, *sentences_of_run(config)]
+            out.write("".join(f"{EMULATED}: {sentence}\n" for sentence in sentences))
         return _run_config(config, args, out, on_ready, terminal=terminal)
 
 

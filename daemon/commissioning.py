@@ -36,7 +36,11 @@ MOST_AGE_DAYS: Final = 180
 _CLOCKS_DIFFER = timedelta(days=1)
 # A measured value beyond this multiple of a capped speed stops the motion.
 _HARD: Final = 1.6
-CURE: Final = "run `shearloop commission CONFIG --out FILE`, then write `commissioned: FILE` into the configuration"
+CURE: Final = (
+    "run `shearloop commission CONFIG --out FILE{option}`, then write `commissioned: FILE` into the configuration"
+)
+# In the place of the serial number of a robot: no real one has it.
+EMULATED_SERIAL_NUMBER: Final = "EMULATED"
 # What a report is about: the parts of a configuration that name devices.
 _DEVICE_KEYS: Final[Any] = {
     "fingertips": {"__all__": {"device", "frame_period_s"}},
@@ -178,28 +182,40 @@ class MotionCap:
 
 
 class Commissioning:
-    """The robot's settings as its report allows them. An emulated robot needs no report."""
+    """The robot's settings as its report allows them. An emulated robot needs no report, unless it plays a real one."""
 
     def __init__(
-        self, settings: UrSettings, report: Report | None, reason: str = "", *, emulated: bool = False
+        self,
+        settings: UrSettings,
+        report: Report | None,
+        reason: str = "",
+        *,
+        emulated: bool = False,
+        rehearsed: bool = False,
     ) -> None:
-        """`reason` is why the report, or its absence, raises nothing; empty for a report that counts."""
+        """`reason` is why the report, or its absence, raises nothing; empty for a report that counts.
+
+        `emulated` stands for a robot without a cap, `rehearsed` for an emulated one with the cap of the real one.
+        """
         self._given, self._report, self._reason, self._emulated = settings, report, reason, emulated
+        self._rehearsed = rehearsed
         # How the connected controller differs from the report's.
         self._other = ""
 
     @property
     def cap(self) -> MotionCap | None:
-        """The cap that holds now; None for an emulated robot."""
+        """The cap that holds now; None for an emulated robot that plays no real one."""
         if self._emulated:
             return None
         if self._report is None or not self.counts:
-            return MotionCap(f"{self._reason or self._other}; {CURE}")
+            cure = CURE.format(option=" --emulate" if self._rehearsed else "")
+            return MotionCap(f"{self._reason or self._other}; {cure}")
         found = self._report.supplied()
         wrist_rad_per_s = found.wrist_speed_rad_per_s if self._report.has(_SPEED_NEEDS) else None
         torque_nm = found.torque_nm if self._report.has(_TORQUE_NEEDS) else None
+        devices = " of emulated devices" if self._report.rig.emulated else ""
         return MotionCap(
-            "its report covers no more",
+            f"its report{devices} covers no more",
             wrist_speed_rad_per_s=max(CAPPED_RAD_PER_S, wrist_rad_per_s or 0.0),
             torque_nm=max(CAPPED_NM, torque_nm or 0.0),
         )
@@ -236,8 +252,11 @@ class Commissioning:
         return self._report is not None and not (self._reason or self._other)
 
     def on_controller(self, polyscope: str, serial_number: str) -> UrSettings:
-        """Compare the connected controller with the report's, and return the settings for it."""
-        if self._report is not None:
+        """Compare the connected controller with the report's, and return the settings for it.
+
+        The controller of a rehearsal is emulated, and never the report's.
+        """
+        if self._report is not None and not self._rehearsed:
             seen = {"polyscope": polyscope, "robot_serial_number": serial_number}
             differs = list(self._report.rig.differences(self._report.rig.model_copy(update=seen)))
             self._other = f"{' and '.join(differs)} changed since its report" if differs else ""
@@ -245,7 +264,7 @@ class Commissioning:
 
     @property
     def sentence(self) -> str:
-        """The cap in words; empty for an emulated robot."""
+        """The cap in words; empty where there is none."""
         return self.cap.sentence if self.cap is not None else ""
 
 
@@ -259,19 +278,29 @@ def _lowered(bound: BoundT, cap: float) -> BoundT:
 def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime | None = None) -> Commissioning:
     """Return what a rig's report allows at a time, by default now.
 
-    Raises UserError for a file that cannot be read or is no report: a mistake in the configuration.
+    A rehearsal has the cap of the rig that it plays; a report of emulated devices raises it too. Raises UserError for a
+    file that cannot be read or is no report: a mistake in the configuration.
     """
-    if config.emulated:
+    rehearsed = config.real is not config
+    if config.emulated and not rehearsed:
         return Commissioning(settings, None, emulated=True)
     if config.commissioned is None:
-        return Commissioning(settings, None, "`commissioned` is not in the configuration")
+        return Commissioning(settings, None, "`commissioned` is not in the configuration", rehearsed=rehearsed)
     report = load_report(config.commissioned)
-    return Commissioning(settings, report, why_not(report, config, now or datetime.now(UTC)))
+    reason = why_not(report, config, now or datetime.now(UTC))
+    return Commissioning(settings, report, reason, rehearsed=rehearsed)
 
 
 def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
     """Return why a report does not count for a configuration, or an empty string."""
     seen = identity_of(config, report.rig.polyscope, report.rig.robot_serial_number)
+    # Each alone is enough, so that no slip in a file raises a real robot's cap.
+    is_emulated = report.rig.emulated or report.rig.robot_serial_number == EMULATED_SERIAL_NUMBER
+    if is_emulated and not config.emulated:
+        return f"{config.commissioned} is of emulated devices, and raises nothing on real ones"
+    # A rehearsal also shows what a report of the real devices raises.
+    robot = {key: getattr(report.rig, key) for key in ("emulated", "robot_serial_number")}
+    seen = seen.model_copy(update=robot)
     if differs := list(report.rig.differences(seen)):
         return f"{' and '.join(differs)} changed since {config.commissioned} was measured"
     failed = [f"{line.what} in stage {stage.stage}" for stage in report.stages for line in stage.lines
@@ -294,16 +323,19 @@ def load_report(path: Path) -> Report:
 
 
 def identity_of(config: DaemonConfig, polyscope: str, robot_serial_number: str) -> RigIdentity:
-    """Return which rig this is; raises UserError where the robot's settings cannot be read."""
-    devices = config.model_dump(mode="json", exclude_unset=True, include=_DEVICE_KEYS)
+    """Return which rig this is, a rehearsal being the one that it plays, on emulated devices.
+
+    Raises UserError where the robot's settings cannot be read.
+    """
+    devices = config.real.model_dump(mode="json", exclude_unset=True, include=_DEVICE_KEYS)
     return RigIdentity(
         emulated=config.emulated,
         configuration_sha256=_sha256(json.dumps(devices, sort_keys=True).encode()),
-        robot_settings_sha256=_sha256(_content(config.robot)),
+        robot_settings_sha256=_sha256(_content(config.real.robot)),
         script_sha256=own_script_hash(),
         ur_rtde=_installed("ur-rtde"),
         polyscope=polyscope,
-        robot_serial_number=robot_serial_number,
+        robot_serial_number=EMULATED_SERIAL_NUMBER if config.emulated else robot_serial_number,
     )
 
 

@@ -4,9 +4,17 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationInfo, WithJsonSchema, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PrivateAttr,
+    ValidationInfo,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
 
 from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
 from shearloop.daemon.loop_config import LoopConfig
@@ -297,6 +305,11 @@ class DaemonConfig(ConfigModel):
         return folders or (own,)
 
     @property
+    def real(self) -> "DaemonConfig":
+        """What a report is about: this configuration, or the one that it rehearses."""
+        return self
+
+    @property
     def experiment_folders(self) -> tuple[Path, ...]:
         """The folders of the experiments that a request may name: the configured ones and `experiment`'s."""
         return (*self.experiments, *((self.experiment.parent,) if self.experiment is not None else ()))
@@ -373,6 +386,22 @@ class DaemonConfig(ConfigModel):
         """The configuration keys and addresses that are open to the network."""
         both = {"publish": self.publish, "commands": self.commands}
         return {key: address for key, address in both.items() if not addresses.is_local(address)}
+
+
+class RehearsedConfig(DaemonConfig):
+    """A configuration whose devices are all emulated, in the place of those of another one."""
+
+    _real: DaemonConfig = PrivateAttr()
+
+    def __init__(self, real: DaemonConfig, content: Mapping[str, Any]) -> None:
+        """Take the configuration of the real devices, and the content of the one that plays them."""
+        super().__init__(**content)
+        self._real = real
+
+    @property
+    def real(self) -> DaemonConfig:
+        """The configuration of the real devices."""
+        return self._real
 
 
 def _is_hardware(port: Path) -> bool:

@@ -26,7 +26,7 @@ JOINTS = {joint.value: joint for joint in Joint}
 # The pads face each other: a shear on the right has the opposite sign on the left.
 SIDES = {"right": 1.0, "left": -1.0}
 COMMANDS = (
-    f"kick NM, slip [NM], weigh NM, flip load|FINGERTIP, joint {'|'.join(JOINTS)}, object MM|none, "
+    f"kick NM, slip [NM], weigh NM, flip load|FINGERTIP, joint {'|'.join(JOINTS)}, spring NM_PER_RAD, object MM|none, "
     "silence DEVICE [SECONDS], unplug DEVICE [SECONDS], replug DEVICE, right|left|load FAULT, "
     "gripper drop|fault CODE|…, a fault of the robot, or normal"
 )
@@ -129,6 +129,9 @@ class EmulatedRig:
                 self._flipped.add(side)
             case ["joint", name] if name in JOINTS:
                 self.scene.put_on(JOINTS[name])
+            case ["spring", nm_per_rad]:
+                refusal = "no stiffness in N·m/rad from 0.05 to 50; write for instance 0.8"
+                self.scene.put_on_spring(number_between(nm_per_rad, 0.05, 50.0, refusal))
             case ["object", *_]:
                 self._device("gripper").command(text)
             case ["normal"]:

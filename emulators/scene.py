@@ -238,6 +238,15 @@ class Scene:
         """Put the tool on another joint, not yet turned; a gripped tool loses its torque."""
         self.twin = Twin(replace(self.twin.settings, joint=joint))
 
+    def put_on_spring(self, nm_per_rad: float) -> None:
+        """Put the tool on a lever with which gel and joint together are as stiff as this."""
+        each = 2.0 * nm_per_rad
+        self.twin = Twin(
+            replace(
+                self.twin.settings, joint=Joint.LEVER, gel_stiffness_nm_per_rad=each, joint_stiffness_nm_per_rad=each
+            )
+        )
+
     def _require_grip(self, command: str) -> None:
         if not self.twin.state.gripped:
             raise ValueError(f"{command} needs a tool in the grip, and the fingers hold nothing")

@@ -277,6 +277,7 @@ _WITHOUT_NUMBER: dict[str, Callable[[Controller], None]] = {
     "protective-stop": lambda one: one.robot.protective_stop("requested by hand"),
     "emergency-stop": lambda one: one.robot.emergency_stop(),
     "release": lambda one: one.robot.release(),
+    "stop": lambda one: one.robot.end_program("stopped at the pendant"),
     "drop-rtde": Controller.drop_rtde,
     "protect-abrupt-ends": lambda one: setattr(one.robot, "protects_abrupt_ends", True),
     "protect-ends": lambda one: setattr(one.robot, "protects_ends", True),

@@ -30,6 +30,7 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   protective-stop         stop for safety, pause the program
   emergency-stop          press the button: stop, end the program, power off
   release                 release the button; power comes back from the dashboard
+  stop                    press the stop of the program at the pendant
   drop-rtde               close the RTDE connections, but not the dashboard's
   silence SECONDS         send nothing on any port
   registers-in-use        refuse input registers as if a fieldbus had them

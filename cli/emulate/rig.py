@@ -34,6 +34,7 @@ Commands, one a line on standard input:
   kick NM                     turn the workpiece so that the torque jumps by NM
   slip [NM]                   let the tool slip in the grip until NM (0) remain
   joint KIND                  put the tool on another joint: lever, tightening, seized
+  spring NM_PER_RAD           put it on a lever; gel and lever together are as stiff as this
   object MM | object none     put something of that width between the fingers, or take it away
   silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot
   unplug DEVICE [SECONDS]     disconnect a device, without a number until `replug DEVICE`
@@ -220,6 +221,7 @@ def _play_skin(args: argparse.Namespace) -> Playing:
         match line.split():
             case ["robot", *words] if controller is not None:
                 controller.command(" ".join(words))
+                console.print_event("obeyed", detail=line)
             case ["shear", newtons]:
                 refusal = "no force of at most 20 N; write for instance 0.5"
                 pushed.skin.push(number_between(newtons, -20.0, 20.0, refusal))

@@ -9,6 +9,7 @@ import pytest
 from shearloop.cli.emulator_processes import EmulatedDevices
 from shearloop.daemon.config import EmulatorConfig
 from shearloop.daemon.config_file import load_yaml_model
+from shearloop.errors import UserError
 
 S = 1_000_000_000
 Devices = Callable[..., EmulatedDevices]
@@ -49,6 +50,25 @@ def test_an_event_is_sent_once_when_its_step_is_held_for_its_time(played, tmp_pa
         devices("loop.state", held(74))
         assert [command for _, command in devices.sent] == ["kick -0.03"]
         assert (tmp_path / "obeyed").read_text() == "kick -0.03\n"
+
+
+READY = "print('ready', flush=True)\n"
+OBEDIENT = """import json, sys
+for line in sys.stdin:
+    print(json.dumps({"event": "obeyed", "detail": line.strip()}), flush=True)
+"""
+
+
+def test_an_order_is_carried_out_before_it_returns_and_the_end_of_the_device_is_said(played):
+    # The robot is played by the last device.
+    with played((emulator(), emulator(arguments=("2",))), "input()", OBEDIENT, ready=READY) as devices:
+        devices.order("object none")
+        devices.order("robot slider 0.5")
+    with (
+        played((emulator(),), "input()") as devices,
+        pytest.raises(UserError, match="did not carry out `robot stop`: run it again"),
+    ):
+        devices.order("robot stop")
 
 
 @pytest.mark.parametrize("then", ["", "signal.pause()"])

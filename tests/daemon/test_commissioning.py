@@ -23,7 +23,7 @@ from shearloop.daemon.commissioning import (
     identity_of,
     measured_widths,
 )
-from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.config import RehearsedConfig, load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.rig import make_loop
 from shearloop.drivers.ur.client import UrRobot
@@ -109,7 +109,8 @@ def changed(report: Report, **rig: str | bool) -> Report:
 @pytest.mark.parametrize(
     ("change", "now", "why"),
     [
-        (lambda report: changed(report, emulated=True), NOW, "`emulated`"),
+        (lambda report: changed(report, emulated=True), NOW, "of emulated devices, and raises nothing on real ones"),
+        (lambda report: changed(report, robot_serial_number="EMULATED"), NOW, "of emulated devices"),
         (lambda report: changed(report, configuration_sha256="0"), NOW, "the devices in the configuration"),
         (lambda report: changed(report, robot_settings_sha256="0"), NOW, "the robot's settings"),
         (lambda report: changed(report, script_sha256="0"), NOW, "the script for the robot"),
@@ -125,6 +126,42 @@ def test_a_report_that_does_not_count_raises_and_supplies_nothing(tmp_path, chan
     assert why in found.cap.why
     assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
     assert found.supplied == NOTHING_SUPPLIED
+
+
+def rehearsing(folder: Path, report: Report | None, **content: object):
+    """Return what a report allows in a rehearsal of a rig, which has other addresses."""
+    real = load_daemon_config(write_rig(folder, **content))
+    if report is not None:
+        save_report(folder / "report.yaml", report)
+        real = load_daemon_config(write_rig(folder, commissioned="report.yaml", **content))
+    played = {"load_cell": {"device": {"path": "cell"}}, "emulated": True, "commissioned": real.commissioned}
+    config = RehearsedConfig(real, {**played, "robot": real.robot})
+    return commissioning_of(config, read_settings(config.robot), NOW)
+
+
+def test_a_rehearsal_has_the_cap_of_the_rig_that_it_plays(tmp_path):
+    found = rehearsing(tmp_path, None)
+    assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
+    assert found.settings.limits.wrist_speed_rad_per_s.inner == CAPPED_RAD_PER_S
+    assert "--emulate`, then write `commissioned: FILE`" in found.sentence
+
+
+@pytest.mark.parametrize("emulated", [True, False])
+def test_a_report_of_emulated_or_of_real_devices_raises_a_rehearsal(tmp_path, emulated):
+    report = changed(report_of(write_rig(tmp_path), "013457", SUPPLIED), emulated=emulated)
+    found = rehearsing(tmp_path, report)
+    assert found.counts
+    assert caps(found) == (0.5, CAPPED_M_PER_S, 0.4)
+    found.on_controller("5.11.0.0", "of the emulated controller")
+    assert found.counts, "the controller of a rehearsal is never the report's"
+    assert ("of emulated devices covers no more" in found.sentence) == emulated
+
+
+def test_a_rehearsal_of_another_rig_is_not_raised(tmp_path):
+    report = changed(report_of(write_rig(tmp_path), "013457", SUPPLIED), emulated=True)
+    found = rehearsing(tmp_path, report, wrist=0.7)
+    assert "the robot's settings changed" in found.cap.why
+    assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
 
 
 def test_one_failed_line_caps(tmp_path):

@@ -18,6 +18,7 @@ from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GRIP_N, close_fingers, open_fingers
 from shearloop.tools.commission.limits import REAL
 from shearloop.tools.commission.listening import SILENT_S
+from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
 from shearloop.tools.commission.tap import frame_step_s, judge_clocks, load_step_s, robot_step_s
 
@@ -26,6 +27,8 @@ STAGE: Final = "6 boards"
 LARGEST_NOISE_V: Final = 0.02
 SCALE_TOLERANCE: Final = 0.02
 LOAD_SAMPLES: Final = 40
+# Of an emulated tool.
+_TOOL_MM: Final = 20.0
 # A torque that is known to 2 % has to be this many standard deviations high.
 _LEAST_NM: Final = 0.02
 # Before and after a press each device has to show a level.
@@ -56,11 +59,18 @@ def measure(context: Context) -> Measured:
         return Measured([*lines, *_clocks(context, fingertips, load)])
 
 
+def put_between(context: Context) -> Played:
+    """Return how a tool comes between emulated fingers; without a gripper it is clamped to the wrist."""
+    if context.config.gripper is None:
+        return Played("the tool is clamped to the wrist")
+    return Played(f"a tool of {_TOOL_MM:g} mm is put there for you", (f"object {_TOOL_MM:g}",))
+
+
 def _clocks(
     context: Context, fingertips: Mapping[str, Arrivals[Frame]], load: Arrivals[LoadSample] | None
 ) -> list[Line]:
     """Return the lines on the clocks, with a tool in the grip that the operator presses."""
-    context.operator.act("Put the tool on the load cell's lever, between the open fingers")
+    context.operator.act("Put the tool on the load cell's lever, between the open fingers", put_between(context))
     with ExitStack() as opened:
         hand = opened.enter_context(context.rig.hand()) if context.config.gripper is not None else None
         if hand is not None:
@@ -89,7 +99,9 @@ def _press(
     begun_ns = context.clock.now_ns()
     context.observer.listen(level_s)
     context.operator.act(
-        "Press the tool about the wrist's axis, quickly and by about 0.1 N·m, and keep the pressure until the next line"
+        "Press the tool about the wrist's axis, quickly and by about 0.1 N·m, and keep the pressure until the next "
+        "line",
+        Played("it is pressed for you", ("kick 0.1",)),
     )
     context.observer.listen(level_s)
     found = {
@@ -148,10 +160,12 @@ def _weigh(context: Context, load: Arrivals[LoadSample], rate_hz: float) -> list
     operator = context.operator
     rest = load.take(LOAD_SAMPLES, SILENT_S)
     known_nm = operator.number(
-        "Load the lever with a known torque and let it rest; its size in N·m (mass × 9.81 × arm)", _LEAST_NM, 5.0
+        "Load the lever with a known torque and let it rest; its size in N·m (mass × 9.81 × arm)",
+        *(_LEAST_NM, 5.0),
+        Played("the torque that you type is put on it for you, for instance 0.1", ("weigh {}",)),
     )
     loaded = load.take(LOAD_SAMPLES, SILENT_S)
-    operator.act("Take the known torque off")
+    operator.act("Take the known torque off", Played("it is taken off for you", ("weigh 0",)))
     return judge_load(rest, loaded, known_nm, rate_hz, context.limits.rate_tolerance)
 
 

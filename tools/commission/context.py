@@ -89,9 +89,8 @@ class Context:
             self._mover = self.opened.enter_context(self.rig.mover(bounded(self.settings, here_rad)))
         return self._mover
 
-    @property
-    def confirmed(self) -> Seen:
-        """A sample of the pose about which motions are allowed; the operator confirms it once."""
+    def confirm(self) -> Seen:
+        """Have the operator confirm the pose about which motions are allowed, once; return a sample of it."""
         if self._confirmed is None:
             here = self.observer.latest()
             self.operator.act(
@@ -104,7 +103,7 @@ class Context:
     @property
     def pose_rad(self) -> float:
         """The wrist's angle in the confirmed pose."""
-        return self.confirmed.wrist_rad
+        return self.confirm().wrist_rad
 
     def stop_program(self) -> bool:
         """Stop the program on the robot; return whether it stopped."""

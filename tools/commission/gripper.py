@@ -10,10 +10,13 @@ from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperState
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GENTLE_N, Hand, close_fingers, open_fingers
+from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged, percentile_99
 
 STAGE: Final = "2 gripper"
 WIDTH_MM: Final = 1.0
+# Emulated objects, as fractions of the stroke.
+_OBJECTS: Final = (0.05, 0.6, 0.25, 0.4)
 
 
 def measure(context: Context) -> Measured:
@@ -55,7 +58,11 @@ def _gauges(context: Context, hand: Hand) -> list[tuple[float, float]]:
     gauges = []
     for number in range(1, context.counts.gauges + 1):
         question = f"Hold gauge {number} of {context.counts.gauges} between the fingers; its width in mm"
-        width_mm = context.operator.number(question, 0.5, hand.model.stroke_mm)
+        for_instance_mm = hand.model.stroke_mm * (number - 0.5) / context.counts.gauges
+        played = Played(
+            f"a gauge as wide as you type is held for you, for instance {for_instance_mm:g}", ("object {}",)
+        )
+        width_mm = context.operator.number(question, 0.5, hand.model.stroke_mm, played)
         state = _close_and_open(context, hand, f"gauge {number}")
         gauges.append((float(state.position_counts), width_mm))
     return gauges
@@ -88,11 +95,13 @@ def _objects(context: Context, hand: Hand) -> list[Line]:
     """Return the lines on objects that are held, and on nothing that is held."""
     count, seen = context.counts.objects, 0
     for number in range(1, count + 1):
+        width_mm = hand.model.stroke_mm * _OBJECTS[(number - 1) % len(_OBJECTS)]
         context.operator.act(
-            f"Hold object {number} of {count} between the fingers: a thin, a thick, a soft, a hard one"
+            f"Hold object {number} of {count} between the fingers: a thin, a thick, a soft, a hard one",
+            Played(f"a hard object of {width_mm:g} mm is held for you", (f"object {width_mm:g}",)),
         )
         seen += _close_and_open(context, hand, f"object {number}").diameter_mm is not None
-    context.operator.act("Take everything out of the gripper")
+    context.operator.act("Take everything out of the gripper", Played("it is taken out for you", ("object none",)))
     empty = _close_and_open(context, hand, "nothing").diameter_mm is None
     return [
         judged(

@@ -12,6 +12,7 @@ from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.observer import WRIST, Seen
+from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged, percentile_99
 
 STAGE: Final = "3 empty gripper"
@@ -160,13 +161,16 @@ def judge_turns(turns: Sequence[Turn], context: Context, noise_rad_per_s: float)
 def _slider(context: Context) -> Line:
     """Return the line on a motion at half speed, which has to be refused."""
     mover, here_rad = context.mover, context.pose_rad
-    context.operator.act(f"Set the speed slider at the pendant to {_SLIDER:.0%}")
+    context.operator.act(
+        f"Set the speed slider at the pendant to {_SLIDER:.0%}",
+        Played("it is set for you", (f"robot slider {_SLIDER:g}",)),
+    )
     context.observer.wait_for(
         lambda seen: abs(seen.outputs.speed_slider - _SLIDER) < 0.2, context.observer.latest().made_ns, 5.0
     )
     context.operator.allow(f"a turn of {TURN_RAD:g} rad at {SPEED_RAD_PER_S:g} rad/s, which has to be refused")
     refusal = mover.ended(mover.request("turn", rad_per_s=SPEED_RAD_PER_S, to_rad=here_rad + TURN_RAD))
-    context.operator.act("Set the speed slider back to 100 %")
+    context.operator.act("Set the speed slider back to 100 %", Played("it is set for you", ("robot slider 1",)))
     return judged(
         "slider at 50 %",
         refusal or "it turned",

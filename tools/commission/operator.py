@@ -1,8 +1,9 @@
 """The questions of a commissioning to the person at the robot."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 from shearloop.errors import UserError
 
@@ -18,25 +19,51 @@ class DeclinedError(UserError):
 
 
 @dataclass(frozen=True, slots=True)
+class Played:
+    """What emulated devices do in the place of the operator's hands, once the operator has typed the word.
+
+    `shown` says it to the operator, who types the words and numbers. `commands` are of `shearloop emulate rig`, with
+    `{}` for the number; without one nothing has to be done.
+    """
+
+    shown: str
+    commands: tuple[str, ...] = ()
+
+
+NOTHING_TO_DO: Final = Played("there is nothing to do")
+
+
+class Play(Protocol):
+    """Has the emulated devices carry out a command of `shearloop emulate rig`."""
+
+    def __call__(self, command: str) -> None:
+        """Return once it is carried out; raises UserError where it is not."""
+
+
+@dataclass(frozen=True, slots=True)
 class Operator:
-    """Asks and tells; `answer` returns the line that is typed after a question."""
+    """Asks and tells; `answer` returns the line that is typed after a question.
+
+    `play` is of devices that are emulated for this commissioning, and None for others.
+    """
 
     answer: Callable[[str], str]
     say: Callable[[str], None]
+    play: Play | None = None
 
-    def ask(self, question: str) -> str:
+    def ask(self, question: str, played: Played | None = None) -> str:
         """Return the answer, without blanks around it."""
-        return self.answer(question).strip()
+        return self.answer(self._with_hint(question, played)).strip()
 
-    def number(self, question: str, low: float, high: float) -> float:
+    def number(self, question: str, low: float, high: float, played: Played | None = None) -> float:
         """Return a number within a range; raises UserError after some other answers."""
         for _ in range(_MOST_TRIES):
-            try:
-                value = float(self.ask(f"{question} ({low:g} to {high:g}):"))
-            except ValueError:
-                continue
-            if low <= value <= high:
-                return value
+            answer = self.ask(f"{question} ({low:g} to {high:g}):", played)
+            with contextlib.suppress(ValueError):
+                if low <= (value := float(answer)) <= high:
+                    self._do(played, value)
+                    return value
+            self.say(f"{answer!r} is no number from {low:g} to {high:g}.")
         raise UserError(f"no number from {low:g} to {high:g} was given: {question}")
 
     def allow(self, motion: str) -> None:
@@ -47,7 +74,20 @@ class Operator:
         ):
             raise DeclinedError(f"not allowed: {motion}. What is measured so far is kept; run it again to continue")
 
-    def act(self, action: str) -> None:
+    def act(self, action: str, played: Played = NOTHING_TO_DO) -> None:
         """Have the operator do something; raises DeclinedError where it is not done."""
-        if self.ask(f"{action}. Type `{DONE}`:") != DONE:
+        if self.ask(f"{self._with_hint(f'{action}.', played)} Type `{DONE}`:") != DONE:
             raise DeclinedError(f"not done: {action}. What is measured so far is kept; run it again to continue")
+        self._do(played)
+
+    def _with_hint(self, question: str, played: Played | None) -> str:
+        """Return the question with what the emulated devices do, if there are any, before its last character."""
+        if self.play is None or played is None:
+            return question
+        return f"{question[:-1]} [emulated: {played.shown}]{question[-1]}"
+
+    def _do(self, played: Played | None, value: float = 0.0) -> None:
+        if self.play is None or played is None:
+            return
+        for command in played.commands:
+            self.play(command.format(f"{value:g}"))

@@ -66,7 +66,7 @@ def _run(context: Context, out: Path, only: Sequence[str]) -> tuple[Report, Path
     operator = context.operator
     if context.config.emulated:
         times = ", and its limits on times are those of a busy computer" if context.limits is EMULATED else ""
-        operator.say(f"EMULATED: the report says so{times}.")
+        operator.say(f"The report says EMULATED{times}.")
     name = operator.ask("Your name:")
     for stage, measure in STAGES.items():
         done = context.report.stage(stage[0])

@@ -13,6 +13,7 @@ from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S, LARGES
 from shearloop.tools.commission.context import STOPS_NEEDED, Context
 from shearloop.tools.commission.mover_process import CAUSES
 from shearloop.tools.commission.observer import Seen
+from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, has_failed, judged
 
 STAGE: Final = "4 stops"
@@ -106,7 +107,7 @@ class StraightMove:
 
     def __init__(self, context: Context, m_per_s: float, at: str) -> None:
         self._context, self._m_per_s = context, m_per_s
-        self._home: Six = context.confirmed.outputs.tcp_pose
+        self._home: Six = context.confirm().outputs.tcp_pose
         self.at = at
         self.shown = (
             f"the tool moves {{count}} times {1e3 * LARGEST_M:g} mm towards the robot at {m_per_s:g} m/s, and back"
@@ -134,6 +135,7 @@ class StraightMove:
 
 def measure(context: Context) -> Measured:
     """Return the stage's lines, the largest speed at which every layer passed, and the largest angle to rest."""
+    context.confirm()
     lines: list[Line] = []
     passed_rad_per_s, largest_rad = 0.0, 0.0
     limits = context.settings.limits
@@ -309,6 +311,7 @@ def _by_hand(context: Context, speed: float) -> list[Line]:
             speed,
             "emergency stop",
             "press the emergency stop",
+            Played("it is pressed for you", ("robot emergency-stop",)),
             lambda seen: seen.outputs.safety_mode in SAFETY_EMERGENCY_STOPS,
             "Make the cell safe, and release the emergency stop",
         ),
@@ -317,6 +320,7 @@ def _by_hand(context: Context, speed: float) -> list[Line]:
             speed,
             "stop at the pendant",
             "press the stop of the program at the pendant",
+            Played("it is pressed for you", ("robot stop",)),
             lambda seen: not seen.plays,
             "",
         ),
@@ -324,7 +328,7 @@ def _by_hand(context: Context, speed: float) -> list[Line]:
     ]
 
 
-def _swing(context: Context, speed: float, action: str) -> int:
+def _swing(context: Context, speed: float, action: str, played: Played) -> int:
     """Turn to and fro, and have the operator stop that; return when it began."""
     mover = context.ready()
     context.observer.forget()
@@ -334,14 +338,14 @@ def _swing(context: Context, speed: float, action: str) -> int:
     asked_ns = mover.request("swing", rad_per_s=speed, middle_rad=context.pose_rad, by_rad=0.5 * LARGEST_RAD)
     if context.observer.wait_for(lambda seen: abs(seen.wrist_rad_per_s) > 0.9 * speed, asked_ns, 5.0) is None:
         raise UserError(f"the wrist did not turn: {mover.ended(asked_ns)}")
-    context.operator.act(f"Now {action}")
+    context.operator.act(f"Now {action}", played)
     return asked_ns
 
 
 def _stopped_by(
-    context: Context, speed: float, what: str, action: str, stopped: Callable[[Seen], bool], after: str
+    context: Context, speed: float, what: str, action: str, played: Played, stopped: Callable[[Seen], bool], after: str
 ) -> Line:
-    asked_ns = _swing(context, speed, action)
+    asked_ns = _swing(context, speed, action, played)
     first = context.observer.wait_for(stopped, asked_ns, _RESTS_WITHIN_S)
     rest = None
     if first is not None:
@@ -349,7 +353,7 @@ def _stopped_by(
     time_s = (rest.made_ns - first.made_ns) / 1e9 if first is not None and rest is not None else math.inf
     longest_s = context.limits.rest_s(context.settings)
     if after:
-        context.operator.act(after)
+        context.operator.act(after, Played("it is released for you", ("robot release",)))
     refusal = context.mover.unlock()
     return judged(
         what,
@@ -362,7 +366,12 @@ def _stopped_by(
 
 def _cable(context: Context, speed: float) -> Line:
     """Return the line on a pulled cable: nothing is seen meanwhile, so that the angle counts."""
-    asked_ns = _swing(context, speed, "pull the robot's network cable, wait for 3 s, and plug it in again")
+    asked_ns = _swing(
+        context,
+        speed,
+        "pull the robot's network cable, wait for 3 s, and plug it in again",
+        Played("it is pulled for you, and plugged in again", ("robot silence 1.2",)),
+    )
     mover, observer = context.mover, context.observer
     found = observer.interruption(asked_ns, _INTERRUPTED_NS, 10.0)
     longest_s = context.limits.rest_s(context.settings)

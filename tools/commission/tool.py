@@ -11,11 +11,13 @@ from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.ur.messages import tool_axis
 from shearloop.errors import UserError
 from shearloop.tools.commission.arrivals import Arrivals
+from shearloop.tools.commission.boards import put_between
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.curves import Curve, middle_s
 from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GRIP_N, close_fingers, open_fingers
 from shearloop.tools.commission.listening import SILENT_S
 from shearloop.tools.commission.motion import TURN_RAD
+from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, has_failed, judged
 from shearloop.tools.commission.tactile import TactileSensor, calibrated_sessions
 from shearloop.tools.commission.wrench import read
@@ -63,7 +65,12 @@ def measure(context: Context) -> Measured:
     if cell is None:
         raise UserError("stage 7 needs a load cell on the tool: add `load_cell` to the configuration, or leave it out")
     spring = context.operator.number(
-        "Mount the tool on a spring of known stiffness; that of spring and pads together in N·m/rad", 0.05, 50.0
+        "Mount the tool on a spring of known stiffness; that of spring and pads together in N·m/rad",
+        *(0.05, 50.0),
+        Played(
+            "it is mounted for you on a spring as stiff as you type, for instance 0.8",
+            (*put_between(context).commands, "spring {}"),
+        ),
     )
     with ExitStack() as opened:
         tactile = _tactile(context, opened)
@@ -149,19 +156,28 @@ def _turn(context: Context, by_rad: float) -> None:
 
 def _signs(context: Context, sensors: Sensors) -> list[Line]:
     """Turn once by a positive angle; the operator says which way the tool turned."""
+    context.confirm()
     context.operator.allow(f"wrist 3 turns the tool by +{TURN_RAD:g} rad at {_SLOWLY_RAD_PER_S:g} rad/s, and back")
     before = _hold_and_feel(context, sensors)
     _turn(context, TURN_RAD)
     after = _hold_and_feel(context, sensors)
     said = context.operator.ask(
-        "Which way did the gripper turn, for an eye that faces it: clockwise or counterclockwise?"
+        "Which way did the gripper turn, for an eye that faces it: clockwise or counterclockwise?",
+        Played(
+            f"wrist 3 turned from {before.wrist_rad:.3f} to {after.wrist_rad:.3f} rad; where the angle grows, that eye "
+            "sees it turn counterclockwise"
+        ),
     )
     _turn(context, 0.0)
-    return judge_signs(before, after, said)
+    return judge_signs(before, after, said, emulated=context.config.emulated)
 
 
-def judge_signs(before: Held, after: Held, said: str) -> list[Line]:
-    """Return the lines on a positive turn: command, wrist, load cell, wrench and estimates are positive."""
+def judge_signs(before: Held, after: Held, said: str, *, emulated: bool = False) -> list[Line]:
+    """Return the lines on a positive turn: command, wrist, load cell, wrench and estimates are positive.
+
+    A calibration on recordings of real fingertips may refuse `emulated` frames.
+    """
+    lines: list[Line] = []
     found = {
         "command": "positive" if said.lower() == "counterclockwise" else f"negative: the operator said {said!r}",
         "wrist": _sign(after.wrist_rad - before.wrist_rad),
@@ -171,10 +187,14 @@ def judge_signs(before: Held, after: Held, said: str) -> list[Line]:
     for name, after_nm in after.tactile_nm.items():
         before_nm = before.tactile_nm[name]
         if after_nm is None or before_nm is None:
-            found[f"estimate of {name}"] = "no estimate in the grip"
+            refused = "no estimate in the grip"
+            if emulated:
+                lines.append(Line(what=f"sign of the estimate of {name}", value=f"not measured: {refused}"))
+            else:
+                found[f"estimate of {name}"] = refused
         else:
             found[f"estimate of {name}"] = _sign(after_nm - before_nm)
-    lines = [
+    lines += [
         judged(
             f"sign of the {what}",
             value,

@@ -15,6 +15,7 @@ from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.motion import SPEED_RAD_PER_S, TURN_RAD
 from shearloop.tools.commission.observer import Seen
+from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
 
 STAGE: Final = "5 wrench"
@@ -133,9 +134,13 @@ def judge_rest(readings: Sequence[Reading], settings: UrSettings) -> list[Line]:
 
 def _hung_mass(context: Context) -> Line:
     before = read(context)
-    kg = context.operator.number("Hang a known mass on the tool and let it rest; its mass in kg", 0.1, 5.0)
+    kg = context.operator.number(
+        "Hang a known mass on the tool and let it rest; its mass in kg",
+        *(0.1, 5.0),
+        Played("the mass that you type is hung for you, for instance 1", ("robot hang {}",)),
+    )
     after = read(context)
-    context.operator.act("Take the mass off")
+    context.operator.act("Take the mass off", Played("it is taken off for you", ("robot hang 0",)))
     return judge_mass(before, after, kg, context.settings)
 
 

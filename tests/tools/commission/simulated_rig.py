@@ -330,7 +330,7 @@ class SimulatedRig:
     def order(self, command: str) -> None:
         """Carry out a command of `emulate rig`."""
         match command.split():
-            case ["silence", "robot", seconds]:
+            case ["silence", "robot", seconds] | ["robot", "silence", seconds]:
                 self._silent_until_s = self.robot.clock_s + float(seconds)
             case _:
                 self.emulated.command(command)

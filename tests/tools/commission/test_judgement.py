@@ -206,6 +206,13 @@ def test_each_flipped_sign_fails_its_line(after, said, lines):
     assert failed(judge_signs(Held(0.0, 0.0, 0.0, dict.fromkeys(after.tactile_nm, 0.0)), after, said)) == lines
 
 
+def test_emulated_frames_that_a_calibration_refuses_fail_nothing():
+    before = Held(0.0, 0.0, 0.0, {"right": 0.0})
+    lines = judge_signs(before, Held(0.08, 0.05, 0.05, {"right": None}), "counterclockwise", emulated=True)
+    assert failed(lines) == []
+    assert [line.value for line in lines if "right" in line.what] == ["not measured: no estimate in the grip"]
+
+
 def held(stiffness: float, left_nm: float = 0.0) -> list[Held]:
     angles = [0.0, *(0.08 * (-1) ** number for number in range(10)), 0.0]
     found = [Held(angle, stiffness * angle, 0.0) for angle in angles]

@@ -45,18 +45,18 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.tools.commission.operator import Operator
     from shearloop.tools.commission.procedure import commission
 
+    config = load_daemon_config(args.config)
     counts = Counts() if args.stops is None else replace(Counts(), stops=args.stops)
-    terminal = _Terminal(sys.stderr if args.json else sys.stdout)
+    label = f"{EMULATED}: " if args.emulate or config.emulated else ""
+    terminal = _Terminal(sys.stderr if args.json else sys.stdout, label)
     with ExitStack() as emulating:
-        config = load_daemon_config(args.config)
-        operator = Operator(terminal.answer, terminal.say)
+        order = None
         if args.emulate:
             config, devices = emulating.enter_context(_emulated(config, args.config, terminal))
-            operator = Operator(terminal.answer, terminal.say, devices.order)
-        elif config.emulated:
-            terminal.label = f"{EMULATED}: "
+            order = devices.order
+        operator = Operator(terminal.answer, terminal.say, order)
         report, page = commission(config, args.config, args.out, operator, counts, args.stages)
-    written = f"{terminal.label}{args.out} and {page} are written."
+    written = f"{label}{args.out} and {page} are written."
     print_result(report.model_dump(mode="json", exclude_none=True), [written], as_json=args.json)
     return 0 if report.passed else 1
 
@@ -72,7 +72,6 @@ def _emulated(
     if config.robot is None:
         raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
     with rehearsal(config, path) as rehearsed, EmulatedDevices(rehearsed.config.emulators, path.parent) as devices:
-        terminal.label = f"{EMULATED}: "
         for sentence in rehearsed.sentences:
             terminal.say(sentence)
         if config.gripper is not None:
@@ -84,13 +83,12 @@ def _emulated(
 class _Terminal:
     """Where the operator reads and types; each line begins with `label`."""
 
-    def __init__(self, said: TextIO) -> None:
-        self.label = ""
-        self._said = said
+    def __init__(self, said: TextIO, label: str) -> None:
+        self._said, self._label = said, label
 
     def say(self, line: str) -> None:
         """Print a line."""
-        print(f"{self.label}{line}", file=self._said, flush=True)
+        print(f"{self._label}{line}", file=self._said, flush=True)
 
     def answer(self, question: str) -> str:
         """Return the operator's line; raises UserError at the end of the input."""

@@ -233,6 +233,8 @@ def _robot_arguments(robot: "UrSettings") -> list[str]:
         )
     arguments = ["--rate-hz", EMULATED_RATE_HZ, "--joints-rad", *(f"{angle:.6f}" for angle in joints_rad)]
     arguments += ["--tcp-offset", *map(str, offset)]
+    if robot.generation == "cb3":
+        arguments.append("--cb3")
     if tool.payload_kg is not None:
         arguments += ["--payload-kg", str(tool.payload_kg)]
     if tool.payload_cog_m is not None:

@@ -171,6 +171,7 @@ def _play_hx711(args: argparse.Namespace) -> Playing:
 def add_robot(parser: argparse._ActionsContainer) -> None:
     """Add the arguments of every emulated controller."""
     add_option(parser, "--rate-hz", RATE_HZ, "HZ", "control cycles per second (default: %(default)s)", default=500.0)
+    parser.add_argument("--cb3", action="store_true", help="play a CB3 with PolyScope 3.15, not an e-Series")
     parser.add_argument("--unlock-wait-s", type=float, default=5.0, help="time in which a stop is not unlocked (5)")
     parser.add_argument("--power-on-s", type=float, default=1.0, help="time of each power-on step (default: 1)")
     text = "joints where the arm stands at first"
@@ -186,9 +187,10 @@ def add_robot(parser: argparse._ActionsContainer) -> None:
 
 def robot_make(args: argparse.Namespace) -> "ControllerSpec":
     """Return the controller's make."""
-    from shearloop.emulators.ur_robot import ControllerSpec
+    from shearloop.emulators.ur_robot import CB3_VERSION, ControllerSpec
 
     return ControllerSpec(
+        version=CB3_VERSION if args.cb3 else ControllerSpec().version,
         unlock_wait_s=args.unlock_wait_s,
         power_on_s=args.power_on_s,
         payload_kg=args.payload_kg,

@@ -1,21 +1,26 @@
 """A rehearsal: a configuration of real devices runs, and none of them is opened."""
 
 import asyncio
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from shearloop.cli import main
+from shearloop.cli.emulate.devices import robot_make
 from shearloop.cli.emulator_processes import check_emulators
 from shearloop.cli.init import packaged_files
 from shearloop.cli.rehearsal import rehearsal
+from shearloop.daemon.commissioning import Line, Report, StageResult, Supplied, identity_of
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.drivers.calibration_files import save_calibration
 from shearloop.drivers.load_cell import LoadCalibration
-from shearloop.drivers.ur.settings import read_settings
+from shearloop.drivers.ur.settings import GENERATIONS, read_settings
 from shearloop.emulators.ur_arm import HOME_RAD, frame_of_pose, joints_within, tool_frames
 from shearloop.errors import UserError
+from shearloop.tools.commission.report import save_report
 from tests.fixtures.daemons import shearloop
 
 REAL = {
@@ -39,7 +44,7 @@ SHORT = {
         {"do": "release", "timeout_s": 15},
         {"do": "tare", "timeout_s": 30},
         {"do": "grip", "width_mm": 5, "force_n": 60, "timeout_s": 15},
-        {"do": "twist", "angles_rad": [0.1], "hold_s": 0.5, "timeout_s": 30},
+        {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.3, "hold_s": 0.5, "timeout_s": 30},
         {"do": "release", "timeout_s": 15},
     ],
 }
@@ -52,6 +57,7 @@ def real_rig(tmp_path, tiny_bank):
     def write(*keys: str, **changes: Any) -> Path:
         robot = yaml.safe_load(packaged_files()[Path("ur.yaml")])
         robot["tool"] = {"payload_kg": 1.3, "tcp_offset": [0.0, 0.0, 0.15, 0.0, 0.0, 0.0]}
+        robot["limits"]["wrist_speed_rad_per_s"] = {"inner": 0.5, "hard": 0.7}
         (tmp_path / "ur.yaml").write_text(yaml.safe_dump(robot))
         (tmp_path / "short.yaml").write_text(yaml.safe_dump(SHORT))
         content = {key: REAL[key] for key in keys} | changes
@@ -119,6 +125,19 @@ def test_a_calibrated_load_cell_gets_the_counts_of_its_own_calibration(real_rig,
     assert calibration.torque_nm(float(line)) == pytest.approx(0.25)
 
 
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize("generation", ["cb3", "e-series"])
+def test_the_emulated_controller_is_of_the_generation_of_the_robots_settings(real_rig, generation):
+    path = real_rig("robot", "load_cell")
+    robot = path.with_name("ur.yaml")
+    content = yaml.safe_load(robot.read_text())
+    content["limits"] |= {"force_n": {"inner": 40.0, "hard": 60.0}, "torque_nm": {"inner": 6.0, "hard": 8.0}}
+    robot.write_text(yaml.safe_dump({**content, "generation": generation}))
+    with rehearsal(load_daemon_config(path), path) as rehearsed:
+        (options,) = check_emulators(rehearsed.config.emulators, path)
+    assert GENERATIONS[generation].major == robot_make(options).version[0]
+
+
 def test_the_arm_stands_inside_the_workspace_and_the_joint_ranges():
     wide = [-6.2] * 6, [6.2] * 6
     offset = [0.0, 0.05, 0.15, 0.0, 0.0, 0.0]
@@ -159,13 +178,41 @@ def skin_of_the_demo() -> dict[str, Any]:
     return {**REAL["skin"], "calibration": str(calibration)}
 
 
+@pytest.mark.usefixtures("ur_rtde")
+def test_an_experiment_beyond_the_cap_is_refused_as_on_the_real_rig(real_rig, capsys):
+    path = real_rig("robot", "gripper", "load_cell", experiment="short.yaml")
+    assert main(["run", str(path), "--emulate"]) == 2
+    printed = capsys.readouterr()
+    assert "EMULATED: the robot is capped at 0.2 rad/s" in printed.out
+    assert "has speed_rad_per_s 0.3 rad/s: write 0.2 or less" in printed.err
+
+
+def report_of_emulated(path: Path) -> Report:
+    """Return what `commission --emulate` measures of a rig: the stages that raise the wrist's speed."""
+    rig = identity_of(load_daemon_config(path), "5.17.3.0", "EMULATED").model_copy(update={"emulated": True})
+    line = Line(what="w", value="v", verdict="passed")
+    stages = [
+        StageResult(
+            stage=f"{number} s",
+            operator="Ada",
+            date=datetime.now(UTC),
+            lines=(line,),
+            supplies=Supplied(wrist_speed_rad_per_s=0.5),
+        )
+        for number in "0134"
+    ]
+    return Report(rig=rig, stages=tuple(stages))
+
+
 @pytest.mark.real_time
 @pytest.mark.usefixtures("ur_rtde")
-async def test_the_experiment_of_a_real_configuration_runs_to_its_end(real_rig):
-    path = real_rig("robot", "gripper", "load_cell", experiment="short.yaml")
+async def test_the_experiment_of_a_real_configuration_runs_to_its_end_with_the_limits_that_a_report_raises(real_rig):
+    path = real_rig("robot", "gripper", "load_cell", experiment="short.yaml", commissioned="emulated.yaml")
+    save_report(path.with_name("emulated.yaml"), report_of_emulated(path))
     async with shearloop("run", str(path), "--emulate") as daemon:
         out, log = await asyncio.wait_for(daemon.communicate(), 90)
     assert daemon.returncode == 0, log.decode()
     assert "EMULATED: every device was emulated on this computer." in out.decode()
+    assert "capped at 0.5 rad/s, 0.05 m/s and 0.3 N·m: its report of emulated devices covers no more" in out.decode()
     assert "'short' was done" in out.decode()
     assert all("EMULATED" in line for line in log.decode().splitlines())

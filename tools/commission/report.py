@@ -95,6 +95,9 @@ def report_for(rig: RigIdentity, found: Report | None, path: Path) -> Report:
     """Return the report `found` in `path`, or a new one; UserError if it is of another rig or of other settings."""
     if found is None:
         return Report(rig=rig)
+    if found.rig.emulated != rig.emulated:
+        of, here = ("emulated", "real") if found.rig.emulated else ("real", "emulated")
+        raise UserError(f"{path} is of {of} devices, and these are {here}; give another --out")
     if differs := list(found.rig.differences(rig)):
         raise UserError(
             f"{path}: {' and '.join(differs)} changed since this report was begun, and its results are of the old "

@@ -20,7 +20,7 @@ from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
-from shearloop.tools.commission.identity import Identity, judge_identity
+from shearloop.tools.commission.identity import EMULATED_CHECKSUM, Identity, judge_identity
 from shearloop.tools.commission.report import earlier_report, report_for, save_report
 from tests.emulator_process import EmulatorProcess
 
@@ -99,7 +99,10 @@ def test_a_report_of_another_rig_is_not_continued(tmp_path, changed):
     path = tmp_path / "report.yaml"
     save_report(path, Report(rig=RIG))
     other = RIG.model_copy(update={changed: True if changed == "emulated" else "other"})
-    with pytest.raises(UserError, match="changed since this report was begun"):
+    why = (
+        "is of real devices, and these are emulated" if changed == "emulated" else "changed since this report was begun"
+    )
+    with pytest.raises(UserError, match=why):
         report_for(other, earlier_report(path), path)
 
 
@@ -137,3 +140,26 @@ def test_stage_0_is_run_on_an_emulated_controller_with_scripted_answers(tmp_path
         assert failed == ["payload"]
     finally:
         robot.close()
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_commissioning_is_rehearsed_on_emulated_devices_and_every_line_says_so(tmp_path, monkeypatch, capsys):
+    path, out = write_rig(tmp_path), tmp_path / "emulated.yaml"
+    monkeypatch.setattr(sys, "stdin", io.StringIO(f"Ada\n{EMULATED_CHECKSUM}\n"))
+    assert main(["commission", str(path), "--out", str(out), "--stages", "0", "--emulate"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "EMULATED: passed payload: 1.400 kg (limit: 1.4 ± 0.1 kg)" in lines
+    assert any(f"[emulated: the pendant shows {EMULATED_CHECKSUM}]:" in line for line in lines)
+    assert [line for line in lines if not line.startswith("EMULATED: ")] == []
+    rig = yaml.safe_load(out.read_text())["rig"]
+    assert (rig["emulated"], rig["robot_serial_number"]) == (True, "EMULATED")
+    assert "EMULATED: commissioning" in out.with_suffix(".html").read_text()
+
+
+def test_what_cannot_be_rehearsed_is_refused_before_anything_is_played(tmp_path, mistake):
+    path = tmp_path / "rig.yaml"
+    path.write_text("load_cell: {device: {path: cell}}\n")
+    assert "no robot to commission" in mistake("commission", path, "--out", tmp_path / "r.yaml", "--emulate")
+    write_rig(tmp_path)
+    path.write_text("load_cell: {device: {path: cell}}\nrobot: ur.yaml\nemulated: true\n")
+    assert "emulated already" in mistake("commission", path, "--out", tmp_path / "r.yaml", "--emulate")

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -42,14 +43,20 @@ def test_the_folders_at_the_top_cannot_be_imported_by_themselves(folder):
         importlib.import_module(folder)
 
 
-def test_no_module_imports_the_folders_at_the_top_by_themselves():
-    bare = []
+@cache
+def imports() -> list[tuple[str, str]]:
+    """Return each module that is imported by its whole name, after the file that imports it."""
+    found = []
     for path in (p for folder in (*FOLDERS, "benchmarks", "tests", "src") for p in (ROOT / folder).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
-            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            bare += [f"{path.relative_to(ROOT)}: {name}" for name in names if name.split(".")[0] in FOLDERS]
-    assert not bare
+            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            found += [(str(path.relative_to(ROOT)), module) for module in modules]
+    return found
+
+
+def test_no_module_imports_the_folders_at_the_top_by_themselves():
+    assert [f"{path}: {module}" for path, module in imports() if module.split(".")[0] in FOLDERS] == []
 
 
 def test_the_version_and_its_date_are_the_same_everywhere():
@@ -112,12 +119,7 @@ FOREIGN = {"lerobot", "torch"}
 def test_every_import_is_declared():
     declared = [*PROJECT["dependencies"], *(one for some in PROJECT["optional-dependencies"].values() for one in some)]
     names = {re.split(r"[<>=;\[ ]", one)[0].lower() for one in declared}
-    imported: dict[str, str] = {}
-    for path in (p for folder in (*FOLDERS, "benchmarks", "tests", "src") for p in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
-            modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            imported |= {module.split(".")[0]: str(path.relative_to(ROOT)) for module in modules}
+    imported = {module.split(".")[0]: path for path, module in imports()}
     own = {"shearloop", "benchmarks", "tests", "__future__", *sys.stdlib_module_names, *FOREIGN}
     undeclared = {
         name: place

@@ -43,6 +43,12 @@ def trees() -> dict[str, ast.Module]:
 
 
 @cache
+def nodes() -> list[tuple[str, ast.AST]]:
+    """Return the nodes of all modules' syntax trees."""
+    return [(module, node) for module, tree in trees().items() for node in ast.walk(tree)]
+
+
+@cache
 def constants() -> dict[Place, ast.expr]:
     """Return the values of the modules' constants."""
     found: dict[Place, ast.expr] = {}
@@ -63,8 +69,7 @@ def imports() -> dict[Place, Place]:
     """Return where each imported name comes from."""
     return {
         (module, each.asname or each.name): (line.module, each.name)
-        for module, tree in trees().items()
-        for line in ast.walk(tree)
+        for module, line in nodes()
         if isinstance(line, ast.ImportFrom)
         for each in line.names
     }
@@ -90,8 +95,7 @@ def origin(module: str, default: ast.expr | None) -> tuple[Place, object] | None
 
 def defaults() -> Iterator[tuple[str, Place, object]]:
     """Yield the name of each default of a class or of its constructor, where it is written out, and its value."""
-    classes = [(module, node) for module, tree in trees().items() for node in ast.walk(tree)]
-    bodies = [(module, node.body) for module, node in classes if isinstance(node, ast.ClassDef)]
+    bodies = [(module, node.body) for module, node in nodes() if isinstance(node, ast.ClassDef)]
     for module, line in [(module, line) for module, body in bodies for line in body]:
         pairs: list[tuple[str, ast.expr | None]] = []
         if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):

@@ -122,13 +122,19 @@ def _is_integer(value: Any) -> bool:
 
 
 def _is_array(value: Any) -> bool:
-    if type(value) is not list or not set(map(type, value)) <= {float, int, type(None)}:
+    if type(value) is not list:
         return False
-    return all(map(_is_number, value)) if {int} <= set(map(type, value)) else _is_finite_array(value)
+    kinds = set(map(type, value))
+    if not kinds <= {float, int, type(None)}:
+        return False
+    return all(map(_is_number, value)) if int in kinds else _is_finite_array(value)
 
 
-def _is_finite_array(value: list[float | None]) -> bool:
-    return all(element is None or math.isfinite(element) for element in value)
+def _is_finite_array(value: list[Any]) -> bool:
+    # A frame has 896 elements, and mostly all of them.
+    if None in value:
+        return all(element is None or math.isfinite(element) for element in value)
+    return all(map(math.isfinite, value))
 
 
 class _Type(NamedTuple):
@@ -156,8 +162,10 @@ def _check_rectangle(scores: list[float], shape: list[float]) -> None:
 def _check_input(row: Mapping[str, Any]) -> None:
     if row["kind"] not in (kind.value for kind in InputKind):
         raise ContentError(f"kind is {_quoted(row['kind'])}, not one of {', '.join(kind.value for kind in InputKind)}")
-    if not all(ord(character) < 256 for character in row["data"]):
-        raise ContentError(f"data is {_quoted(row['data'])}, not bytes as Latin-1 text")
+    try:
+        row["data"].encode("latin-1")
+    except UnicodeEncodeError:
+        raise ContentError(f"data is {_quoted(row['data'])}, not bytes as Latin-1 text") from None
 
 
 def _quoted(value: object) -> str:

@@ -12,7 +12,6 @@ from itertools import pairwise
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.spatial import Delaunay
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.channels import INJECTION, ChannelTable, Injection
@@ -189,6 +188,9 @@ class RoundFingertip:
 
     def mesh(self) -> Mesh:
         """Return the fingertip's mesh."""
+        # A fifth of the start-up time of the page's viewer, which meshes nothing.
+        from scipy.spatial import Delaunay
+
         radius, size = self.diameter_cm / 2, self.mesh_size_cm
         starts = np.deg2rad(self.angles_deg) - self.electrode_width_cm / self.diameter_cm
         ends = np.deg2rad(self.angles_deg) + self.electrode_width_cm / self.diameter_cm

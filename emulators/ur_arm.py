@@ -12,7 +12,6 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy import constants
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 Vector = NDArray[np.float64]
@@ -72,6 +71,9 @@ def joints_within(
 
     The tool keeps its direction. The point keeps a quarter of the box from each face, or as far as HOME_RAD is.
     """
+    # A fifth of the start-up time of an emulated rig, which needs it only in a given workspace.
+    from scipy.optimize import least_squares
+
     tool = frame_of_pose(tcp_offset)
     box, home = np.array([lower_m, upper_m]), tool_frames(HOME_RAD, tool)[-1]
     quarter = (box[1] - box[0]) / 4

@@ -4,6 +4,7 @@ import asyncio
 import gc
 import inspect
 import io
+import itertools
 import os
 import sys
 import threading
@@ -61,10 +62,19 @@ def shared() -> Path:
     return SHARED
 
 
+@pytest.fixture(scope="session")
+def state_homes(tmp_path_factory) -> Iterator[Path]:
+    """Numbered folders for the state of each test; pytest's own would look through all that are there for each."""
+    folder = tmp_path_factory.mktemp("states")
+    return (folder / str(number) for number in itertools.count())
+
+
 @pytest.fixture(autouse=True)
-def state_home(tmp_path_factory, monkeypatch) -> None:
+def state_home(state_homes, monkeypatch) -> None:
     """A state folder of its own for every test: a stop is remembered there for the next daemon of the same robot."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+    folder = next(state_homes)
+    folder.mkdir()
+    monkeypatch.setenv("XDG_STATE_HOME", str(folder))
 
 
 @pytest.fixture(scope="session")

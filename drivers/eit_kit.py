@@ -168,10 +168,11 @@ class FrameClock:
     edge of their lower convex hull that spans the middle (Moon, Skelly and Towsley 1999, "Estimation and removal of
     clock skew from network delay measurements"). Its slope is the period; its height over the last few frames is the
     phase. All times are integer nanoseconds of one monotonic clock. The nominal period applies until the real one is
-    `learned`.
+    `learned`. After a pause of more than `longest_gap` periods the board counts as stopped; before, a frame is late.
     """
 
-    def __init__(self, nominal_period_ns: int) -> None:
+    def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:
+        self._longest_gap = longest_gap
         # The learned period, or the nominal one until it is learned.
         self.period_ns = nominal_period_ns
         self.learned = False
@@ -204,7 +205,7 @@ class FrameClock:
             # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
             # board. Half a period early means that the last one was counted as two.
             paused = min(late, late_before) > 0.5 and late > late_before - 0.5
-            if elapsed > LONGEST_GAP or late < -0.5 or paused:
+            if elapsed > self._longest_gap or late < -0.5 or paused:
                 self.restart()
         self._seen.append((number, arrival_ns))
         self._latest.append((self._latest[-1][0] + steps if self._latest else 0, arrival_ns))
@@ -253,11 +254,14 @@ class FrameParser:
     """Turns bytes, however they are sliced, into frames; counts rejected lines by kind. No I/O.
 
     `zero_slots` (v,) is true where the injection pattern makes the value 0. A line that was under way when the port was
-    opened is no error.
+    opened is no error. `patience` is the factor on the pause after which the board counts as stopped; above 1 on an
+    emulated rig alone, whose boards a busy computer keeps waiting.
     """
 
-    def __init__(self, zero_slots: NDArray[np.bool_], *, nominal_period_ns: int = NOMINAL_PERIOD_NS) -> None:
-        self.clock = FrameClock(nominal_period_ns)
+    def __init__(
+        self, zero_slots: NDArray[np.bool_], *, nominal_period_ns: int = NOMINAL_PERIOD_NS, patience: float = 1.0
+    ) -> None:
+        self.clock = FrameClock(nominal_period_ns, patience * LONGEST_GAP)
         self.frames = 0
         self.errors: Counter[FrameErrorKind] = Counter()
         self.last_error: FrameError | None = None
@@ -373,7 +377,7 @@ class EitKit(SerialSensor[Frame]):
         inputs: InputRecorder | None = None,
         patience: float = 1.0,
     ) -> None:
-        self._frame_parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
+        self._frame_parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9), patience=patience)
         super().__init__(link, frame_period_s, self._frame_parser, inputs, patience)
 
     @property

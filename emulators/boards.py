@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from shearloop.emulators.numbers import number_between
 from shearloop.emulators.ports import PtyPort
 
-# Lateness of this process that is made up for, so that fast rates are kept on average.
-CATCH_UP_S = 0.05
+# Lateness of this process or of the reader that is made up for, in periods, and at least: a real board does not wait
+# for a busy computer, and fast rates are kept on average. Whatever keeps the board waiting keeps the emulated arm
+# waiting.
+CATCH_UP_PERIODS, CATCH_UP_S = 9, 0.05
 # The mean over 4882 lines of the paper's rig.
 LOAD_PERIOD_S = 1 / 10.9
 # A line of the paper's board without its beginning, "0.0000": 38 µN·m became 38 MN·m.
@@ -73,12 +75,12 @@ class EmulatedBoard:
     async def run(self) -> None:
         """Play until cancelled; at the end of the data the board stays plugged in."""
         loop = asyncio.get_running_loop()
+        catch_up_s = max(CATCH_UP_S, CATCH_UP_PERIODS * self._period_s)
         with self.port:
             await self._wait_for_start()
             due_s = loop.time()
             while True:
-                # Held up by the reader, the next line takes a whole period from here.
-                due_s = max(due_s, loop.time() - CATCH_UP_S) + self._period_s
+                due_s = max(due_s, loop.time() - catch_up_s) + self._period_s
                 await asyncio.sleep(due_s - loop.time())
                 if loop.time() >= self._lasts_until_s:
                     self._end_lasting()

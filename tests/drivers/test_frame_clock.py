@@ -56,6 +56,16 @@ def test_a_board_that_paused_is_followed(pause_periods):
     assert abs(error[53:]).max() < 1_000_000
 
 
+def test_frames_that_an_emulated_board_sends_late_are_late_and_none_is_missing():
+    truth = sent(80)
+    arrivals = truth.copy()
+    # The computer was busy for five periods; then each waiting frame is read by itself.
+    arrivals[40:45] = truth[45] + np.arange(-5, 0) * 1_000_000
+    patient = FrameClock(PERIOD_NS, longest_gap=25.0)
+    assert abs(straightened(arrivals, patient) - truth).max() < 1_000_000
+    assert np.diff(straightened(arrivals)).max() > 5 * PERIOD_NS, "of a real board they may be missing"
+
+
 def test_frames_queued_before_the_first_read_do_not_spoil_the_period():
     truth = sent(80)
     arrivals = np.maximum(truth, truth[5] + 50_000_000 * np.arange(80))

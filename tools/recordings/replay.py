@@ -38,7 +38,7 @@ from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session
 from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
 from shearloop.daemon.sensing.snapshots import SnapshotError, restored
-from shearloop.daemon.sensors import load_cell_calibration
+from shearloop.daemon.sensors import load_cell_calibration, patience_of
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
@@ -275,6 +275,7 @@ class Replay:
             name: FrameParser(
                 self._sessions[name].calibration.table.zero_slots,
                 nominal_period_ns=round(fingertip.frame_period_s * 1e9),
+                patience=patience_of(config),
             )
             for name, fingertip in config.fingertips.items()
         }

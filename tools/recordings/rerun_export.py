@@ -1,10 +1,12 @@
 """Writes a recording for the Rerun viewer: scalars with their intervals, images of the bank's match, and the robot."""
 
-import errno
+import os
+import tempfile
+import threading
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +16,14 @@ from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatma
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.web.message_store import conductivity_profile
 from shearloop.errors import require
-from shearloop.files import replaced_path
+from shearloop.files import replace_file
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import read_messages
 
 TIMELINE = "time"
 # Values of an entity that are sent at once, and images.
 _BATCH, _IMAGE_BATCH = 1000, 30
+_COPIED_BYTES = 1 << 16
 # Longer arrays are frames and heatmaps.
 _LONGEST_SCALARS = 8
 _POSE = 6
@@ -29,10 +32,43 @@ _NOT_SHOWN = (*ENVELOPE, "scores", schema.SCORES_SHAPE)
 _CHARTS = {"N·m": "torque (N·m)", "mm": "diameter (mm)", "N": "shear force (N)", "rad": "angle (rad)"}
 
 
+class _Copy(threading.Thread):
+    """Copies a pipe into a file to the pipe's end, which it reaches also where the file takes no more.
+
+    The SDK writes files in a thread. One that meets a full disk ends, and whoever waits for it waits for ever; so it
+    gets a pipe.
+    """
+
+    def __init__(self, pipe: Path, out: IO[bytes]) -> None:
+        super().__init__(name="rerun", daemon=True)
+        os.mkfifo(pipe)
+        # Opened before its writer, and read from once that has opened it.
+        self._pipe, self._out = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK), out
+        os.set_blocking(self._pipe, True)
+        self._error: OSError | None = None
+
+    def run(self) -> None:
+        """Copy until the writer has closed the pipe."""
+        with open(self._pipe, "rb") as pipe:
+            while data := pipe.read(_COPIED_BYTES):
+                if self._error is None:
+                    try:
+                        self._out.write(data)
+                    except OSError as error:
+                        self._error = error
+
+    def end(self) -> None:
+        """Wait for the end of the pipe; raises OSError if the file did not take everything."""
+        self.join()
+        if self._error is not None:
+            raise self._error
+
+
 class _RerunFile:
     """Adds messages to a Rerun file, in batches."""
 
-    def __init__(self, out: Path, fingertip: Fingertip) -> None:
+    def __init__(self, out: IO[bytes], folder: Path, fingertip: Fingertip) -> None:
+        """Take the file, and an empty folder."""
         import rerun
 
         self._rr = rerun
@@ -40,7 +76,9 @@ class _RerunFile:
         self._width_cm = float(np.ptp([x for x, _ in fingertip.outline().contour]))
         # The SDK may be switched off by an environment variable, and would then write nothing.
         self._stream = rerun.RecordingStream("shearloop", default_enabled=True)
-        self._stream.save(out)
+        self._copy = _Copy(folder / "pipe", out)
+        self._stream.save(folder / "pipe")
+        self._copy.start()
         self._waiting: dict[str, tuple[list[int], list[Any]]] = {}
         self._models: dict[str, str] = {}
         self._images: set[str] = set()
@@ -74,15 +112,12 @@ class _RerunFile:
 
     def close(self) -> None:
         """Write what waits, and the layout of the viewer; raises OSError where the disk does not take it."""
-        try:
-            for entity in self._waiting:
-                self._send(entity)
-            self._stream.send_blueprint(self._layout())
-            self._stream.flush()
-        except RuntimeError as error:
-            # The SDK writes in a thread, whose error it prints and does not pass on.
-            raise OSError(errno.EIO, f"the disk does not take it, is it full? ({error})") from error
+        for entity in self._waiting:
+            self._send(entity)
+        self._stream.send_blueprint(self._layout())
+        self._stream.flush()
         self._stream.disconnect()
+        self._copy.end()
 
     def _add(self, entity: str, value: Any, t_ns: int) -> None:
         times, values = self._waiting.setdefault(entity, ([], []))
@@ -151,10 +186,11 @@ def export_rerun(
     Raises OSError for a file that cannot be written, UserError without rerun-sdk and for an unreadable recording.
     """
     require("rerun", "rerun", "a file for Rerun")
-    with replaced_path(out) as written:
-        # The SDK's own error is a sentence of its internals.
-        written.open("wb").close()
-        with closing(_RerunFile(written, fingertip)) as file:
-            for topic, content, message in read_messages(path, topics, progress):
-                file.add(topic, content, message.log_time)
+    with (
+        replace_file(out) as written,
+        tempfile.TemporaryDirectory() as folder,
+        closing(_RerunFile(written, Path(folder), fingertip)) as file,
+    ):
+        for topic, content, message in read_messages(path, topics, progress):
+            file.add(topic, content, message.log_time)
     return out

@@ -66,7 +66,7 @@ class UrArm:
         self._age = SampleAge()
         # In the base's frame: of a controller that cannot zero its wrench, or that has zeroed it with a load.
         self.wrench_zero: Six = (0.0,) * 6
-        # The wrench before the last upload, where something was held.
+        # The wrench before a program was first sent, where something was held, until that program answers.
         self._held: Six | None = None
         self.script_readiness = ScriptReadiness(self._receiver, settings.command_timeout_s)
 
@@ -148,12 +148,16 @@ class UrArm:
     def upload(self, *, held: bool = False) -> None:
         """Send the control script; the program starts by itself, and ends when it receives nothing.
 
-        An e-Series zeroes its wrench as a program starts. Where something is `held`, the zero from before is kept.
+        An e-Series zeroes its wrench as a program starts. Where something is `held`, the zero from before is kept, also
+        where the first program that was sent has started without an answer.
 
         Raises:
             RobotLostError: the controller does not take the script.
         """
-        self._held = self._wrench() if held and self._settings.facts.zeroes_at_start else None
+        if not (held and self._settings.facts.zeroes_at_start):
+            self._held = None
+        elif self._held is None:
+            self._held = self._wrench()
         # ur-rtde's own script connection is never read, so that the controller soon stops listening to it.
         self._script_port.send(control_program(self._settings, self._registers, self._held))
         self.script_readiness.command_sent()
@@ -164,6 +168,7 @@ class UrArm:
         if armed and self._settings.facts.zeroes_at_start:
             now: Six = self._receiver.latest().wrench
             self.wrench_zero = _difference(now, self._held) if self._held is not None else (0.0,) * 6
+            self._held = None
         return armed
 
     def end_program(self) -> None:

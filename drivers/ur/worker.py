@@ -51,6 +51,8 @@ class Pipe:
     def __init__(self, stdin: int, stdout: int) -> None:
         self._in, self._out = stdin, stdout
         self._decoder = messages.MessageDecoder()
+        # Received together with a message that was taken by itself.
+        self._received: list[tuple[int, messages.Message]] = []
         # Of the messages sent last.
         self.unsent = b""
         self.open = True
@@ -63,12 +65,17 @@ class Pipe:
 
     def receive(self) -> list[tuple[int, messages.Message]]:
         """Return the messages that have arrived; `open` is False once the daemon is gone."""
+        received, self._received = self._received, []
         try:
             data = os.read(self._in, 1 << 16)
         except BlockingIOError:
-            return []
+            return received
         self.open = self.open and bool(data)
-        return self._decoder.feed(data)
+        return received + self._decoder.feed(data)
+
+    def keep(self, received: list[tuple[int, messages.Message]]) -> None:
+        """Return these messages from the next `receive`, before all others."""
+        self._received = received + self._received
 
     def send(self, message: messages.Message, number: int = 0) -> None:
         """Send a message that must arrive."""
@@ -126,8 +133,11 @@ def receive_settings(pipe: Pipe) -> UrSettings | None:
     """Return the settings that the daemon sends first, None if it is gone."""
     while pipe.open:
         pipe.wait(60.0)
-        for _, message in pipe.receive():
+        received = pipe.receive()
+        for number, (_, message) in enumerate(received, 1):
             if isinstance(message, UrSettings):
+                # What the gripper holds comes right behind, before this process could start.
+                pipe.keep(received[number:])
                 return message
     return None
 

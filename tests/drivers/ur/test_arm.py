@@ -210,6 +210,28 @@ def test_wrench_of_what_is_held_outlives_the_zero_of_a_new_program(arm, monkeypa
     assert another.read().wrench == SIX
 
 
+def test_a_program_that_is_sent_again_keeps_the_wrench_from_before_the_first(arm, monkeypatch):
+    """The controller may start the first one late, or end it before it answers."""
+    monkeypatch.setattr(arm.ScriptPort, "send", lambda *_: None)
+    one = arm.UrArm(SETTINGS)
+    load = (1.0, 0.0, 3.0, 0.0, 0.0, 1.5)
+    Receiver.made.sample = dataclasses.replace(received(1.0), wrench=load)
+    one.upload(held=True)
+    # It has started, and has zeroed the wrench.
+    Receiver.made.sample = dataclasses.replace(received(3.0), wrench=SIX)
+    one.upload(held=True)
+    one.script_readiness.waiting = False
+    assert one.arm_watchdog()
+    assert one.read().wrench == load
+    # Another program, later, begins with the load of its own time.
+    Receiver.made.sample = dataclasses.replace(received(9.0), wrench=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    one.upload(held=True)
+    Receiver.made.sample = dataclasses.replace(received(9.1), wrench=SIX)
+    one.script_readiness.waiting = False
+    assert one.arm_watchdog()
+    assert one.read().wrench == (2.0, 0.0, 3.0, 0.0, 0.0, 1.5)
+
+
 def test_deadline_counts_from_the_latest_sample(arm):
     one = arm.UrArm(SETTINGS)
     Receiver.made.sample = received(1.0, script_ticks=10_000)

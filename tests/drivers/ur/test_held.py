@@ -2,8 +2,10 @@
 
 import pytest
 
-from shearloop.drivers.ur.messages import Held, Unlock
-from tests.drivers.ur.handler_bench import HandlerBench
+from shearloop.drivers.ur import worker
+from shearloop.drivers.ur.messages import Disconnect, Held, Unlock
+from tests.drivers.ur.handler_bench import SETTINGS, HandlerBench
+from tests.drivers.ur.process import CyclingArm
 
 ZERO = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5)
 
@@ -28,3 +30,21 @@ def test_unlock_starts_a_program_that_knows_what_the_gripper_holds_now(held):
     bench.handler.take_held(Held(held, ZERO))
     assert bench.ask(Unlock()).accepted
     assert [one for one in bench.arm.calls if one.startswith("upload")] == ["upload, held" if held else "upload"]
+
+
+def test_what_the_daemon_sends_behind_the_settings_is_not_lost(daemon):
+    """Both are there before the worker's interpreter has started."""
+    daemon.send(SETTINGS, Held(held=True, wrench_zero=ZERO))
+    assert worker.receive_settings(daemon.pipe) == SETTINGS
+    daemon.send(Disconnect())
+    assert daemon.pipe.receive() == [(2, Held(held=True, wrench_zero=ZERO)), (1, Disconnect())]
+
+
+def test_a_new_worker_keeps_the_zero_under_the_tool_that_is_held(daemon, timed):
+    """Its predecessor was killed, or lost the robot."""
+    arm = CyclingArm()
+    daemon.send(SETTINGS, Held(held=True, wrench_zero=ZERO))
+    assert worker.receive_settings(daemon.pipe) == SETTINGS
+    timed(arm, (0.1, Disconnect()))
+    assert arm.calls[:2] == ["clear_command", "upload, held"]
+    assert arm.wrench_zero == ZERO

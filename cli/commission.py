@@ -74,9 +74,8 @@ def _emulated(
     with rehearsal(config, path) as rehearsed, EmulatedDevices(rehearsed.config.emulators, path.parent) as devices:
         for sentence in rehearsed.sentences:
             terminal.say(sentence)
-        if config.gripper is not None:
-            # Its tool comes between the fingers when the operator says so.
-            devices.order("object none")
+        # A tool comes between the fingers when the operator says so.
+        devices.order("object none" if config.gripper is not None else "robot normal")
         yield rehearsed.config, devices
 
 

@@ -141,7 +141,9 @@ class EmulatedDevices:
                 process.stdin.write(f"{command}\n".encode())
         until_s = time.monotonic() + OBEYS_S
         while not _has_obeyed(os.pread(output.fileno(), os.fstat(output.fileno()).st_size - begin, begin), command):
-            if time.monotonic() > until_s or process.poll() is not None:
+            if process.poll() is not None:
+                raise UserError("an emulated device has ended; the line above says why")
+            if time.monotonic() > until_s:
                 raise UserError(f"the emulated devices did not carry out `{command}`: run it again")
             time.sleep(POLL_S)
 

@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     write_files(args.folder, files)
     rig = args.folder / "rig.yaml"
     print(f"{rig}: edit it, then run `shearloop check {shlex.quote(str(rig))}`")
-    print(f"{args.folder / 'ur.yaml'}: set the robot's address and every limit")
+    print(f"{args.folder / 'ur.yaml'}: set the robot's address, its payload and every limit")
     return 0
 
 

@@ -66,7 +66,7 @@ def test_an_order_is_carried_out_before_it_returns_and_the_end_of_the_device_is_
         devices.order("robot slider 0.5")
     with (
         played((emulator(),), "input()") as devices,
-        pytest.raises(UserError, match="did not carry out `robot stop`: run it again"),
+        pytest.raises(UserError, match="an emulated device has ended"),
     ):
         devices.order("robot stop")
 

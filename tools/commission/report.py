@@ -92,13 +92,18 @@ def earlier_report(path: Path) -> Report | None:
 
 
 def report_for(rig: RigIdentity, found: Report | None, path: Path) -> Report:
-    """Return the report `found` in `path`, or a new one; UserError if it is of another rig or of other settings."""
+    """Return the report `found` in `path`, or a new one; UserError if it is of another rig or of other settings.
+
+    A report of other settings without a stage that passed is begun anew: they were changed to make it pass.
+    """
     if found is None:
         return Report(rig=rig)
     if found.rig.emulated != rig.emulated:
         of, here = ("emulated", "real") if found.rig.emulated else ("real", "emulated")
         raise UserError(f"{path} is of {of} devices, and these are {here}; give another --out")
     if differs := list(found.rig.differences(rig)):
+        if not any(stage.passed for stage in found.stages):
+            return Report(rig=rig)
         raise UserError(
             f"{path}: {' and '.join(differs)} changed since this report was begun, and its results are of the old "
             "one; begin a new report with another --out"

@@ -94,10 +94,22 @@ def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
     assert "4 stops" in text
 
 
+def stage(verdict: str) -> StageResult:
+    line = Line(what="w", value="v", verdict=verdict)
+    return StageResult(stage="0 identity", operator="O", date="2026-01-01T00:00:00Z", lines=(line,))
+
+
+def test_a_report_in_which_nothing_passed_is_begun_anew_with_settings_that_were_mended(tmp_path):
+    path = tmp_path / "report.yaml"
+    mended = RIG.model_copy(update={"robot_settings_sha256": "other"})
+    save_report(path, Report(rig=RIG, stages=(stage("failed"),)))
+    assert report_for(mended, earlier_report(path), path) == Report(rig=mended)
+
+
 @pytest.mark.parametrize("changed", list(RigIdentity.model_fields))
 def test_a_report_of_another_rig_is_not_continued(tmp_path, changed):
     path = tmp_path / "report.yaml"
-    save_report(path, Report(rig=RIG))
+    save_report(path, Report(rig=RIG, stages=(stage("passed"),)))
     other = RIG.model_copy(update={changed: True if changed == "emulated" else "other"})
     why = (
         "is of real devices, and these are emulated" if changed == "emulated" else "changed since this report was begun"

@@ -8,8 +8,9 @@ from typing import Final
 
 from shearloop.daemon.commissioning import Report, StageResult, identity_of
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.rig import open_settings
+from shearloop.daemon.rig import gripper_calibration, open_settings
 from shearloop.daemon.rig_memory import lock_robot
+from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.errors import UserError
 from shearloop.tools.commission import boards, gripper, identity, motion, rtde, stops, tool, wrench
 from shearloop.tools.commission.context import Context, Counts
@@ -17,6 +18,7 @@ from shearloop.tools.commission.limits import EMULATED
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.report import Measured, earlier_report, report_for, save_report
 from shearloop.tools.commission.rig import ConnectedRig, Rig
+from shearloop.tools.commission.tactile import calibrated_sessions
 
 Measure = Callable[[Context], Measured]
 
@@ -52,6 +54,7 @@ def commission(
         raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
     # Before any device is asked: it may be the name of another file.
     earlier = earlier_report(out)
+    _open_files(config)
     with ExitStack() as opened:
         # A daemon would drive the robot at the same time.
         opened.enter_context(lock_robot(settings.host))
@@ -60,6 +63,15 @@ def commission(
         report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)
         context = Context(config, settings, devices, controller, operator, report, counts, opened)
         return _run(context, out, only)
+
+
+def _open_files(config: DaemonConfig) -> None:
+    """Open the files that later stages need; raises UserError or DriverError for one that cannot be used."""
+    calibrated_sessions(config)
+    if config.load_cell is not None:
+        load_cell_calibration(config.load_cell)
+    if config.gripper is not None:
+        gripper_calibration(config.gripper)
 
 
 def _run(context: Context, out: Path, only: Sequence[str]) -> tuple[Report, Path]:

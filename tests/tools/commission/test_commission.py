@@ -175,3 +175,12 @@ def test_what_cannot_be_rehearsed_is_refused_before_anything_is_played(tmp_path,
     write_rig(tmp_path)
     path.write_text("load_cell: {device: {path: cell}}\nrobot: ur.yaml\nemulated: true\n")
     assert "emulated already" in mistake("commission", path, "--out", tmp_path / "r.yaml", "--emulate")
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_file_that_a_late_stage_needs_is_missed_before_the_first(tmp_path, mistake):
+    path = write_rig(tmp_path, "127.0.0.9")
+    content = yaml.safe_load(path.read_text())
+    fingertip = {"device": {"serial_number": "1"}, "bank": "absent.bank"}
+    path.write_text(yaml.safe_dump({**content, "fingertips": {"right": fingertip}}))
+    assert "build it with `shearloop bank build" in mistake("commission", path, "--out", tmp_path / "report.yaml")

@@ -64,10 +64,7 @@ def test_an_order_is_carried_out_before_it_returns_and_the_end_of_the_device_is_
     with played((emulator(), emulator(arguments=("2",))), "input()", OBEDIENT, ready=READY) as devices:
         devices.order("object none")
         devices.order("robot slider 0.5")
-    with (
-        played((emulator(),), "input()") as devices,
-        pytest.raises(UserError, match="an emulated device has ended"),
-    ):
+    with played((emulator(),), "input()") as devices, pytest.raises(UserError, match="an emulated device has ended"):
         devices.order("robot stop")
 
 

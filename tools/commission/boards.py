@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from shearloop.daemon.commissioning import Line
+from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.sensing.sessions import fingertip_table
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
@@ -40,7 +41,7 @@ def measure(context: Context) -> Measured:
     """Return the stage's lines."""
     config = context.config
     if not config.fingertips and config.load_cell is None:
-        raise UserError("the configuration has no fingertip and no load cell, so that stage 6 measures nothing")
+        return Measured(unmeasured(config))
     lines: list[Line] = []
     context.operator.act("See that nothing touches the fingertips and that the load cell carries no load")
     with ExitStack() as opened:
@@ -56,7 +57,24 @@ def measure(context: Context) -> Measured:
             )
         if load is not None and config.load_cell is not None:
             lines += _weigh(context, load, config.load_cell.rate_hz)
-        return Measured([*lines, *_clocks(context, fingertips, load)])
+        return Measured([*lines, *_clocks(context, fingertips, load), *unmeasured(config)])
+
+
+def unmeasured(config: DaemonConfig) -> list[Line]:
+    """Return the lines on devices that no press shows, and on boards that are not configured."""
+    lines: list[Line] = []
+    if not config.fingertips:
+        lines.append(Line(what="fingertips", value="none is configured"))
+    if config.load_cell is None:
+        lines.append(Line(what="load cell", value="none is configured"))
+    if config.gripper is not None:
+        why = "a press on the tool moves no finger"
+        bound = "its error is at most the time of an exchange, which stage 2 measures, and the delay of a URCap"
+        lines.append(Line(what="clock of the gripper", value=f"not measured: {why}; {bound}"))
+    if config.skin is not None:
+        cure = "`shearloop doctor` examines its instruments, and `shearloop skin calibrate` makes its scale"
+        lines.append(Line(what="skin", value=f"not measured by a commissioning; {cure}"))
+    return lines
 
 
 def put_between(context: Context) -> Played:

@@ -60,10 +60,10 @@ class Sensors:
 
 
 def measure(context: Context) -> Measured:
-    """Return the stage's lines and the largest torque that they cover."""
+    """Return the stage's lines and the largest torque that they cover, none without a load cell."""
     cell = context.config.load_cell
     if cell is None:
-        raise UserError("stage 7 needs a load cell on the tool: add `load_cell` to the configuration, or leave it out")
+        return Measured([Line(what="tool and spring", value="not measured: no load cell is configured")])
     spring = context.operator.number(
         "Mount the tool on a spring of known stiffness; that of spring and pads together in N·m/rad",
         *(0.05, 50.0),

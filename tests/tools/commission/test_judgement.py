@@ -6,11 +6,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
 from shearloop.bank.channels import PAPER_TABLE
+from shearloop.daemon.commissioning import NOTHING_SUPPLIED
+from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.tools.commission import boards, tool
 from shearloop.tools.commission.boards import judge_frames, judge_load
 from shearloop.tools.commission.bounds import LARGEST_RAD, LARGEST_RAD_PER_S, bounded
 from shearloop.tools.commission.curves import middle_s, step_s
@@ -329,3 +333,17 @@ def test_a_straight_move_that_the_watchdog_alone_ends_keeps_the_rigs_watchdog_an
     assert alone.watchdog_hz == DELIVERED.watchdog_hz
     assert alone.lease_s > 2.0 / DELIVERED.watchdog_hz
     assert (alone.limits, alone.command_timeout_s) == (DELIVERED.limits, DELIVERED.command_timeout_s)
+
+
+def test_what_a_rig_without_boards_cannot_measure_is_noted_and_raises_no_torque(tmp_path):
+    path = tmp_path / "rig.yaml"
+    source, daq = {"serial": {"serial_number": "1"}}, {"adc": {"device": {"serial_number": "2"}}}
+    skin = {"source": source, "daq": daq, "calibration": "skin.yaml"}
+    gripper = {"socket": {"host": "192.168.1.10"}}
+    path.write_text(yaml.safe_dump({"skin": skin, "robot": "ur.yaml", "gripper": gripper}))
+    context = SimpleNamespace(config=load_daemon_config(path))
+    of_boards, of_tool = boards.measure(context), tool.measure(context)
+    assert [line.what for line in of_boards.lines] == ["fingertips", "load cell", "clock of the gripper", "skin"]
+    assert [line.what for line in of_tool.lines] == ["tool and spring"]
+    assert {line.verdict for line in (*of_boards.lines, *of_tool.lines)} == {"noted"}
+    assert (of_boards.supplies, of_tool.supplies) == (NOTHING_SUPPLIED, NOTHING_SUPPLIED)

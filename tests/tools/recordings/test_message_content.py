@@ -12,6 +12,7 @@ from shearloop.daemon.messaging.messages import TOPICS, wire_map
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.schema import basic_identity
 from shearloop.daemon.recorder.writer import McapFile
+from shearloop.drivers.serial_sensor import InputKind
 from shearloop.tools.recordings import message_content, replay
 from shearloop.tools.recordings.message_content import ContentError, columns, read_content
 from tests.sample_messages import sample
@@ -20,7 +21,7 @@ from tests.tools.recordings.test_damage import recorded
 
 STRANGE: list[Any] = [
     *(2**70, -(2**70), 2**63, 10**400, 1e308, -1, 1.5, True, None, "x", "\ud800", [], [[1, 2], [3]], [1, [2]], [None]),
-    *([2**64], ["x"], [True], {}, {"a": [1]}),
+    *([2**64], ["x"], [True], {}, {"a": [1]}, [math.inf], [1.0, None, math.nan], [1, math.inf]),
 ]
 PYTHON = {"number": float, "integer": int, "boolean": bool, "string": str, "object": dict, "array": list}
 
@@ -40,12 +41,21 @@ def test_each_key_takes_its_own_type_alone(topic):
             if column.kind in ("integer", "number"):
                 assert math.isfinite(found or 0)
                 assert column.kind == "number" or abs(found) < 2**63
+            if column.kind == "array":
+                assert all(math.isfinite(one or 0) for one in found or []), (key, value)
         # Without a source it is an import's.
         if not column.optional and key != "source":
             with pytest.raises(ContentError, match=f"lacks the key '{key}'"):
                 read_content(name, json.dumps({one: content[one] for one in content if one != key}).encode())
     with pytest.raises(ContentError, match="unknown key 'other'"):
         read_content(name, json.dumps({**content, "other": 1}).encode())
+
+
+def test_the_bytes_of_an_input_are_latin_1_text():
+    content = {"t_mono_ns": 1, "kind": InputKind.DATA.value, "data": "".join(map(chr, range(256)))}
+    assert read_content("input.right", json.dumps(content).encode())["data"].encode("latin-1") == bytes(range(256))
+    with pytest.raises(ContentError, match="data is '1€', not bytes as Latin-1 text"):
+        read_content("input.right", json.dumps({**content, "data": "1€"}).encode())
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "mat", "rrd", "lerobot", "replay"])

@@ -54,6 +54,7 @@ class GainSpread:
 
     `between` is of one grip to the next, and as certain as from this number of `recordings`; `within` is of twists
     of one grip. The first twist after a grip differs from the later ones by `first`, with the deviation `first_spread`.
+    `drift` is by how much more one half of a grip's twists deviates from the other than grips from each other.
     `zero` is of the torque without motion, as a share of the load: 0 for the calibration's tool.
     """
 
@@ -64,6 +65,7 @@ class GainSpread:
     zero: float = 0.0
     first: float = 0.0
     first_spread: float = FIRST_SPREAD
+    drift: float = 0.0
 
     @classmethod
     def fit(
@@ -73,12 +75,14 @@ class GainSpread:
         grips: IntArray,
         is_first: BoolArray,
         left_out: Sequence[float],
+        halves: Sequence[float],
         fingertips: int,
     ) -> Self:
         """Return the spread from (n,) predictions of left-out frames and their truth, in the order of time.
 
         `grips` are the number of each one's grip, `is_first` whether it belongs to the grip's first twist, `left_out`
-        logarithms of the gains of grips that were left out of the fit. The fingertips share the prior.
+        logarithms of the gains of grips that were left out of the fit, `halves` those of halves of a grip's twists. The
+        fingertips share the prior.
         """
         noise: list[FloatArray] = []
         firsts: list[float] = []
@@ -115,7 +119,14 @@ class GainSpread:
             first=first,
             first_spread=_pooled(first_prior, _PRIOR_RECORDINGS, [(one - first) ** 2 for one in firsts]),
         )
-        return prior._with_recordings([one**2 for one in left_out])
+        spread = prior._with_recordings([one**2 for one in left_out])
+        between_halves = float(np.mean(np.square(halves))) if len(halves) else 0.0
+        return replace(spread, drift=math.sqrt(max(between_halves - spread.between**2, 0.0)))
+
+    @property
+    def is_of_another_tool(self) -> bool:
+        """Whether the torque is of a tool that was not calibrated, so that nothing is known of its own gain."""
+        return self.zero > 0.0
 
     def _with_recordings(self, squares: Sequence[float]) -> Self:
         """Return the spread after recordings with these squares of the gain's logarithm."""
@@ -149,40 +160,36 @@ class GainSpread:
         loaded = np.concatenate(twists)
         is_first = np.array([first is not None and bool(first[rows].any()) for rows in twists])
         # Variances of the logarithm: the part common to successive twists, and each twist's part.
-        common = _ALIKE * self.within**2
-        own = self.within**2 - common + np.where(is_first, self.first_spread**2, 0.0)
+        alike = _ALIKE * self.within**2
+        own = self.within**2 - alike + np.where(is_first, self.first_spread**2, 0.0)
+        # The spread of first twists holds how far a single one deviates.
+        only_first = bool(is_first.all())
+        common = alike if only_first else alike + self.drift**2
         whole = parts.sum(axis=1)
-        spread = self._with_this(whole[loaded], truth[loaded], common + float(own.mean()) / len(twists))
-        known = partial(self._equations, parts, truth, twists, is_first, common, own, bounded=bounded)
-        prior = known(spread.between)
-        x = prior.solve()
-        slope = prior.slopes(x)
-        covariance: FloatArray = np.asarray(np.linalg.inv(slope.T @ slope))
-        m = parts.shape[1]
-        before = _relative_error(np.diag(prior.prior**2), parts[loaded], x)
-        left = _relative_error(covariance, parts[loaded], x)
-        if left > _MOST_LEFT * before:
-            raise CalibrationError(
-                "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
-                "these are too small; twist further, and several times"
-            )
-        shrunk = x
+        of_each = float(own.mean()) / len(twists)
+        equations = partial(self._equations, parts, truth, twists, is_first, own, bounded=bounded)
+        # A gain that drifts is no reason to refuse: such twists are followed less.
+        steady = self._with_this(whole[loaded], truth[loaded], alike + of_each)
+        equations(alike, steady.between).check_informative(parts[loaded])
+        spread = self._with_this(whole[loaded], truth[loaded], common + of_each)
+        known = partial(equations, common)
+        with_prior = known(spread.between)
+        shown = with_prior.solve()
+        covariance = with_prior.covariance(shown)
+        of_twists = _relative_error(covariance, parts[loaded], shown)
+        followed, left = shown, of_twists
         # On another tool nothing says that the gain is the calibration's.
-        if not self.zero:
+        if not self.is_of_another_tool:
             seen = self._deviation(whole, truth, twists, is_first, common, own)
-            shrunk = known(min(spread.between, seen.beyond_chance)).solve()
-            if m > 1 and prior.misfit(shrunk) - prior.misfit(x) > _BY_CHANCE * m:
-                # The fingertips' gains have changed against each other, which their sum does not show.
-                shrunk = x
-            left = math.hypot(left, _log_total(parts[loaded], x) - _log_total(parts[loaded], shrunk))
-            if is_first.all():
-                # How far first twists deviate is known from few grips: one that may be chance narrows nothing.
-                left = math.sqrt((1.0 - seen.unchanged) * left**2 + seen.unchanged * spread.between**2)
-        factors = np.exp(shrunk[:m])
+            followed = _beyond_chance(known, with_prior, shown, min(spread.between, seen.beyond_chance))
+            not_followed = _log_total(parts[loaded], shown) - _log_total(parts[loaded], followed)
+            left = seen.spread_left(math.hypot(of_twists, not_followed), spread.between, only_first=only_first)
+        m = parts.shape[1]
+        factors = np.exp(followed[:m])
         return GainCorrection(
             factors,
             factors * np.sqrt(np.diag(covariance))[:m],
-            float(shrunk[m]),
+            float(followed[m]),
             replace(spread, between=min(left, spread.between)),
             len(twists),
         )
@@ -218,8 +225,8 @@ class GainSpread:
         truth: FloatArray,
         twists: Sequence[IntArray],
         is_first: BoolArray,
-        common: float,
         own: FloatArray,
+        common: float,
         between: float,
         *,
         bounded: bool,
@@ -286,6 +293,15 @@ class _Deviation:
         """How likely an unchanged gain is against a changed one, 1 within chance (Akaike's relative likelihood)."""
         return min(1.0, math.exp((_BY_CHANCE - self.log_gain**2 / self.variance) / 2.0))
 
+    def spread_left(self, of_twists: float, before: float, *, only_first: bool) -> float:
+        """Return the gain's spread after these twists, which leave `of_twists`, from the one before.
+
+        How far first twists deviate is known from few grips: one that may be chance narrows nothing.
+        """
+        if not only_first:
+            return of_twists
+        return math.sqrt((1.0 - self.unchanged) * of_twists**2 + self.unchanged * before**2)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Equations:
@@ -309,6 +325,21 @@ class _Equations:
         if x is None:
             raise CalibrationError("the gain of these twists does not settle; twist further, and several times")
         return x
+
+    def covariance(self, x: FloatArray) -> FloatArray:
+        """Return the covariance of the unknowns (m + 1, m + 1) at x."""
+        slopes = self.slopes(x)
+        return np.asarray(np.linalg.inv(slopes.T @ slopes))
+
+    def check_informative(self, loaded: FloatArray) -> None:
+        """Raise CalibrationError where twists leave the sum of the loaded parts (n, m) as uncertain as the prior."""
+        x = self.solve()
+        before = _relative_error(np.diag(self.prior**2), loaded, x)
+        if _relative_error(self.covariance(x), loaded, x) > _MOST_LEFT * before:
+            raise CalibrationError(
+                "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
+                "these are too small; twist further, and several times"
+            )
 
     def misfit(self, x: FloatArray) -> float:
         """Return the sum of the squared residuals without those of the prior."""
@@ -416,6 +447,22 @@ def log_gain(predicted: FloatArray, truth: FloatArray) -> float | None:
     """
     along = float(predicted @ truth)
     return math.log(along / float(predicted @ predicted)) if along > 0 else None
+
+
+def _beyond_chance(
+    known: "Callable[[float], _Equations]", equations: "_Equations", shown: FloatArray, beyond_chance: float
+) -> FloatArray:
+    """Return what is followed of the unknowns that twists have `shown`: what is not explained by chance.
+
+    `known` returns the equations for a spread of the gain from grip to grip, `beyond_chance` is the one that the sum of
+    the fingertips shows.
+    """
+    shrunk = known(beyond_chance).solve()
+    m = len(shown) - 1
+    if m > 1 and equations.misfit(shrunk) - equations.misfit(shown) > _BY_CHANCE * m:
+        # The fingertips' gains have changed against each other, which their sum does not show.
+        return shown
+    return shrunk
 
 
 def _least_squares(

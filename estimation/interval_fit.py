@@ -1,13 +1,13 @@
 """Fits a regressor with its intervals, by frames left out of the fit."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.gain import LOADED_SHARE, GainSpread, find_twists, first_twists, loaded_log_gain
+from shearloop.estimation.gain import LOADED_SHARE, GainSpread, find_twists, first_twists, loaded_log_gain, log_gain
 from shearloop.estimation.interval_regressor import IntervalRegressor, Regressor, reported_values
 from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange, student_inflation
 from shearloop.estimation.left_out import LeftOut, later_splits, left_out_blocks, left_out_groups
@@ -19,6 +19,8 @@ INFLATION = 1.05
 LEAST_FRAMES = 8
 # This share of the loads must lie within their intervals.
 _LEAST_COVERED = 0.75
+# Twists in each half of a grip that shows how the gain drifts: fewer do not determine a fit of the motion.
+_LEAST_IN_HALF = 3
 
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
@@ -89,7 +91,8 @@ def fit_interval_regressor(
     gain = GainSpread()
     if recordings is not None:
         gains = _gains_of_recordings(features, values, recordings, refit)
-        gain = _spread_of_gain(values, recordings, rows, reported, gains, fingertips)
+        halves = _gains_of_halves(features, values, recordings, refit)
+        gain = _spread_of_gain(values, recordings, rows, reported, gains, halves, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain)
 
 
@@ -119,19 +122,47 @@ def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: I
     return gains
 
 
+def _gains_of_halves(features: FloatArray, values: FloatArray, grips: IntArray, refit: Refit) -> list[float]:
+    """Return the logarithm of the gain of each half of a grip's twists, as the rest predicts it.
+
+    `grips` (n,) is the number of each row's grip. Grips with fewer than three twists in a half have none.
+    """
+    gains: list[float] = []
+    for own in (np.flatnonzero(grips == grip) for grip in np.unique(grips)):
+        twists = [own[rows] for rows in find_twists(values[own])]
+        for half, out in _halves(own, twists):
+            part = refit(np.setdiff1d(np.arange(len(values)), out))
+            gain = log_gain(reported_values(part, part.predict(features[half])), values[half])
+            if gain is not None:
+                gains.append(gain)
+    return gains
+
+
+def _halves(rows: IntArray, twists: Sequence[IntArray]) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield the loaded rows and all rows of each half of a grip's twists; an odd number is cut both ways."""
+    n = len(twists)
+    for middle in sorted({n // 2, (n + 1) // 2}):
+        if min(middle, n - middle) < _LEAST_IN_HALF:
+            continue
+        first_of_second = (twists[middle - 1][-1] + twists[middle][0] + 1) // 2
+        yield np.concatenate(twists[:middle]), rows[rows < first_of_second]
+        yield np.concatenate(twists[middle:]), rows[rows >= first_of_second]
+
+
 def _spread_of_gain(
     values: FloatArray,
     recordings: IntArray,
     rows: IntArray,
     predicted: FloatArray,
     gains: Sequence[float],
+    halves: Sequence[float],
     fingertips: int,
 ) -> GainSpread:
-    """Return the spread of the gain from the predictions of left-out rows, and the gains of left-out recordings."""
+    """Return the spread of the gain from the predictions of left-out rows, and gains of recordings and halves."""
     order = np.argsort(rows, kind="stable")
     rows, predicted = rows[order], predicted[order]
     is_first = first_twists(values, recordings)
-    return GainSpread.fit(predicted, values[rows], recordings[rows], is_first[rows], gains, fingertips)
+    return GainSpread.fit(predicted, values[rows], recordings[rows], is_first[rows], gains, halves, fingertips)
 
 
 def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:

@@ -54,12 +54,12 @@ def test_intervals_grow_with_the_load_alone():
     assert max(free[1:]) == pytest.approx(1.05 * noise_nm, rel=0.22)
 
 
-def spread_of(factors, left_out=(), first=1.0):
+def spread_of(factors, left_out=(), first=1.0, halves=()):
     """Return the spread learned from one grip of twists whose truth is these factors times the prediction."""
     truth = np.concatenate([factor * TWISTS[:8] for factor in (first, *factors)])
     predicted = np.tile(TWISTS[:8], 1 + len(factors))
     grips = np.zeros(len(truth), dtype=int)
-    return GainSpread.fit(predicted, truth, grips, first_twists(truth, grips), left_out, 1)
+    return GainSpread.fit(predicted, truth, grips, first_twists(truth, grips), left_out, halves, 1)
 
 
 @pytest.mark.parametrize(("gains", "bounds"), [([1.0] * 6, (0.0, 0.7)), ([0.4, 2.5] * 3, (1.5, 6.0))])
@@ -73,7 +73,7 @@ def test_the_gain_of_a_tool_does_not_count_as_a_difference_between_twists():
     factors = np.repeat([0.5, 1.0, 2.0], 5 * 8)
     predicted = np.tile(TWISTS[:8], 15)
     truth, grips = factors * predicted, np.repeat([0, 1, 2], 5 * 8)
-    spread = GainSpread.fit(predicted, truth, grips, first_twists(truth, grips), [], 1)
+    spread = GainSpread.fit(predicted, truth, grips, first_twists(truth, grips), [], [], 1)
     assert spread.within <= 0.05
 
 
@@ -169,6 +169,43 @@ def test_twists_that_disagree_correct_little_or_are_refused():
     assert factors[0] > 1.4 > factors[1] > factors[2] > 1.0
     with pytest.raises(CalibrationError, match="leave the gain as uncertain as it was"):
         replace(spread, within=1.5).correct(parts, TWISTS[:8], twists, bounded=False)
+
+
+def test_halves_of_a_grip_that_differ_more_than_grips_do_show_a_drift():
+    prior = PRIOR_SPREADS[1]
+    assert spread_of([1.0] * 4).drift == 0.0
+    assert spread_of([1.0] * 4, halves=[prior, -prior]).drift == pytest.approx(0.0, abs=1e-9)
+    assert spread_of([1.0] * 4, halves=[0.7, -0.1]).drift == pytest.approx(math.sqrt(0.25 - prior**2))
+
+
+def test_several_twists_of_a_gain_that_drifts_are_followed_less_and_the_first_one_as_without():
+    steady = GainSpread(between=0.3, within=0.05, noise_nm=0.001, first_spread=0.1)
+    drifting, twists = replace(steady, drift=0.4), find_twists(TWISTS[:24])
+    parts, first = TWISTS[:24, None] / 1.7, np.arange(24) < 8
+    found, alone = (
+        [
+            one.correct(parts[:end], TWISTS[:end], twists[:n], first=first[:end], bounded=False)
+            for one in (steady, drifting)
+        ]
+        for end, n in ((24, 3), (8, 1))
+    )
+    assert found[0].factors[0] == pytest.approx(1.7, abs=0.05)
+    assert 1.0 <= found[1].factors[0] < 1.3
+    assert found[1].spread.between > 2 * found[0].spread.between
+    assert alone[0].factors == alone[1].factors
+    assert alone[0].spread.between == alone[1].spread.between
+
+
+@pytest.mark.parametrize(("begins_at", "drifts"), [(1.0, False), (3.0, True)])
+def test_a_gain_that_falls_over_a_grip_is_a_drift(begins_at, drifts):
+    """Ten twists, of which the gel shows less and less."""
+    gains = np.repeat(np.geomspace(begins_at, 1.0, 10), 8)
+    noise = np.random.default_rng(0).normal(0, 5e-4, 80)
+    regressor = fit_interval_regressor(
+        (TWISTS / gains + noise)[:, None], TWISTS, CensoredRidge.fit, strengths=(1e-6,), recordings=np.zeros(80, int)
+    )
+    assert (regressor.gain.drift > 0.2) is drifts
+    assert drifts or regressor.gain.drift == 0.0
 
 
 def test_a_gain_far_from_the_prior_is_not_clipped():

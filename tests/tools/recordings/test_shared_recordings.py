@@ -30,6 +30,8 @@ from shearloop.studies.slices.novelty import NoveltyDetector
 from shearloop.studies.slices.series import SliceSeries, read_slices
 from shearloop.tools.evaluate import estimate_series, figures_by_load, figures_of, invalid_reasons
 from shearloop.tools.frame_series import part_of, read_series, series_of
+from shearloop.tools.leave_out import Recipe, plan_left_out
+from shearloop.tools.parallel import SerialExecutor
 from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import find_streams, import_mat, read_stream
 
@@ -181,6 +183,15 @@ def test_a_grip_much_stronger_than_the_calibrated_one_is_refused_and_evaluate_sa
     unchecked.save(tmp_path / "older.cal")
     said = ran("evaluate", tmp_path / "older.cal", tmp_path / "20241202_171704.mcap").err
     assert "older.cal assumes that every grip is about as strong as in the calibration" in said
+
+
+def test_three_twists_of_a_gain_that_drifts_make_later_ones_no_worse(twists_file):
+    """The left fingertip's gain falls by half over the grip, so that its first twists say little of the last ones."""
+    left = read_series(twists_file, ("left",))
+    found = plan_left_out("twists", Recipe("motion_regression"), left, ["a"], adapt_twists=3).judge(SerialExecutor())
+    before, after = (figures_by_load(tracks)["loaded"] for tracks in (found.before, found.all_tracks))
+    assert after["rmse_nm"] < 1.05 * before["rmse_nm"]
+    assert after["coverage_95"] > 0.9
 
 
 def test_later_torque_slices(slices, earlier):

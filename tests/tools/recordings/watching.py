@@ -111,7 +111,8 @@ class Watched:
         published, rows = by_stream(recorded.published), recorded.by_stream()
         for received, expected in ((self.listened, topics), (self.paged, topics - not_paged)):
             found = by_stream(received.messages)
-            assert {topic for topic, _, _ in found} == expected
+            came = {topic for topic, _, _ in found}
+            assert came == expected, f"missing: {expected - came}, too many: {came - expected}"
             for stream, content in found.items():
                 # The recording ends before the daemon says so.
                 row = None if stream[0] == "daemon.end" else rows[stream]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -133,6 +134,22 @@ def test_values_that_cannot_be_kept_and_files_that_cannot_be_written_are_errors(
         motion_calibration.save(tmp_path / "none" / "x.cal")
 
 
+def test_a_file_of_version_0_3_0_loads_without_what_it_does_not_hold(saved, motion_calibration, recorded, tmp_path):
+    def older(member, content):
+        if member != "calibration.yaml":
+            return content
+        header = yaml.safe_load(content)
+        del header["content"]["learned"], header["content"]["torque"]["regressor"]["drift"]
+        return yaml.safe_dump(header, sort_keys=False).encode()
+
+    loaded = Calibration.load(rewritten(saved, tmp_path / "older.cal", older))
+    assert not loaded.learned.complete
+    assert not len(loaded.learned.digests)
+    assert loaded.gain_regressor().gain.drift == 0.0
+    part = recorded.between(0, 120)
+    assert follow(loaded, part) == follow(motion_calibration, part)
+
+
 def test_assumptions_are_kept(motion_calibration, recorded, tmp_path):
     assert motion_calibration.assumptions == ()
     assert motion_calibration.assumption_text == ""
@@ -182,7 +199,14 @@ def test_a_header_with_a_wrong_value_is_refused(small, find, new, problem, tmp_p
 
 
 @pytest.mark.parametrize(
-    "array", ["scale", "torque.regressor.mean_feature", "validators.0.noise", "torque.regressor.point.weights"]
+    "array",
+    [
+        "scale",
+        "torque.regressor.mean_feature",
+        "validators.0.noise",
+        "torque.regressor.point.weights",
+        "learned.digests",
+    ],
 )
 @pytest.mark.parametrize(
     "change",

@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from shearloop.emulators.ur_arm import Arm, PathError, WristPlant, frame_of_pose
-from shearloop.emulators.urscript import Program, ProgramEndedError, Registers
+from shearloop.emulators.urscript import Interrupts, Program, ProgramEndedError, Registers
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 MODE_POWER_OFF, MODE_IDLE, MODE_RUNNING = 3, 5, 7
@@ -66,6 +66,8 @@ class Robot:
         self.protects_abrupt_ends = False
         # Whether any program that ends by itself does.
         self.protects_ends = False
+        # Where the threads of the next program are interrupted.
+        self.interrupts: Interrupts | None = None
 
     def step(self, dt_s: float) -> None:
         """Run one control cycle."""
@@ -121,7 +123,9 @@ class Robot:
             return
         self.end_program("a new script arrived")
         try:
-            self._program = Program(text, self.registers, self.arm, self.log.append, e_series=self.is_e_series)
+            self._program = Program(
+                text, self.registers, self.arm, self.log.append, e_series=self.is_e_series, interrupts=self.interrupts
+            )
         except SyntaxError as error:
             self._note("script-refused", str(error))
             return

@@ -5,6 +5,9 @@ cycles. Expressions are Python's already, but for poses (`p[…]`). A program do
 wrong arguments, or with a block that has no end. It plays the functions of our script, and those that ur-rtde's needs
 for the same commands, and ends when it calls another one. It also ends, as on a controller, when two threads move the
 arm, or when a watchdog is not fed. Scopes are simpler: a variable is global where it is declared so.
+
+A thread runs until it has used up a cycle. A controller also interrupts one that has computed for too long, until the
+next cycle (UR's page "Thread scheduling"). `Interrupts` decides where, between statements outside critical sections.
 """
 
 import ast
@@ -26,6 +29,8 @@ from shearloop.emulators.urscript_names import E_SERIES_ONLY, check_names
 # An event's name and detail.
 Event = tuple[str, str]
 Thread = Iterator[None]
+# Whether a thread, by its number, is interrupted now. The main one is number 1.
+Interrupts = Callable[[int], bool]
 
 # The first integer register of each half.
 COMMANDS = ("input_int_register_0", "input_int_register_24")
@@ -89,8 +94,10 @@ class _Expressions(ast.NodeTransformer):
 
 
 @lru_cache(maxsize=8)
-def translate(text: str) -> tuple[CodeType, str, frozenset[str]]:
+def translate(text: str, *, interruptible: bool = False) -> tuple[CodeType, str, frozenset[str]]:
     """Return the compiled Python of a program, the name of its main function, and the controller's functions in it.
+
+    An `interruptible` program asks before each statement whether its thread is interrupted.
 
     Raises:
         SyntaxError: a controller would not start it.
@@ -111,9 +118,12 @@ def translate(text: str) -> tuple[CodeType, str, frozenset[str]]:
             if depth < 0:
                 raise SyntaxError("an end has no block")
             continue
-        lines.append("    " * (depth - line.startswith(("elif ", "else:"))) + _statement(line))
+        goes_on = line.startswith(("elif ", "else:"))
+        if interruptible and depth > 0 and not goes_on:
+            lines.append("    " * depth + "while is_interrupted(): yield")
+        lines.append("    " * (depth - goes_on) + _statement(line))
         if line.endswith(":"):
-            depth += not line.startswith(("elif ", "else:"))
+            depth += not goes_on
             lines += ["    " * depth + one for one in _opening(line, declared)]
     if depth != 0:
         raise SyntaxError("a block has no end")
@@ -153,17 +163,24 @@ class Program:
     """One run of a program, from its upload to its end."""
 
     def __init__(
-        self, text: str, registers: Registers, arm: Arm, log: Callable[[str], None], *, e_series: bool = True
+        self,
+        text: str,
+        registers: Registers,
+        arm: Arm,
+        log: Callable[[str], None],
+        *,
+        e_series: bool = True,
+        interrupts: Interrupts | None = None,
     ) -> None:
         """Begin; SyntaxError where the text is no program. `log` gets the messages for the pendant's log.
 
         Without `e_series` the controller lacks the functions that came with that generation.
         """
-        self._registers, self._arm, self._log = registers, arm, log
+        self._registers, self._arm, self._log, self._interrupts = registers, arm, log, interrupts
         self._step_s = 0.0
         self._events: list[Event] = []
         self._watchdogs: dict[str, float] = {}
-        code, main, called = translate(text)
+        code, main, called = translate(text, interruptible=interrupts is not None)
         if not e_series and (unknown := called & E_SERIES_ONLY):
             raise SyntaxError(f"name {min(unknown)} is not defined")
         names = self._functions()
@@ -184,6 +201,7 @@ class Program:
             "write_output_float_register": partial(self._write_output, "double"),
             "write_output_integer_register": partial(self._write_output, "int"),
             "get_actual_joint_positions": lambda: [*map(float, arm.q_rad)],
+            "get_actual_joint_speeds": lambda: [*map(float, arm.measured_rad_per_s)],
             "get_tcp_force": lambda: [*map(float, arm.wrench)],
             "get_steptime": lambda: self._step_s,
             "movel": lambda pose, a, v: self._move(arm.move_to, np.array(pose), v, a),
@@ -225,6 +243,10 @@ class Program:
                 raise ProgramEndedError("it has run to its end") from None
         except (NameError, TypeError, ValueError, IndexError, ArithmeticError) as error:
             raise ProgramEndedError(f"the emulated controller cannot play this: {error}") from error
+
+    def is_interrupted(self) -> bool:
+        """Return whether the running thread does nothing more in this cycle."""
+        return self._critical == 0 and self._interrupts is not None and self._interrupts(self._running)
 
     def run(self, function: Callable[[], Thread]) -> int:
         """Start a thread in the next cycle and return its number."""

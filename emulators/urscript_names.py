@@ -9,7 +9,7 @@ from collections.abc import Iterator, Set
 # The parameters of the functions that the emulated controller plays; those in brackets may be left out.
 _PLAYED = """
     enter_critical() exit_critical() halt() sync()
-    get_actual_joint_positions() get_steptime() get_tcp_force() zero_ftsensor()
+    get_actual_joint_positions() get_actual_joint_speeds() get_steptime() get_tcp_force() zero_ftsensor()
     kill(thread) norm(a) sqrt(f) textmsg(s1 [s2])
     speedj(qd a [t]) movel(pose [a v t r]) stopj(a) stopl(a [aRot])
     read_input_float_register(address) read_input_integer_register(address)
@@ -28,7 +28,7 @@ _NOT_PLAYED = """
     set_target_payload set_tcp speedl teach_mode tool_contact
 """
 # What `translate` writes for statements.
-_INSERTED = frozenset({"put", "count_loop"})
+_INSERTED = frozenset({"put", "count_loop", "is_interrupted"})
 # Functions from PolyScope 5 on.
 E_SERIES_ONLY = frozenset({"zero_ftsensor", "get_steptime"})
 

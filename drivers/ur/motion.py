@@ -347,6 +347,9 @@ def clip_wrist(asked: WristSpeed, sample: RtdeSample, settings: UrSettings) -> t
         asked.acceleration_rad_per_s2, limits.wrist_acceleration_rad_per_s2, "acceleration", reasons
     )
     braking = limits.wrist_acceleration_rad_per_s2.inner
+    if asked.rad_per_s == 0 and acceleration < braking:
+        acceleration = braking
+        reasons.append(f"a wrist that is to stand brakes at {braking:g} rad/s²")
     room = max(_room(asked.rad_per_s, sample, limits), 0.0)
     lag_s = _NO_OVERSHOOT * settings.reaction_s
     brakeable = braking * (math.sqrt(lag_s**2 + 2 * room / braking) - lag_s)
@@ -369,11 +372,12 @@ def clip_wrist(asked: WristSpeed, sample: RtdeSample, settings: UrSettings) -> t
 def clip_stop(asked: float, sample: RtdeSample, settings: UrSettings) -> float:
     """Return a deceleration (rad/s²) between the needed one and the hard limit.
 
-    The needed one keeps the wrist within its range and ends the fastest joint's motion within `LONGEST_STOP_S`.
+    The needed one is the inner limit at least, as in the script on the robot. It keeps the wrist within its range and
+    ends the fastest joint's motion within `LONGEST_STOP_S`.
     """
-    brisk = max(asked, sample.fastest_rad_per_s / LONGEST_STOP_S)
-    safe = _safe_ramp(brisk, 0.0, sample, settings)
-    return min(safe, settings.limits.wrist_acceleration_rad_per_s2.hard)
+    bound = settings.limits.wrist_acceleration_rad_per_s2
+    brisk = max(asked, bound.inner, sample.fastest_rad_per_s / LONGEST_STOP_S)
+    return min(_safe_ramp(brisk, 0.0, sample, settings), bound.hard)
 
 
 def clip_linear(asked: MoveLinear, limits: UrLimits) -> tuple[MoveLinear, tuple[str, ...]]:

@@ -1,14 +1,27 @@
 """An arm whose controller runs a control script, without a process and a clock."""
 
 import dataclasses
+import math
 
-from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
+import pytest
+
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
 from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, control_program
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.emulators.ur_robot import Robot
 from tests.drivers.ur import robots
-from tests.drivers.ur.handler_bench import AT_REST, CYCLE_NS, FakeArm
-from tests.drivers.ur.robots import DELIVERED
+from tests.drivers.ur.handler_bench import AT_REST, CYCLE_NS, FakeArm, HandlerBench, enabled
+from tests.drivers.ur.robots import DELIVERED, control_script
+
+LIMITS, TIMEOUT_S = DELIVERED.limits, DELIVERED.command_timeout_s
+FASTEST = LIMITS.wrist_speed_rad_per_s.inner
+# No stop is gentler.
+FLOOR = LIMITS.wrist_acceleration_rad_per_s2.inner
+HARDEST = LIMITS.wrist_acceleration_rad_per_s2.hard
+# From the last decision to rest.
+PROMISED_S = 0.2
+# Until a command takes effect.
+TWO_CYCLES_S = 2 * CYCLE_NS / 1e9
 
 # Of the controller, in a cycle of the worker.
 STEPS = 4
@@ -93,3 +106,61 @@ class ScriptedArm(FakeArm):
 
     def arm_watchdog(self) -> bool:
         return self._write(robots.SET_WATCHDOG, self._settings.watchdog_hz)
+
+
+def guarded_arm(robot: Robot | None = None) -> ScriptedArm:
+    """Return an arm that runs our script, without a worker; its watchdog is fed as long as something is written."""
+    arm = ScriptedArm(control_script(DELIVERED), robot=robot)
+    arm.send_heartbeat()
+    arm.upload()
+    arm.cycle()
+    return arm
+
+
+def turn(arm: ScriptedArm, command: WristSpeed, seconds: float) -> list[RtdeSample]:
+    """Decide on a speed in each cycle, and return the samples."""
+    found = []
+    for _ in range(round(seconds / (STEPS * robots.STEP_S))):
+        arm.wrist(command, TIMEOUT_S)
+        arm.cycle()
+        found.append(arm.reading)
+    return found
+
+
+def at_full_speed(script: str) -> tuple[HandlerBench, WristSpeed]:
+    """Return a bench at the largest speed, at the moment of a decision, and the command."""
+    bench = enabled(DELIVERED, ScriptedArm(script))
+    for _ in range(50):
+        command = WristSpeed(FASTEST, LIMITS.wrist_acceleration_rad_per_s2.inner, bench.now_ns)
+        assert bench.ask(command).accepted
+        bench.run(1)
+    assert bench.wrist_speed == pytest.approx(FASTEST)
+    assert bench.ask(dataclasses.replace(command, decided_ns=bench.now_ns)).accepted
+    return bench, command
+
+
+def moving_at_full_speed(script: str, settings: UrSettings = DELIVERED) -> HandlerBench:
+    """Return a bench in a linear move at its largest speed, at the moment of the daemon's last message."""
+    bench = enabled(settings, ScriptedArm(script, settings))
+    bench.run(1)
+    x, y, z, *turned = bench.arm.robot.arm.pose
+    inner = LIMITS.linear_speed_m_per_s.inner
+    assert bench.ask(MoveLinear((x, y, z - 0.2, *turned), inner, LIMITS.linear_acceleration_m_per_s2.inner)).accepted
+    bench.run(60)
+    assert bench.state.motion == "linear"
+    assert not bench.arm.reading.rests
+    return bench
+
+
+def stands_within(arm: ScriptedArm, seconds: float) -> bool:
+    """Let cycles pass without another command, and return whether the arm then rests."""
+    for _ in range(math.ceil(1e9 * seconds / CYCLE_NS)):
+        arm.cycle()
+    return arm.reading.rests
+
+
+def send_after_another(arm: ScriptedArm, command: int, *numbers: float) -> None:
+    """Clear the command before, and write another one; nothing waits for its answer."""
+    robots.send(arm.robot, 0)
+    arm.cycle()
+    robots.send(arm.robot, command, *numbers, asynchronous=True)

@@ -1,5 +1,6 @@
 """Motions and their ends: turning, linear moves, stops."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -123,7 +124,7 @@ def test_linear_move_has_a_deadline_and_inner_limits():
 def test_stop_is_sent_at_once_and_ends_before_another_motion_begins():
     bench = turning(0.5)
     bench.arm.calls.clear()
-    assert bench.ask(Stop(2.0)).sent == Stop(2.0)
+    assert bench.ask(Stop(5.0)).sent == Stop(5.0)
     assert (bench.arm.calls, bench.arm.target) == (["wrist"], 0.0)
     bench.run(1)
     assert bench.state.motion == "stopping"
@@ -135,26 +136,30 @@ def test_stop_is_sent_at_once_and_ends_before_another_motion_begins():
 
 
 def test_gentle_stop_becomes_a_hard_one_when_the_daemon_falls_silent():
-    bench = turning(0.5)
-    assert bench.ask(Stop(0.6)).accepted
+    bench = enabled(replace(SETTINGS, silence_timeout_s=0.03))
+    assert bench.ask(WristSpeed(0.5, 4.0)).accepted
+    bench.run(30)
+    assert bench.ask(Stop(4.5)).accepted
     bench.run(1)
-    assert bench.arm.acceleration == 0.6
-    bench.run(40, daemon_alive=False)
+    assert bench.arm.acceleration == 4.5
+    bench.run(4, daemon_alive=False)
+    assert bench.state.motion == "stopping"
     assert bench.arm.acceleration == LIMITS.wrist_acceleration_rad_per_s2.hard
 
 
 def test_harder_of_two_stops_counts():
     bench = turning(0.5)
-    assert bench.ask(Stop(4.0)).sent == Stop(4.0)
-    assert bench.ask(Stop(1.0)).sent == Stop(4.0)
+    assert bench.ask(Stop(5.0)).sent == Stop(5.0)
+    assert bench.ask(Stop(4.5)).sent == Stop(5.0)
     assert bench.ask(Stop(6.0)).sent == Stop(6.0)
     assert bench.arm.acceleration == 6.0
 
 
-def test_gentlest_stop_ends_within_a_second():
+def test_gentlest_stop_brakes_at_the_inner_acceleration():
+    inner = LIMITS.wrist_acceleration_rad_per_s2.inner
     bench = turning(0.5)
-    assert bench.ask(Stop(1e-3)).sent == Stop(0.5)
-    bench.run(130)
+    assert bench.ask(Stop(1e-3)).sent == Stop(inner)
+    bench.run(math.ceil(0.5 / inner * 1e9 / CYCLE_NS) + 5)
     assert bench.state.motion == "idle"
     assert bench.wrist_speed == 0
 

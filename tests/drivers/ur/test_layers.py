@@ -2,53 +2,33 @@
 
 import dataclasses
 import itertools
+import math
 
 import pytest
 
-from shearloop.drivers.ur.messages import ARRIVED, MoveLinear, RtdeSample, Stop, WristSpeed
+from shearloop.drivers.ur.messages import ARRIVED, MoveLinear, Stop, WristSpeed
 from shearloop.drivers.ur.script import UPPER
-from shearloop.drivers.ur.settings import UrSettings
 from shearloop.emulators.ur_robot import PLAYING, Robot
 from tests.drivers.ur import robots
 from tests.drivers.ur.handler_bench import CYCLE_NS, HandlerBench, enabled
 from tests.drivers.ur.robots import DELIVERED, control_script, do
-from tests.drivers.ur.scripted_arm import STEPS, ScriptedArm
-
-LIMITS, TIMEOUT_S = DELIVERED.limits, DELIVERED.command_timeout_s
-FASTEST = LIMITS.wrist_speed_rad_per_s.inner
-HARDEST = LIMITS.wrist_acceleration_rad_per_s2.hard
-PROMISED_S = 0.2
-
-
-def guarded_arm() -> ScriptedArm:
-    """Return an arm that runs our script, without a worker; its watchdog is fed as long as something is written."""
-    arm = ScriptedArm(control_script(DELIVERED))
-    arm.send_heartbeat()
-    arm.upload()
-    arm.cycle()
-    return arm
-
-
-def turn(arm: ScriptedArm, command: WristSpeed, seconds: float) -> list[RtdeSample]:
-    """Decide on a speed in each cycle, and return the samples."""
-    found = []
-    for _ in range(round(seconds / (STEPS * robots.STEP_S))):
-        arm.wrist(command, TIMEOUT_S)
-        arm.cycle()
-        found.append(arm.reading)
-    return found
-
-
-def at_full_speed(script: str) -> tuple[HandlerBench, WristSpeed]:
-    """Return a bench at the largest speed, at the moment of a decision, and the command."""
-    bench = enabled(DELIVERED, ScriptedArm(script))
-    for _ in range(50):
-        command = WristSpeed(FASTEST, LIMITS.wrist_acceleration_rad_per_s2.inner, bench.now_ns)
-        assert bench.ask(command).accepted
-        bench.run(1)
-    assert bench.wrist_speed == pytest.approx(FASTEST)
-    assert bench.ask(dataclasses.replace(command, decided_ns=bench.now_ns)).accepted
-    return bench, command
+from tests.drivers.ur.scripted_arm import (
+    FASTEST,
+    FLOOR,
+    HARDEST,
+    LIMITS,
+    PROMISED_S,
+    STEPS,
+    TIMEOUT_S,
+    TWO_CYCLES_S,
+    ScriptedArm,
+    at_full_speed,
+    guarded_arm,
+    moving_at_full_speed,
+    send_after_another,
+    stands_within,
+    turn,
+)
 
 
 def test_worker_alone_stops_the_wrist_in_time():
@@ -78,19 +58,6 @@ def test_script_alone_stops_the_wrist_in_time(guarded):
         # A new decision turns it again.
         turn(arm, command, 0.3)
         assert arm.reading.qd_rad_per_s[5] == pytest.approx(FASTEST)
-
-
-def moving_at_full_speed(script: str, settings: UrSettings = DELIVERED) -> HandlerBench:
-    """Return a bench in a linear move at its largest speed, at the moment of the daemon's last message."""
-    bench = enabled(settings, ScriptedArm(script, settings))
-    bench.run(1)
-    x, y, z, *turn = bench.arm.robot.arm.pose
-    inner = LIMITS.linear_speed_m_per_s.inner
-    assert bench.ask(MoveLinear((x, y, z - 0.2, *turn), inner, LIMITS.linear_acceleration_m_per_s2.inner)).accepted
-    bench.run(60)
-    assert bench.state.motion == "linear"
-    assert not bench.arm.reading.rests
-    return bench
 
 
 def test_worker_alone_stops_a_linear_move_in_time():
@@ -182,11 +149,46 @@ def test_resumed_program_does_not_turn_the_wrist(worker_lives):
     assert arm.reading.rests
 
 
-def test_gentle_stop_of_the_worker_stays_gentle():
+@pytest.mark.parametrize(("asked", "carried_out"), [(5.0, 5.0), (4.0, 4.0), (1.0, FLOOR), (1e-4, FLOOR)])
+def test_stop_of_the_worker_is_as_gentle_as_asked_within_the_inner_limit(asked, carried_out):
     bench, _ = at_full_speed(control_script(DELIVERED))
-    assert bench.ask(Stop(1.0)).accepted
-    bench.run(40)
-    assert bench.wrist_speed == pytest.approx(FASTEST - 1.0 * 40 * CYCLE_NS / 1e9, abs=0.02)
+    assert bench.ask(Stop(asked)).sent == Stop(carried_out)
+    bench.run(10)
+    assert bench.wrist_speed == pytest.approx(FASTEST - carried_out * 10 * CYCLE_NS / 1e9, abs=0.02)
+
+
+@pytest.mark.parametrize("asked", [1e-4, 0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("command", [robots.SPEED_J, robots.SPEED_STOP, robots.STOP_J])
+def test_a_stop_that_a_faulty_worker_sends_is_no_gentler_than_the_inner_limit(command, asked):
+    """The program that ends a motion so slowly is fed, and the deadline has passed."""
+    arm = guarded_arm()
+    turn(arm, WristSpeed(FASTEST, 4.0), 0.3)
+    numbers = (0, 0, 0, 0, 0, 0, asked) if command == robots.SPEED_J else (asked,)
+    robots.send(arm.robot, command, *numbers, asynchronous=True)
+    assert stands_within(arm, FASTEST / FLOOR + TWO_CYCLES_S)
+
+
+@pytest.mark.parametrize("asked", [1e-4, math.nan])
+@pytest.mark.parametrize("command", [robots.SPEED_STOP, robots.STOP_J])
+def test_a_stop_of_a_straight_move_is_no_gentler_than_the_inner_limit(command, asked):
+    bench = moving_at_full_speed(control_script(DELIVERED))
+    arm = bench.arm
+    send_after_another(arm, command, asked)
+    assert stands_within(arm, arm.reading.fastest_rad_per_s / FLOOR + TWO_CYCLES_S)
+
+
+def test_a_straight_move_that_changes_its_speed_slowly_stops_in_time():
+    """The acceleration of a straight move is that of its own beginning and end; the script's stop has another one."""
+    arm = guarded_arm()
+    x, y, z, *turned = arm.robot.arm.pose
+    arm.send_heartbeat(DELIVERED.silence_timeout_s)
+    arm.run_once(robots.MOVE_L, x, y, z - 0.2, *turned, 0.1, 0.02)
+    for _ in range(250):
+        arm.send_heartbeat(DELIVERED.silence_timeout_s)
+        arm.cycle()
+    assert not arm.reading.rests
+    arm.run_once(robots.MOVE_L, x, y, z, *turned, 0.1, 1e-6)
+    assert stands_within(arm, PROMISED_S)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.09, 0.11, 0.5])
@@ -322,10 +324,11 @@ def test_a_program_that_starts_while_something_is_held_keeps_its_limits(held):
     load[5] = 1.1 * LIMITS.torque_nm.hard
     assert turn(arm, command, 0.3)[-1].rests == held
     # A new zero counts for the program too.
-    load[5] = 1.5 * LIMITS.torque_nm.hard
+    load[5] = 0.9 * LIMITS.torque_nm.hard
     turn(arm, WristSpeed(0.0, 8.0), 0.3)
-    arm.end_speed(4.0)
+    do(arm.robot, robots.SPEED_STOP, 4.0)
     do(arm.robot, robots.ZERO_FT)
+    load[5] = 1.7 * LIMITS.torque_nm.hard
     arm.send_heartbeat()
     assert not turn(arm, command, 0.3)[-1].rests
 

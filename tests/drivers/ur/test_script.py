@@ -138,7 +138,7 @@ def test_critical_sections_end_and_take_no_time():
         sections = re.findall(r"enter_critical\n(.*?)exit_critical\n", body, re.DOTALL)
         assert len(sections) == body.count("enter_critical") == body.count("exit_critical")
         for section in sections:
-            lasting = {"sync", "speedj", "movel", "stopj", "stopl", "halt", "while", "end_motion", "stop_and_halt"}
+            lasting = {"sync", "speedj", "movel", "stopj", "stopl", "halt", "while", "stop_arm", "stop_and_halt"}
             assert not names_in(section) & lasting
 
 
@@ -299,7 +299,7 @@ def test_an_unknown_command_stops_the_arm_and_ends_the_program(command):
     assert run_out(robot) == ["motion-stopped", "program-ended"]
     refused, reason = [*robot.log][-2:]
     assert refused == f"shearloop: refused command {command}"
-    assert "does not know this command" in reason
+    assert "does not carry out this command" in reason
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,16 @@ is slower: a program that ends while the arm moves may end in a protective stop.
 """
 
 import hashlib
+import math
 import sys
+from collections import defaultdict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-from shearloop.drivers.ur.settings import MOVE_GRACE_S, GenerationFacts, Six, UrSettings
+from shearloop.drivers.ur.settings import GENERATIONS, MOVE_GRACE_S, GenerationFacts, Six, UrSettings
 
 # The only version of ur-rtde whose protocol the script speaks.
 CLIENT_VERSION: Final = "1.6.5"
@@ -80,6 +83,36 @@ _CONTROL_SCRIPT: Final = Path(__file__).with_name("control.script")
 _ZEROES = "  global can_zero_wrench = True\n  def zero_wrench():\n    zero_ftsensor()\n  end\n"
 _CANNOT_ZERO = "  global can_zero_wrench = False\n  def zero_wrench():\n    sync()\n  end\n"
 
+# What is sent before the script. The watchdog is armed first.
+_HEAD: Final = """\
+def shearloop_control():
+  rtde_set_watchdog("{command_register}", {watchdog_hz}, "stop")
+  global first = {first}
+  global keeps_load = {keeps_load}
+  global load_before = {load_before}
+"""
+
+# What the script takes from the settings, under its names.
+_FROM_SETTINGS: Final[Mapping[str, Callable[[UrSettings], float]]] = {
+    "longest_turn_s": lambda settings: settings.command_timeout_s + _SLACK_S,
+    "longest_line_s": lambda settings: settings.silence_timeout_s + _SLACK_S,
+    "grace_s": lambda _: MOVE_GRACE_S,
+    "margin_rad": lambda settings: settings.limits.joints.margin_rad,
+    "lowest_rad": lambda settings: settings.limits.joints.lower_rad[5] + settings.limits.joints.margin_rad,
+    "highest_rad": lambda settings: settings.limits.joints.upper_rad[5] - settings.limits.joints.margin_rad,
+    "rest_rad_per_s": lambda settings: settings.rest_rad_per_s,
+    "inner_rad_per_s": lambda settings: settings.limits.wrist_speed_rad_per_s.inner,
+    "hard_rad_per_s": lambda settings: settings.limits.wrist_speed_rad_per_s.hard,
+    "inner_rad_per_s2": lambda settings: settings.limits.wrist_acceleration_rad_per_s2.inner,
+    "hard_rad_per_s2": lambda settings: settings.limits.wrist_acceleration_rad_per_s2.hard,
+    "inner_m_per_s": lambda settings: settings.limits.linear_speed_m_per_s.inner,
+    "inner_m_per_s2": lambda settings: settings.limits.linear_acceleration_m_per_s2.inner,
+    "hard_n": lambda settings: settings.limits.force_n.hard,
+    "hard_nm": lambda settings: settings.limits.torque_nm.hard,
+}
+# In the place of each value that belongs to a rig.
+_NO_VALUE: Final = "?"
+
 
 def why_other_client() -> str:
     """Return why the installed ur-rtde cannot drive our script, or an empty string."""
@@ -96,9 +129,11 @@ def why_other_client() -> str:
 
 
 def own_script_hash() -> str:
-    """Return the SHA-256 of the control script, without the settings' values, in hexadecimal digits."""
-    text = _CONTROL_SCRIPT.read_text(encoding="ascii")
-    return hashlib.sha256("".join((text, _ZEROES, _CANNOT_ZERO)).encode()).hexdigest()
+    """Return the SHA-256 of what is sent to robots of both generations, but for each rig's values, in hex digits."""
+    head = _HEAD.format_map(defaultdict(lambda: _NO_VALUE))
+    settings = dict.fromkeys(_FROM_SETTINGS, _NO_VALUE)
+    texts = [_program(head, settings, facts) for facts in GENERATIONS.values()]
+    return hashlib.sha256("".join(texts).encode()).hexdigest()
 
 
 def control_program(settings: UrSettings, registers: ScriptRegisters = UPPER, load: Six | None = None) -> str:
@@ -110,37 +145,22 @@ def control_program(settings: UrSettings, registers: ScriptRegisters = UPPER, lo
     `load` is the wrench in N and N·m in the base's frame before the program's start, where the gripper holds something
     and the controller zeroes its wrench then; turns about the tool's axis do not change what lies along that axis.
     """
-    named = _values(settings, registers, load)
-    values = "".join(f"  global {name} = {_urscript(value)}\n" for name, value in named.items())
-    armed = f'  rtde_set_watchdog("{registers.command}", {settings.watchdog_hz:g}, "stop")\n'
+    head = _HEAD.format(
+        command_register=registers.command,
+        watchdog_hz=f"{settings.watchdog_hz:g}",
+        first=registers.first,
+        keeps_load=load is not None,
+        load_before=f"[{', '.join(map(_float, load or (0.0,) * 6))}]",
+    )
+    values = {name: _float(value(settings)) for name, value in _FROM_SETTINGS.items()}
+    return _program(head, values, settings.facts)
+
+
+def _program(head: str, values: Mapping[str, str], facts: GenerationFacts) -> str:
+    """Return a program with these values of a rig, as literals by their names."""
+    named = "".join(f"  global {name} = {value}\n" for name, value in values.items())
     body = _CONTROL_SCRIPT.read_text(encoding="ascii")
-    return f"def shearloop_control():\n{armed}{values}{_generation(settings.facts)}{body}end\n"
-
-
-def _values(settings: UrSettings, registers: ScriptRegisters, load: Six | None) -> dict[str, int | float | bool | Six]:
-    """Return the values of the settings under the script's names for them."""
-    limits = settings.limits
-    margin_rad = limits.joints.margin_rad
-    return {
-        "first": registers.first,
-        "longest_turn_s": settings.command_timeout_s + _SLACK_S,
-        "longest_line_s": settings.silence_timeout_s + _SLACK_S,
-        "grace_s": MOVE_GRACE_S,
-        "lowest_rad": limits.joints.lower_rad[5] + margin_rad,
-        "highest_rad": limits.joints.upper_rad[5] - margin_rad,
-        "margin_rad": margin_rad,
-        "rest_rad_per_s": settings.rest_rad_per_s,
-        "inner_rad_per_s": limits.wrist_speed_rad_per_s.inner,
-        "hard_rad_per_s": limits.wrist_speed_rad_per_s.hard,
-        "inner_rad_per_s2": limits.wrist_acceleration_rad_per_s2.inner,
-        "hard_rad_per_s2": limits.wrist_acceleration_rad_per_s2.hard,
-        "inner_m_per_s": limits.linear_speed_m_per_s.inner,
-        "inner_m_per_s2": limits.linear_acceleration_m_per_s2.inner,
-        "hard_n": limits.force_n.hard,
-        "hard_nm": limits.torque_nm.hard,
-        "keeps_load": load is not None,
-        "load_before": load or (0.0,) * 6,
-    }
+    return f"{head}{named}{_generation(facts)}{body}end\n"
 
 
 def _generation(facts: GenerationFacts) -> str:
@@ -148,8 +168,8 @@ def _generation(facts: GenerationFacts) -> str:
     return f"  global cycle_s = {facts.step}\n{_ZEROES if facts.zeroes_wrench else _CANNOT_ZERO}"
 
 
-def _urscript(value: int | float | bool | Six) -> str:
-    """Return a literal of URScript, without an exponent."""
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_urscript, value))}]"
-    return f"{value:.6f}" if isinstance(value, float) else str(value)
+def _float(value: float) -> str:
+    """Return a literal of URScript, without an exponent; a whole number has a point too, and so is no integer."""
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is no number for the robot's script")
+    return f"{value:.6f}"

@@ -153,15 +153,15 @@ class MoverProcess(Mover, Opened):
 
     def kill(self) -> None:
         """End the process and its worker at once."""
-        for pid in (self._process.pid if self._process is not None else 0, self._worker):
-            if pid:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
-        self._worker = 0
+        if self._process is not None:
+            self._process.kill()
+        self._kill_worker()
         if self._process is not None:
             self._process.wait()
         if self._reader is not None:
+            # Its last lines may name another worker.
             self._reader.join()
+        self._kill_worker()
         if self._process is not None:
             for pipe in (self._process.stdin, self._process.stdout):
                 if pipe is not None:
@@ -169,8 +169,18 @@ class MoverProcess(Mover, Opened):
                         pipe.close()
         self._process = self._reader = None
 
+    def _kill_worker(self) -> None:
+        """End the worker process, if one is known, and forget it: its number may be another process's later."""
+        if self._worker:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._worker, signal.SIGKILL)
+        self._worker = 0
+
     def stop_worker(self) -> int:
         """Stop the worker process; return the time."""
+        if not self._worker:
+            # Signals to process 0 go to the whole group of this one.
+            raise UserError("no robot's process is known that could be stopped: the robot has not been connected yet")
         stopped_ns = self.events.clock.now_ns()
         os.kill(self._worker, signal.SIGSTOP)
         return stopped_ns

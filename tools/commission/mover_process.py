@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -89,22 +90,29 @@ class Driver:
         return self._settings.limits.wrist_acceleration_rad_per_s2.inner
 
     async def handle(self, request: Mapping[str, Any]) -> None:
-        """Carry out one request, and report its end."""
+        """Carry out one request, and report its end, also where it fails."""
+        try:
+            reply = await self._carry_out(request)
+        except Exception as error:  # noqa: BLE001 - reported to the commissioning, which decides
+            traceback.print_exc()
+            reply = CommandReply(refusal=f"The request failed: {type(error).__name__}: {error}.")
+        self._around.report("ended", do=request.get("do", ""), refusal=reply.refusal)
+
+    async def _carry_out(self, request: Mapping[str, Any]) -> CommandReply:
         while self._robot.state is None:
             await self._robot.next_state()
         cause = request.get("cause", "")
         match request["do"]:
             case "unlock":
-                reply = await self._robot.send(Unlock())
+                return await self._robot.send(Unlock())
             case "turn":
-                reply = await self._turn(request["rad_per_s"], request["to_rad"], cause)
+                return await self._turn(request["rad_per_s"], request["to_rad"], cause)
             case "swing":
-                reply = await self._swing(request["rad_per_s"], request["middle_rad"], request["by_rad"])
+                return await self._swing(request["rad_per_s"], request["middle_rad"], request["by_rad"])
             case "line":
-                reply = await self._line(request["metres"], request["m_per_s"], cause)
+                return await self._line(request["metres"], request["m_per_s"], cause)
             case _:
-                reply = await self._stop()
-        self._around.report("ended", do=request["do"], refusal=reply.refusal)
+                return await self._stop()
 
     async def _stop(self) -> CommandReply:
         """Stop, and return once the arm rests."""
@@ -232,18 +240,19 @@ async def main(worker_module: str) -> None:
     robot, process = UrRobot(settings, LinkMonitor(), warns=False, worker=worker_module), ThisProcess(worker_module)
     driver = Driver(settings, robot, process)
     running = [asyncio.create_task(robot.run()), asyncio.create_task(process.watch(robot))]
-    handling: asyncio.Task[None] | None = None
+    handled: list[asyncio.Task[None]] = []
     try:
         while line := await lines.readline():
             request = json.loads(line)
-            if handling is not None and not handling.done():
-                # Only a stop comes during a motion.
-                handling.cancel()
-            handling = asyncio.create_task(driver.handle(request))
+            # Only a stop comes during a motion.
+            for task in handled:
+                task.cancel()
+            handled = [asyncio.create_task(driver.handle(request))]
     finally:
-        for task in (*running, *([handling] if handling is not None else [])):
+        tasks = (*running, *handled)
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 if __name__ == "__main__":

@@ -16,15 +16,13 @@ pytestmark = pytest.mark.real_time
 
 HOST = own_address(3)
 # Each call once, with the flags of `UrArm`; a client that reads another state than it waits for would wait for minutes.
+# The program runs before the client connects, which waits for the robot's first state.
 CALLS = """
-import os, sys, time
+import os, sys
 import rtde_control
 kind = rtde_control.RTDEControlInterface
 client = kind(sys.argv[1], 125.0, int(kind.FLAG_NO_WAIT) | int(kind.FLAG_UPPER_RANGE_REGISTERS))
-print("connected", flush=True)
-while not client.isProgramRunning():
-    client.kickWatchdog()
-    time.sleep(0.01)
+assert client.isProgramRunning()
 pose = [float(value) for value in sys.argv[2].split(",")]
 answers = [
     client.setWatchdog(5.0),
@@ -52,7 +50,7 @@ EXPECTED = [
 
 
 class WatchedRobot(Robot):
-    """A robot that notes each command that a client writes, with its numbers."""
+    """A robot that notes each command that a client writes, with its numbers; its watchdog waits for the first."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,6 +65,11 @@ class WatchedRobot(Robot):
 
         self.registers.write = note
 
+    def step(self, dt_s: float) -> None:
+        if not self.commands:
+            self.registers.written_s[UPPER.command] = self.time_s
+        super().step(dt_s)
+
 
 async def let_time_pass(controller: Controller) -> None:
     async for _ in controller.run():
@@ -80,14 +83,11 @@ async def test_the_client_writes_the_numbers_that_the_script_knows():
     pose = (x, y, z - 0.1, *turned)
     controller = Controller(robot, host=HOST)
     async with controller.open(), asyncio.timeout(20), asyncio.TaskGroup() as tasks:
+        robot.upload(control_script(DELIVERED))
         time = tasks.create_task(let_time_pass(controller))
         client = await asyncio.create_subprocess_exec(
             sys.executable, "-c", CALLS, HOST, ",".join(map(str, pose)), stdout=asyncio.subprocess.PIPE
         )
-        assert client.stdout is not None
-        while await client.stdout.readline() != b"connected\n":
-            pass
-        robot.upload(control_script(DELIVERED))
         said, _ = await client.communicate()
         time.cancel()
     assert said.endswith(b"True\n")

@@ -8,6 +8,7 @@ import ast
 import asyncio
 import dataclasses
 import itertools
+import math
 import re
 import sys
 from collections import Counter
@@ -178,6 +179,48 @@ def test_every_call_of_the_client_has_its_number_in_the_script():
     }
     assert calls == NUMBERS.keys() | READS
     assert sorted(map(int, re.findall(r"global command_\w+ = (\d+)", CODE))) == sorted(NUMBERS.values())
+
+
+@pytest.mark.parametrize("rig", [DELIVERED, CB3], ids=["e-series", "cb3"])
+def test_every_literal_has_the_type_of_its_variable(rig):
+    """A whole number of the settings is no integer on the robot."""
+    whole = dataclasses.replace(
+        rig.limits,
+        wrist_acceleration_rad_per_s2=settings.WristAccelerationBound(4, 8),
+        force_n=settings.ForceBound(40, 60),
+    )
+    program = control_program(dataclasses.replace(rig, limits=whole, command_timeout_s=1), load=(1, 2, 3, 0, 0, 0))
+    head = program[: program.index("global cycle_s")]
+    kinds = {
+        name: re.sub(r"-?\d+\.\d{6}", "float", value)
+        for name, value in re.findall(r"^  global (\w+) = (.+)$", head, re.MULTILINE)
+    }
+    assert kinds.pop("first") == "24"
+    assert kinds.pop("keeps_load") == "True"
+    assert kinds.pop("load_before") == f"[{', '.join(['float'] * 6)}]"
+    assert set(kinds.values()) == {"float"}
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_no_program_is_made_of_what_is_no_number(value):
+    with pytest.raises(ValueError, match="no number"):
+        control_program(DELIVERED, load=(0.0, 0.0, value, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("part", ["_HEAD", "_ZEROES", "_CANNOT_ZERO"])
+def test_the_hash_of_a_report_changes_with_every_statement_around_the_script(monkeypatch, part):
+    before = script.own_script_hash()
+    monkeypatch.setattr(script, part, getattr(script, part) + "  sync()\n")
+    assert script.own_script_hash() != before
+
+
+def test_the_hash_of_a_report_has_the_names_of_a_rigs_values_and_not_the_values(monkeypatch):
+    hashes = []
+    for names, value in (("ab", 1.0), ("ab", 2.0), ("ac", 1.0)):
+        values = {name: lambda _, value=value: value for name in names}
+        monkeypatch.setattr(script, "_FROM_SETTINGS", values)
+        hashes.append(script.own_script_hash())
+    assert hashes[0] == hashes[1] != hashes[2]
 
 
 def test_the_hash_of_a_report_changes_with_the_script(monkeypatch, tmp_path):

@@ -39,7 +39,7 @@ from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.mover import Mover
 from shearloop.tools.commission.mover_process import CAUSES, Driver
 from shearloop.tools.commission.observer import Observer, Seen
-from shearloop.tools.commission.watchdog_worker import WatchdogAlone
+from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
 from tests.drivers.ur import robots
 from tests.drivers.ur.scripted_arm import ScriptedArm
 
@@ -148,7 +148,7 @@ class SimulatedMover(Mover):
         self._daemon_runs = False
 
     def start(self, *, watchdog_alone: bool = False) -> None:
-        settings = WatchdogAlone(self.settings) if watchdog_alone else self.settings
+        settings = for_watchdog_alone(self.settings) if watchdog_alone else self.settings
         self._robot = SimulatedRobot(self._rig, settings)
         self._driver, self._daemon_runs = Driver(settings, self._robot, self), True
 

@@ -26,7 +26,7 @@ from shearloop.tools.commission.rtde import judge_clock, judge_samples
 from shearloop.tools.commission.stops import Stop, judge_stops
 from shearloop.tools.commission.tap import frame_step_s, judge_clocks, load_step_s
 from shearloop.tools.commission.tool import Held, judge_signs, judge_twists
-from shearloop.tools.commission.watchdog_worker import WatchdogAlone
+from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
 from shearloop.tools.commission.wrench import Reading, judge_mass, judge_rest
 from tests.drivers.ur.robots import DELIVERED
 
@@ -329,7 +329,7 @@ def test_the_robot_itself_bounds_every_motion():
 
 
 def test_a_straight_move_that_the_watchdog_alone_ends_keeps_the_rigs_watchdog_and_limits():
-    alone = WatchdogAlone(DELIVERED)
+    alone = for_watchdog_alone(DELIVERED)
     assert alone.watchdog_hz == DELIVERED.watchdog_hz
     assert alone.lease_s > 2.0 / DELIVERED.watchdog_hz
     assert (alone.limits, alone.command_timeout_s) == (DELIVERED.limits, DELIVERED.command_timeout_s)

@@ -1,0 +1,91 @@
+"""The commissioning's end of what drives the robot: which process gets a signal, and what a failed request reports."""
+
+import asyncio
+import io
+import json
+import os
+import signal
+import subprocess
+
+import pytest
+
+from shearloop.errors import UserError
+from shearloop.tools.commission import mover
+from shearloop.tools.commission.mover import MoverProcess
+from shearloop.tools.commission.mover_process import Driver
+from tests.drivers.ur.robots import DELIVERED
+
+WORKER, LATER_WORKER = 4_190_001, 4_190_002
+
+
+class FakeProcess:
+    """A process that names a worker at once, and another one in its last line."""
+
+    pid = 4_190_000
+
+    def __init__(self, *_arguments: object, **_options: object) -> None:
+        stdout, self._writes = os.pipe()
+        self.stdin, self.stdout = io.StringIO(), os.fdopen(stdout)
+        self._say(WORKER)
+
+    def _say(self, worker: int) -> None:
+        os.write(self._writes, f"{json.dumps({'event': 'connected', 't_ns': 1, 'worker': worker})}\n".encode())
+
+    def kill(self) -> None:
+        """Be killed."""
+
+    def wait(self) -> None:
+        self._say(LATER_WORKER)
+        os.close(self._writes)
+
+
+@pytest.fixture
+def signals(monkeypatch) -> list[tuple[int, signal.Signals]]:
+    """Return the signals that were sent; none arrives anywhere."""
+    sent: list[tuple[int, signal.Signals]] = []
+    monkeypatch.setattr(os, "kill", lambda pid, number: sent.append((pid, number)))
+    monkeypatch.setattr(subprocess, "Popen", FakeProcess)
+    assert mover.subprocess.Popen is FakeProcess
+    return sent
+
+
+def test_a_worker_that_is_not_known_is_not_stopped(signals):
+    """Process 0 is the whole group of the caller."""
+    with pytest.raises(UserError, match="not been connected"):
+        MoverProcess(DELIVERED).stop_worker()
+    assert signals == []
+
+
+def test_a_worker_is_forgotten_once_it_was_killed(signals):
+    """Its number may be another process's later, also where the last lines of the process name another worker."""
+    process = MoverProcess(DELIVERED)
+    process.start()
+    assert process.event("connected", 0, 5.0) is not None
+    process.kill()
+    assert [pid for pid, number in signals if number == signal.SIGKILL and pid != FakeProcess.pid][-1] == LATER_WORKER
+    signals.clear()
+    with pytest.raises(UserError, match="not been connected"):
+        process.stop_worker()
+    process.kill()
+    assert signals == []
+
+
+class Here:
+    """The surroundings of a request, and a robot that has a state."""
+
+    state = object()
+
+    def __init__(self) -> None:
+        self.reports: list[tuple[str, dict[str, object]]] = []
+
+    def report(self, event: str, **facts: object) -> None:
+        self.reports.append((event, facts))
+
+
+def test_a_request_that_fails_is_reported(capsys):
+    here = Here()
+    asyncio.run(Driver(DELIVERED, here, here).handle({"do": "turn"}))
+    ((event, facts),) = here.reports
+    assert (event, facts["do"]) == ("ended", "turn")
+    assert "rad_per_s" in str(facts["refusal"])
+    assert "Traceback" in capsys.readouterr().err

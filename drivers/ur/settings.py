@@ -103,7 +103,7 @@ class WristAccelerationBound(Bound):
     inner: ranges.WristAcceleration
     """Commands are clipped to it."""
     hard: ranges.WristAcceleration
-    """A larger measured value stops the motion; a stop brakes up to it."""
+    """A larger measured value stops the motion; a stop brakes up to it, and no gentler than `inner`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ class ForceBound(Bound):
     inner: ranges.ToolForce
     """From it on the wrist turns slower, and a straight move stops."""
     hard: ranges.ToolForce
-    """A larger measured value stops the motion."""
+    """A larger measured value stops the motion. The script on a CB3 does not subtract a tare."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,7 @@ class TorqueBound(Bound):
     inner: ranges.ToolTorque
     """From it on the wrist turns slower, and a straight move stops."""
     hard: ranges.ToolTorque
-    """A larger measured value stops the motion."""
+    """A larger measured value stops the motion. The script on a CB3 does not subtract a tare."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -129,6 +129,9 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
         own = reply["configured"]
         known = [(one["path"], one["name"], "configured" if one["path"] == own else "") for one in reply["experiments"]]
         return table(("file", "name", ""), known)
+    if name == "tare":
+        end = "`shearloop command status` shows its end, and `start` is refused until then"
+        return [f"tare: the zero of {', '.join(reply['taring'])} is being taken; {end}"]
     if name == "stop":
         if reply.get("ended"):
             return ["stop: nothing was moving; the daemon has ended"]

@@ -221,7 +221,7 @@ def _take_robot(config: DaemonConfig, opened: contextlib.ExitStack) -> "UrSettin
 
     settings = open_settings(config)
     if settings is not None:
-        opened.enter_context(lock_robot(settings.host))
+        opened.enter_context(lock_robot(settings.host, config.commands))
     return settings
 
 

@@ -145,7 +145,7 @@ class Commands:
             _refuse_if(self.rig.control_loop.tare_refusal(confirmed=bool(request.get("confirmed"))))
         for name in names:
             sensors[name].tare()
-        return {"tared": names}
+        return {"taring": names}
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()

@@ -213,7 +213,8 @@ class Rig:
         file = (await self.experiments.read(path)).file
         motion = first_motion(file)
         robot = self.experiments.robot
-        plan = plan_of(file, robot.settings.limits if robot is not None else None, self.experiments.gripper)
+        limits = robot.settings.limits if robot is not None else None
+        plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)
         return f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.", list(plan.sentences())
 
     def state(self) -> Mapping[str, Any]:

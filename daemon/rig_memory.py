@@ -138,9 +138,10 @@ def memory_path(host: str) -> Path:
 
 
 @contextlib.contextmanager
-def lock_robot(host: str) -> Iterator[None]:
+def lock_robot(host: str, commands: str = "") -> Iterator[None]:
     """Keep other daemons of this user away from a robot; raises UserError if one of them has it.
 
+    `commands` is the command address of this process, if it has one, which the sentence to another one names.
     Two daemons would share the robot's memory, and neither would know of the other's stops and grips. The lock ends
     with the process, however that ends. Where the file cannot be made, no experiment starts, and nothing is locked.
     """
@@ -153,12 +154,16 @@ def lock_robot(host: str) -> Iterator[None]:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 file.seek(0)
+                process, _, address = file.read().partition(" ")
+                stop = (
+                    f"with `shearloop command stop --connect {address}`" if address else "with Ctrl-C in its terminal"
+                )
                 raise UserError(
-                    f"the robot at {host} is driven by another daemon of this computer (process {file.read()}): "
-                    "stop that one first, with `shearloop command stop`, or name another robot in the configuration"
+                    f"the robot at {host} is driven by another program of this computer (process {process}): "
+                    f"stop that one first, {stop}, or name another robot in the configuration"
                 ) from None
             file.truncate(0)
-            file.write(str(os.getpid()))
+            file.write(f"{os.getpid()} {commands}".rstrip())
             file.flush()
         yield
 

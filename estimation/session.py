@@ -36,6 +36,7 @@ from shearloop.words import counted
 
 _REPEATED_FRAME = ("the board sent the same frame again",)
 _NO_IDLE_FRAME = ("no idle frame: it took too long, or something was gripped; tare again with nothing gripped",)
+_NEVER_IDLE = "it was not seen untouched since the start; if it holds a tool, release it, tare, and grip again"
 UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _UNKNOWN = (None, None, None)
 _UNCALIBRATED = ("no calibration is configured: k and sigma have no torque",)
@@ -251,6 +252,8 @@ class Session:
         if loose:
             self._memory.forget()
             reason = f"no grip at the {' and '.join(loose)} fingertip"
+            if not idle.complete:
+                reason += f"; {_NEVER_IDLE}"
             return ProcessedFrame(difference, (reason,), usable, held_frames=0)
         memory = self._memory
         # Motion is read in volts: after a release a gel's idle voltages recover for minutes, which is no gain.

@@ -16,6 +16,7 @@ from shearloop.daemon.control.experiment_schema import (
     ExperimentLimits,
     GripStep,
     IdentifyStep,
+    Speeds,
     TareStep,
     first_motion_before_grip,
 )
@@ -72,6 +73,8 @@ class _GrippedTool:
     # A stop has opened the gripper, or why it did not open, until the operator acknowledges it.
     released: bool = False
     release_error: str | None = None
+    # The causes of the latest stop, once it is acknowledged, until the next start.
+    acknowledged: str = ""
 
 
 class ControlLoop:
@@ -118,6 +121,11 @@ class ControlLoop:
         self._gripped = _GrippedTool()
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
+
+    @property
+    def warm_up_s(self) -> float:
+        """The longest time from a grip to the first torque of a source."""
+        return max((one.warm_up_s for one in self._sources.values() if one.measures_torque), default=0.0)
 
     @property
     def running(self) -> Experiment | None:
@@ -311,7 +319,9 @@ class ControlLoop:
             if why is not None:
                 motion = f"step {number} ({step.do}), which {'moves the arm' if straight else 'turns the wrist'}"
                 return f"{why}; put a `grip` or a `release` before {motion}"
-        self.experiment, self._watched, self.wrist = Experiment(file, t_ns), watched, self._wrists[file.torque_source]
+        speeds = Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
+        self.experiment, self._watched = Experiment(file, t_ns, speeds), watched
+        self.wrist = self._wrists[file.torque_source]
         # What the last experiment knew of the tool may be wrong by now.
         self.wrist.reset()
         # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
@@ -350,6 +360,9 @@ class ControlLoop:
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command."""
         self._gripped.release_error = None
+        if self.safety.stopped:
+            causes = "; ".join(fault.cause for fault in self.safety.stop_faults)
+            self._gripped.acknowledged = f"the stop is acknowledged; its cause was: {causes}"
         self.safety.acknowledge()
 
     def tick(self, t_ns: int, late_s: float = 0.0, sent_rad_per_s: float | None = None) -> ControlOutput:
@@ -432,6 +445,9 @@ class ControlLoop:
         if isinstance(action, TareStep) and (reason := self._why_no_tare_step()) is not None:
             self._fail(experiment, reason)
             return self._ended(self.safety.report(decision.faults))
+        if isinstance(action, GripStep):
+            # A process that dies while the fingers close leaves this force behind.
+            gripped.force_n = max(gripped.force_n or 0.0, action.force_n)
         if isinstance(action, IdentifyStep):
             wrist.begin_identification(action, limit_nm)
             action = None
@@ -484,6 +500,8 @@ class ControlLoop:
         experiment = self.experiment
         phase = experiment.phase.value if experiment is not None else "idle"
         reason = experiment.stop_reason if experiment is not None else ""
+        if experiment is not None and experiment.phase is ExperimentPhase.STOPPED and not self.safety.stopped:
+            reason = self._gripped.acknowledged or reason
         self.status = LoopStatus(phase, reason, WristCommand(), decision)
         release = decision.response is Response.STOP_AND_RELEASE and not self._gripped.released
         self._gripped.released |= release

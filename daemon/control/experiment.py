@@ -96,8 +96,10 @@ StepProgram: TypeAlias = Generator[StepCommand, StepContext, None]
 class Experiment:
     """One run of an experiment file."""
 
-    def __init__(self, file: ExperimentFile, t_ns: int) -> None:
+    def __init__(self, file: ExperimentFile, t_ns: int, speeds: steps.Speeds = steps.AS_ASKED) -> None:
+        """Begin at t_ns; `speeds` are the largest that the rig allows."""
         self.file = file
+        self._speeds = speeds
         self.phase = ExperimentPhase.RUNNING
         self.stop_reason = ""
         # The step's command, also while the wrist is paused or held.
@@ -127,17 +129,24 @@ class Experiment:
     @property
     def remaining_s(self) -> float:
         """The approximate remaining time."""
-        if not self.running:
-            return 0.0
-        here_s = max(0.0, _expected_s(self.step) - self._elapsed_s + self._step_began_s)
-        return here_s + sum(map(_expected_s, self.file.steps[self.step_number :]))
+        return self._left_s if self.running else 0.0
+
+    @property
+    def _left_s(self) -> float:
+        """The approximate time of what has not been done."""
+        here_s = max(0.0, self._expected_s(self.step) - self._elapsed_s + self._step_began_s)
+        return here_s + sum(map(self._expected_s, self.file.steps[self.step_number :]))
 
     @property
     def progress(self) -> float:
-        """The completed share, 0 to 1."""
+        """The completed share, 0 to 1; a stopped experiment keeps that of its stop."""
         if self.phase is ExperimentPhase.DONE:
             return 1.0
-        return max(0.0, 1.0 - self.remaining_s / max(sum(map(_expected_s, self.file.steps)), 1e-9))
+        return max(0.0, 1.0 - self._left_s / max(sum(map(self._expected_s, self.file.steps)), 1e-9))
+
+    def _expected_s(self, step: Step) -> float:
+        """Return the approximate duration of a step, for the remaining time shown to the operator."""
+        return steps.demand(step, self._speeds).takes_s
 
     def update(
         self, t_ns: int, wrist_rad: float, torque_nm: float | None, *, gripped_at_rad: float = 0.0, held: bool = False
@@ -213,12 +222,6 @@ class Experiment:
                 continue
             return
         self.phase, self.command = ExperimentPhase.DONE, StepCommand()
-
-
-def _expected_s(step: Step) -> float:
-    """Return the approximate duration of a step, for the remaining time shown to the operator."""
-    needs = steps.demand(step)
-    return needs.stands_s + needs.moves_s
 
 
 def _program(step: Step, now_s: float) -> StepProgram:

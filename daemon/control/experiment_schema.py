@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema, model_validator
@@ -136,7 +137,7 @@ class TwistStep(_Step):
     absolute: bool = Field(False, description="angles of the wrist joint, not from the angle at the grip")
     speed_rad_per_s: ranges.WristSpeed = Field(CAPPED_RAD_PER_S, description="speed of the wrist")
     hold_s: ranges.Seconds = Field(2.0, description="time at each angle")
-    return_to_start: bool = Field(True, description="turn back after each round")
+    return_to_start: bool = Field(True, description="turn back after each angle")
     repeats: int = Field(1, ge=1, le=1000, description="rounds over all angles")
 
 
@@ -334,29 +335,55 @@ class Demand(NamedTuple):
     stands_s: float = 0.0
     moves_s: float = 0.0
 
+    @property
+    def takes_s(self) -> float:
+        """About how long the step takes."""
+        return self.stands_s + self.moves_s
 
-def demand(step: Step) -> Demand:
+
+class Speeds(NamedTuple):
+    """The largest speeds that a rig allows; a step that asks for more moves with these."""
+
+    wrist_rad_per_s: float = math.inf
+    linear_m_per_s: float = math.inf
+
+
+AS_ASKED: Final = Speeds()
+# The wrist slows down as it comes near an angle: to a hundredth of 0.2 rad in a second, at the default bandwidth.
+SETTLES_S: Final = 1.0
+
+
+def _steps_rad(step: TwistStep) -> list[float]:
+    """Return how far the wrist turns between the angles of a round, from the last one of the round before."""
+    angles_rad = step.angles_rad
+    return [abs(later - earlier) for earlier, later in pairwise((angles_rad[-1], *angles_rad))]
+
+
+def demand(step: Step, speeds: Speeds = AS_ASKED) -> Demand:
     """Return the demand of a step; unknown values, as in an outline, are 0."""
     match step:
         case HoldTorqueStep(torque_nm=torque_nm):
             return Demand(abs(torque_nm), stands_s=step.hold_s, moves_s=abs(torque_nm) / step.ramp_nm_per_s)
         case TightenStep(until_torque_nm=torque_nm, until_angle_rad=angle_rad):
-            return Demand(torque_nm, angle_rad, moves_s=angle_rad / step.speed_rad_per_s)
+            speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
+            return Demand(torque_nm, angle_rad, moves_s=angle_rad / speed_rad_per_s)
         case IdentifyStep(amplitude_rad=angle_rad):
             return Demand(angle_rad=angle_rad, moves_s=20.0)
         case TwistStep(angles_rad=angles_rad):
             stands_s = step.hold_s * len(angles_rad) * step.repeats
             # How far an absolute angle is from the grip is known only there.
             reach = [0.2 if step.absolute else abs(angle_rad) for angle_rad in angles_rad]
-            rounds = (2.0 if step.return_to_start else 1.0) * step.repeats
-            moves_s = rounds * sum(reach) / step.speed_rad_per_s
+            moves = [2.0 * one_rad for one_rad in reach] if step.return_to_start else _steps_rad(step)
+            settles_s = SETTLES_S * len(angles_rad) * (2 if step.return_to_start else 1)
+            speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
+            moves_s = step.repeats * (sum(moves) / speed_rad_per_s + settles_s)
             return Demand(0.0, 0.0 if step.absolute else max(reach), stands_s, moves_s)
         case WaitStep(wait_s=wait_s):
             return Demand(stands_s=wait_s)
         case TareStep():
             return Demand(moves_s=6.0)
         case ApproachStep(along_tool_m=float() as distance_m):
-            return Demand(moves_s=1.0 + abs(distance_m) / step.speed_m_per_s)
+            return Demand(moves_s=1.0 + abs(distance_m) / min(step.speed_m_per_s, speeds.linear_m_per_s))
         case ApproachStep() | GripStep() | ReleaseStep() | AdaptStep() | TurnToStep():
             return Demand(moves_s=3.0)
         case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | WaitStep():

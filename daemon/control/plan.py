@@ -8,7 +8,7 @@ from typing import Any
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_check import Turn, reversals, turns
-from shearloop.daemon.control.experiment_schema import Demand, ExperimentFile, Step, demand
+from shearloop.daemon.control.experiment_schema import AS_ASKED, Demand, ExperimentFile, Speeds, Step, demand
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
@@ -124,19 +124,22 @@ def plan_of(
 
     `refused` has the reasons against each step by its index; `warm_up_s` passes after a grip until the first torque.
     """
+    speeds = AS_ASKED
+    if robot is not None:
+        speeds = Speeds(robot.wrist_speed_rad_per_s.inner, robot.linear_speed_m_per_s.inner)
     back = {one.number: one.sentence(file) for one in reversals(file)}
     planned: list[StepPlan] = []
     # Whether the next step that twists waits for the first torques of a grip or a tare.
     waits = False
     opened = False
     for number, (step, turn) in enumerate(zip(file.steps, turns(file), strict=True), 1):
-        needs = demand(step)
-        duration_s = needs.stands_s + needs.moves_s
+        needs = demand(step, speeds)
+        duration_s = needs.takes_s
         notes = list(_notes(file, step, turn, robot))
         if isinstance(step, steps.GripStep | steps.TareStep):
             waits = warm_up_s > 0
         elif waits and isinstance(step, steps.TwistingStep):
-            notes.append(f"before it, up to {warm_up_s:g} s for the first torques of the grip")
+            notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques of the grip")
             duration_s += warm_up_s
             waits = False
         if number in back:

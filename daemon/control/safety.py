@@ -168,7 +168,7 @@ class FaultCode(Enum):
     RECORDING_FAILED = Rule(
         Response.REFUSE_START,
         "the recording cannot be written: {detail}.",
-        "Make room on the disk, or make the folder again; the running experiment continues unrecorded.",
+        "Make room on the disk, or make the folder again; a running experiment continues unrecorded.",
     )
     COMMAND_REFUSED = Rule(
         Response.NOTE,
@@ -232,10 +232,15 @@ class Fault:
         return TABLE[self.code]
 
     @property
+    def cause(self) -> str:
+        """The sentence without its full stop, and without the cure."""
+        # A driver's detail may end with a full stop; the sentence has its own.
+        return self.rule.sentence.format(detail=self.detail.removesuffix(".")).removesuffix(".")
+
+    @property
     def sentence(self) -> str:
         """The operator's sentence, with the cure."""
-        # A driver's detail may end with a full stop; the sentence has its own.
-        return f"{self.rule.sentence.format(detail=self.detail.removesuffix('.'))} {self.rule.cure}"
+        return f"{self.cause}. {self.rule.cure}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -113,8 +113,9 @@ class RequestExecutor:
             return self._refuse(f"{name} failed", reason)
         finally:
             self._running -= 1
-        # Pages and scripts ask for the status every second.
-        (log.debug if name == STATUS else log.info)("command executed", command=name)
+        # Pages and scripts ask for the status every second. A question before a command carries nothing out.
+        quiet = name == STATUS or request.get("ask")
+        (log.debug if quiet else log.info)("command executed", command=name)
         return {"ok": True, **reply}
 
     def _refuse(self, kind: str, reason: str, *, frequent: bool = False) -> Reply:

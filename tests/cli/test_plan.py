@@ -7,9 +7,11 @@ import yaml
 
 from shearloop.cli import main
 from shearloop.daemon.commissioning import Commissioning
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.drivers.robotiq.models import MODELS
-from shearloop.drivers.ur.settings import read_settings
+from shearloop.drivers.ur.settings import UrLimits, read_settings
 from tests.fixtures.daemons import collector, running_daemon, shearloop
 
 ROOT = Path(__file__).parents[2]
@@ -173,3 +175,17 @@ async def test_a_load_cell_alone_runs_and_publishes(config, tmp_path):
     async with board, running_daemon(path) as daemon:
         message = await collector(daemon, "load.torque").get()
     assert message["source"] == "load_cell"
+
+
+def test_the_duration_knows_of_the_robots_speed_and_of_the_approach_to_each_angle():
+    robot = read_settings(ROBOT).limits
+    fastest_rad_per_s = robot.wrist_speed_rad_per_s.inner
+    twist = {"do": "twist", "angles_rad": [0.2, -0.2], "hold_s": 0, "repeats": 10, "speed_rad_per_s": 3}
+
+    def duration_s(step: dict[str, object], limits: UrLimits | None) -> float:
+        return plan_of(ExperimentFile.model_validate({"name": "fast", "steps": [step]}), limits).duration_s
+
+    # 8 rad, and 40 angles or 20 that are come near to.
+    assert duration_s(twist, None) == pytest.approx(8 / 3 + 40.0)
+    assert duration_s(twist, robot) == pytest.approx(8 / fastest_rad_per_s + 40.0)
+    assert duration_s({**twist, "return_to_start": False}, robot) == pytest.approx(8 / fastest_rad_per_s + 20.0)

@@ -95,7 +95,7 @@ async def test_tare_status_and_stop_commands(config, tmp_path):
         async with emulated_kit(tmp_path, 60):
             while not (await estimates.get())["valid"]:
                 continue
-            assert await ask(daemon, "tare") == {"ok": True, "tared": ["right"]}
+            assert await ask(daemon, "tare") == {"ok": True, "taring": ["right"]}
             while "taking the idle frame, 1 of 10" not in (await estimates.get())["reason"]:
                 continue
             reply = await ask(daemon, "tare", source="left")
@@ -205,7 +205,7 @@ async def test_a_load_cell_works_without_a_robot(config, tmp_path):
             stdin=asyncio.subprocess.PIPE,
         ):
             assert (await torques.get())["torque_nm"] == pytest.approx(0.08, abs=0.005)
-            assert await ask(daemon, "tare", source="load_cell") == {"ok": True, "tared": ["load_cell"]}
+            assert await ask(daemon, "tare", source="load_cell") == {"ok": True, "taring": ["load_cell"]}
             while abs((await torques.get())["torque_nm"]) > 0.005:
                 continue
             assert (await ask(daemon, "status"))["tasks"]["load_cell"]["alive"]

@@ -317,6 +317,30 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged():
     assert rig.control_loop.start(file, rig.t_ns) is None
 
 
+def test_after_the_acknowledgement_the_state_asks_for_nothing_and_still_names_the_cause():
+    rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 60})
+    rig.run(2)
+    rig.arm = replace(rig.arm, protective_stop=True)
+    rig.step()
+    assert "shearloop command unlock" in rig.control_loop.status.activity
+    rig.arm = replace(rig.arm, protective_stop=False)
+    rig.control_loop.acknowledge()
+    rig.run(1)
+    said = rig.control_loop.status.activity
+    assert said.startswith("the stop is acknowledged; its cause was: the robot is in a protective stop")
+    assert "unlock" not in said
+
+
+def test_a_stopped_experiment_keeps_its_progress():
+    rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 10}, {"do": "wait", "wait_s": 30})
+    rig.run(12)
+    stop(rig)
+    rig.run(1)
+    state = loop_state(rig.control_loop, 0.0, rig.t_ns)
+    assert state.progress == pytest.approx(0.3, abs=0.01)
+    assert state.remaining_s == 0.0
+
+
 @pytest.mark.parametrize("own_stop", ["protective_stop", "emergency_stop"])
 def test_a_stop_of_the_robot_itself_waits_for_the_operator_also_where_nothing_moved(own_stop):
     rig = Rig(new_loop())

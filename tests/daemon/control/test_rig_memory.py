@@ -65,6 +65,17 @@ def test_a_stop_is_remembered_until_it_is_acknowledged(kind, tmp_path):
     assert refusal(again) == ""
 
 
+def test_the_force_of_a_grip_is_remembered_while_the_fingers_close(tmp_path):
+    rig = started(Rig(new_loop()), {"do": "release"}, GRIP, WAIT)
+    while rig.control_loop.experiment.step_number < 2:
+        rig.step()
+    rig.step()
+    # The process is killed, and the fingers close all the same.
+    rig.force_n = 60.0
+    after = after_restart(rig, tmp_path / "robot.json")
+    assert "with at most 60 N" in after.control_loop.release_question()
+
+
 def test_a_stop_that_released_does_not_release_again_in_the_next_process():
     rig = Rig(new_loop())
     Remembered(stop=((FaultCode.TORQUE_LIMIT.name, "right measured 0.9 N·m"),)).restore(rig.control_loop)
@@ -171,8 +182,9 @@ def test_the_file_is_in_systemds_state_folder_or_the_users(tmp_path, monkeypatch
 
 
 def test_one_daemon_at_a_time_drives_a_robot():
-    with lock_robot("192.168.1.10"):
-        taken = rf"driven by another daemon of this computer \(process {os.getpid()}\)"
+    with lock_robot("192.168.1.10", "tcp://127.0.0.1:27762"):
+        taken = rf"driven by another program of this computer \(process {os.getpid()}\): "
+        taken += "stop that one first, with `shearloop command stop --connect tcp://127.0.0.1:27762`"
         with pytest.raises(UserError, match=taken), lock_robot("192.168.1.10"):
             pytest.fail("it has the robot as well")
         with lock_robot("192.168.1.11"):

@@ -29,7 +29,7 @@ def handlers() -> Mapping[str, Any]:
     async def tare(content: Mapping[str, Any]) -> dict[str, Any]:
         if content.get("source") == "left":
             raise CommandRefusedError("there is no fingertip 'left'")
-        return {"tared": ["right"]}
+        return {"taring": ["right"]}
 
     async def unlock(_: Mapping[str, Any]) -> dict[str, Any]:
         raise ZeroDivisionError("nothing to divide")
@@ -52,7 +52,7 @@ class Unbound(RequestExecutor):
 
 async def test_each_request_gets_one_reply():
     server = Unbound()
-    assert await server.reply(encode({"command": "tare"})) == {"ok": True, "tared": ["right"]}
+    assert await server.reply(encode({"command": "tare"})) == {"ok": True, "taring": ["right"]}
     for request, why in (
         (encode({"command": "tare", "source": "left"}), "there is no fingertip 'left'"),
         (encode({"command": "jump"}), "there is no command 'jump'; the commands are tare, unlock"),
@@ -69,7 +69,7 @@ async def test_req_and_dealer_clients_are_answered():
     ):
         async with running(server.run()):
             reply = await asyncio.to_thread(send_command, server.address, {"command": "tare"}, 5.0)
-            assert reply["tared"] == ["right"]
+            assert reply["taring"] == ["right"]
             with context.socket(zmq.REQ) as client:
                 client.connect(server.address)
                 await client.send(b"\xc1 not msgpack")
@@ -184,9 +184,9 @@ async def test_tare_is_refused_during_an_experiment():
         ):
             await tare(request_)
     assert tared == []
-    assert await tare({"confirmed": True}) == {"tared": ["right", "load_cell"]}
+    assert await tare({"confirmed": True}) == {"taring": ["right", "load_cell"]}
     tared.clear()
     refusal[0] = None
-    assert await tare({"source": "load_cell"}) == {"tared": ["load_cell"]}
-    assert await tare({}) == {"tared": ["right", "load_cell"]}
+    assert await tare({"source": "load_cell"}) == {"taring": ["load_cell"]}
+    assert await tare({}) == {"taring": ["right", "load_cell"]}
     assert tared == ["load_cell", "right", "load_cell"]

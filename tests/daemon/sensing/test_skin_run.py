@@ -157,7 +157,7 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path):
     async with played(tmp_path) as bench:
         await bench.valid()
         bench.skin.push(0.8)
-        assert await bench.command("tare", source="skin") == {"ok": True, "tared": ["skin"]}
+        assert await bench.command("tare", source="skin") == {"ok": True, "taring": ["skin"]}
         await bench.says("the zero was refused and is taken again")
         with pytest.raises(ActionError, match="the skin's zero was refused"):
             await tare_all(bench.daemon.sensors.tareable.values())

@@ -57,6 +57,7 @@ def page_of(report: Report, unmeasured: Sequence[str] = ()) -> str:
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
         f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>",
+        "<p>Every device was emulated: this report raises no limit of a real robot.</p>" if rig.emulated else "",
         "<p>A record of measurements, not a safety function: only the pendant's safety configuration is rated.</p>",
         f"<p>Robot {escape(rig.robot_serial_number or 'without a serial number')}, PolyScope {escape(rig.polyscope)}, "
         f"ur-rtde {escape(rig.ur_rtde)}. SHA-256: devices {rig.configuration_sha256[:16]}, robot's settings "

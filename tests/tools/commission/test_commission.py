@@ -92,6 +92,7 @@ def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
     assert "&lt;v&gt;" in text, "an operator's words are no markup"
     assert "Not measured" in text
     assert "4 stops" in text
+    assert "emulated" not in text.lower()
 
 
 def stage(verdict: str) -> StageResult:
@@ -165,7 +166,9 @@ def test_a_commissioning_is_rehearsed_on_emulated_devices_and_every_line_says_so
     assert [line for line in lines if not line.startswith("EMULATED: ")] == []
     rig = yaml.safe_load(out.read_text())["rig"]
     assert (rig["emulated"], rig["robot_serial_number"]) == (True, "EMULATED")
-    assert "EMULATED: commissioning" in out.with_suffix(".html").read_text()
+    page = out.with_suffix(".html").read_text()
+    assert "EMULATED: commissioning" in page
+    assert "raises no limit of a real robot" in page
 
 
 def test_what_cannot_be_rehearsed_is_refused_before_anything_is_played(tmp_path, mistake):

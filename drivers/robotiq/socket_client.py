@@ -30,7 +30,8 @@ def set_lines(request: messages.Request) -> list[str]:
     """Return the lines of a request; each is acknowledged before the next."""
     match request:
         case messages.GripperAction.RESET:
-            return ["SET ACT 0", "SET ATR 0"]
+            # Without GTO: else the fingers would go to the position of the last move as soon as they are active.
+            return ["SET GTO 0", "SET ACT 0", "SET ATR 0"]
         case messages.GripperAction.ACTIVATE:
             return ["SET ACT 1"]
         case messages.GripperAction.HALT:

@@ -100,6 +100,11 @@ async def test_major_fault_needs_the_operators_confirmation(way, tmp_path):
         state = await driver.activate(operator_confirmed=True)
         assert state.fault.code == 0
         assert state.activation is messages.ActivationStatus.ACTIVE
+        # The fingers stay open: the move of before the fault is over, and something may be between them.
+        for _ in range(50):
+            rig.model.step(STEP_S)
+        assert rig.model.width_mm == pytest.approx(state.width_mm, abs=1.0)
+        assert rig.model.width_mm > 100
 
 
 @WAYS

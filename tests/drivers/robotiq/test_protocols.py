@@ -53,7 +53,7 @@ def test_every_status_is_either_read_whole_or_refused(content):
 
 def test_socket_lines_are_those_that_the_urcap_takes():
     assert set_lines(messages.GripperMove(100, 255, 50)) == ["SET POS 100 SPE 255 FOR 50 GTO 1"]
-    assert set_lines(messages.GripperAction.RESET) == ["SET ACT 0", "SET ATR 0"]
+    assert set_lines(messages.GripperAction.RESET) == ["SET GTO 0", "SET ACT 0", "SET ATR 0"]
     assert set_lines(messages.GripperAction.ACTIVATE) == ["SET ACT 1"]
     assert set_lines(messages.GripperAction.HALT) == ["SET GTO 0"]
 

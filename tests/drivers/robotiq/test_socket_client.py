@@ -69,7 +69,7 @@ async def test_requests_are_answered_in_order():
         await client.write(GripperMove(10, 20, 30))
         assert (await client.read(whole=True)).current == 7
     asked = [f"GET {variable}" for variable in (*IN_TURN, *ALWAYS)]
-    assert peer.lines == [*asked, "SET ACT 0", "SET ATR 0", "SET POS 10 SPE 20 FOR 30 GTO 1", *asked]
+    assert peer.lines == [*asked, "SET GTO 0", "SET ACT 0", "SET ATR 0", "SET POS 10 SPE 20 FOR 30 GTO 1", *asked]
 
 
 @pytest.fixture

@@ -1,5 +1,7 @@
 """URScript in the emulated controller: what programs compute, how their threads run, and how they end."""
 
+from contextlib import suppress
+
 import pytest
 
 from shearloop.emulators.ur_arm import Arm
@@ -72,6 +74,29 @@ def test_program_computes(text, written):
 )
 def test_program_ends_for_a_cause(text, why):
     assert why in run(text)[1]
+
+
+@pytest.mark.parametrize(("critical", "seen"), [(False, 3.0), (True, 1.0)])
+def test_a_thread_is_interrupted_between_statements_outside_critical_sections(critical, seen):
+    """The main thread is held for two cycles wherever it may be; another thread counts meanwhile."""
+    enter, leave = ("enter_critical\n", "exit_critical\n") if critical else ("", "")
+    text = (
+        "def main():\nglobal n = 0\nthread t():\nwhile True:\nn = n + 1\nsync()\nend\nend\n"
+        f"h = run t()\nsync()\nsync()\n{enter}write_output_float_register(1, 0)\n"
+        f"write_output_float_register(0, n)\n{leave}halt\nend\n"
+    )
+    registers = Registers()
+    held = iter([True, True])
+
+    def interrupts(thread: int) -> bool:
+        began = "output_double_register_1" in registers
+        return thread == 1 and began and next(held, False)
+
+    running = Program(text, registers, Arm(), print, interrupts=interrupts)
+    for cycle in range(6):
+        with suppress(ProgramEndedError):
+            running.cycle(0.002, 0.002 * cycle)
+    assert registers["output_double_register_0"] == seen
 
 
 @pytest.mark.parametrize("text", ["while True:", "end", "end\nend\ndef f():\ndef g():", "x = = 2", "if x\nend"])

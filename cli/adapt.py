@@ -55,7 +55,9 @@ def run(args: argparse.Namespace) -> int:
     names = adapted.sides if len(factors) == len(adapted.sides) else (" and ".join(adapted.sides),)
     gains = {name: {"gain": gain, "error": error} for name, gain, error in zip(names, factors, errors, strict=True)}
     sentences = [f"{name}: torque times {one['gain']:.2f} ± {one['error']:.2f}." for name, one in gains.items()]
+    sentences.append(f"To the sum {correction.offset_nm:+.4f} N·m is added.")
     twists = correction.twists
     sentences.append(f"{twists} twist{'s' * (twists > 1)} of known torque decided. Written to {args.out}.")
     figures = {"path": str(args.out), "gains": gains, "twists": twists, "gain_spread": correction.spread.between}
+    figures["offset_nm"] = correction.offset_nm
     return print_result(figures, sentences, as_json=args.json)

@@ -132,7 +132,7 @@ def make_loop(
     `sources` are all torques but the robot's; `dead_tasks` has the error of each task that is dead at present;
     `supplied` is of the rig's report.
     """
-    sources = {**sources, WRENCH: wrench_source(robot.rate_hz)}
+    sources = {**sources, WRENCH: wrench_source(robot.rate_hz, robot.facts.estimated_nm)}
     # Controller, identification and commands plan with what the robot's process lets through.
     limited = {
         name: min(getattr(config.loop, name), getattr(robot.limits, name).inner)
@@ -289,6 +289,10 @@ def experiment_mistakes(
     mistakes += experiment_check.check_devices(file, limits, gripper_model(config), cap)
     if file.torque_source and file.steps:
         mistakes += _undriven(file.torque_source, driving, config)
+        if file.torque_source == WRENCH and robot is not None:
+            noise_nm, limit_nm = robot.settings.facts.estimated_nm, file.tightest_nm
+            if noise_nm >= limit_nm:
+                mistakes.append((("torque_source",), experiment_check.too_noisy(WRENCH, noise_nm, limit_nm)))
     if config.gripper is None:
         cure = "add a `gripper` section to the configuration, or take the step out"
         mistakes += [

@@ -51,6 +51,7 @@ class Parts:
 
 def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulators) -> Parts:
     """Return what each part of the configuration in this file is; opens every file that it names."""
+    from shearloop.daemon.control.loop_runner import WRENCH
     from shearloop.daemon.experiment_files import read_document
     from shearloop.daemon.rig import check_experiment, experiment_mistakes, gripper_model
     from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, torque_sources
@@ -101,6 +102,10 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
             )
             if warm_up_s:
                 text += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
+            if robot is not None and experiment.torque_source != WRENCH:
+                noise_nm = robot.settings.facts.estimated_nm
+                if noise_nm >= experiment.tightest_nm:
+                    text += f"; the wrench does not supervise it, because it is known to {noise_nm:g} N·m only"
             parts.texts["experiment"] = text
     return parts
 

@@ -3,12 +3,14 @@
 A plain object without I/O or clock: inputs come in, `ControlOutput` go out, and events report their results.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, Hold, StepCommand, TrackTorque
+from shearloop.daemon.control.experiment_check import too_noisy
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ApproachStep,
@@ -305,7 +307,10 @@ class ControlLoop:
             known = ", ".join(self._wrists)
             return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
         driving = self._sources[file.torque_source]
-        watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
+        if driving.is_within_noise(file.tightest_nm):
+            return too_noisy(driving.name, driving.noise_nm, file.tightest_nm)
+        others = self._others(driving, file.tightest_nm)
+        watched = replace(self._watched, driving=driving, supervising=others, limits=file.limits)
         faults = detect_faults(self.inputs, watched, self.config, t_ns)
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
@@ -409,8 +414,10 @@ class ControlLoop:
             return self._ended(decision)
         return self._run_step(running, decision, arm.wrist_rad, t_ns)
 
-    def _others(self, driving: TorqueSource) -> tuple[TorqueSource, ...]:
-        return tuple(source for source in self._sources.values() if source is not driving)
+    def _others(self, driving: TorqueSource, limit_nm: float = math.inf) -> tuple[TorqueSource, ...]:
+        """Return the sources that supervise: those whose noise alone does not reach the limit."""
+        others = (source for source in self._sources.values() if source is not driving)
+        return tuple(source for source in others if not source.is_within_noise(limit_nm))
 
     def _why_uncertain(self) -> str | None:
         """Return why the gripper cannot say whether it holds a tool, or None."""

@@ -106,6 +106,14 @@ def reversals(file: ExperimentFile) -> Iterator[Reversal]:
             left = number, turn.leaves
 
 
+def too_noisy(source: str, noise_nm: float, limit_nm: float) -> str:
+    """Return why a source cannot drive an experiment with this torque limit."""
+    return (
+        f"`torque_source: {source}`: its torque is known to {noise_nm:g} N·m only, and the smallest limit is "
+        f"{limit_nm:g} N·m, which its noise alone may pass; let a fingertip or the load cell drive, or raise the limit"
+    )
+
+
 def check_steps(file: ExperimentFile) -> list[Mistake]:
     """Return each step that exceeds its limits or its timeout, and each step that the steps before it make wrong.
 

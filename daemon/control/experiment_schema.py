@@ -233,6 +233,11 @@ class ExperimentFile(ConfigModel):
     )
     steps: tuple[Step, ...] = Field(min_length=1, description="the steps in order")
 
+    @property
+    def tightest_nm(self) -> float:
+        """The smallest torque limit of a step."""
+        return min(self.limits_of(step).torque_nm for step in self.steps)
+
     def limits_of(self, step: Step) -> ExperimentLimits:
         """Return the tighter of the experiment's limits and the step's."""
         own = {} if step.limits is None else step.limits.model_dump(exclude_unset=True)

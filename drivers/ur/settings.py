@@ -55,6 +55,11 @@ class GenerationFacts:
     noise_n: float
     noise_nm: float
 
+    @property
+    def estimated_nm(self) -> float:
+        """How well an estimated torque is known, N·m; 0 for a measured one, whose noise commissioning judges."""
+        return 0.0 if self.zeroes_wrench else self.noise_nm
+
 
 GENERATIONS: Final[dict[Generation, GenerationFacts]] = {
     "e-series": GenerationFacts(

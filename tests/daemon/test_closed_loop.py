@@ -328,7 +328,7 @@ async def test_after_a_kill_with_a_gripped_tool_nothing_moves_and_start_waits_fo
             async with shearloop("run", str(second)) as refused:
                 _, errors = await refused.communicate()
             assert refused.returncode == 2
-            assert f"is driven by another daemon of this computer (process {killed.pid})" in errors.decode()
+            assert f"is driven by another program of this computer (process {killed.pid})" in errors.decode()
             killed.kill()
             await killed.wait()
         still = await standing(rig)

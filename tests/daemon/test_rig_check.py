@@ -1,16 +1,20 @@
 """An experiment that can never be carried out is refused before anything is opened."""
 
 import re
+from contextlib import nullcontext
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.rig import check_experiment
 from shearloop.daemon.torques import TorqueSource
+from shearloop.drivers.ur.settings import ForceBound, TorqueBound, read_settings
 from shearloop.errors import UserError
 
 SERIAL = {"device": {"path": "port"}}
@@ -176,3 +180,13 @@ def test_a_file_that_is_none_is_told_with_its_name(tmp_path):
     (tmp_path / "experiment.yaml").unlink()
     with pytest.raises(UserError, match=r"experiment\.yaml: the experiment cannot be read: No such file"):
         check_experiment(daemon, SOURCES)
+
+
+@pytest.mark.parametrize(("generation", "refused"), [("e-series", False), ("cb3", True)])
+def test_a_wrench_that_a_controller_estimates_drives_nothing_gentle(generation, refused, tmp_path):
+    settings = read_settings(Path(__file__).parents[2] / "config" / "ur.yaml")
+    limits = replace(settings.limits, torque_nm=TorqueBound(8.0, 12.0), force_n=ForceBound(45.0, 60.0))
+    robot = Commissioning(replace(settings, generation=generation, limits=limits), None, emulated=True)
+    made = config(tmp_path, {"torque_source": "wrench", "limits": {"torque_nm": 0.1}})
+    with pytest.raises(UserError, match="known to 5 N·m only") if refused else nullcontext():
+        check_experiment(made, SOURCES, robot)

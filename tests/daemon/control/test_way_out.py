@@ -20,7 +20,7 @@ from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.errors import DriverError
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
-from tests.daemon.control.loop_rig import EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
+from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS
 
 WAIT = {"do": "wait", "wait_s": 60}
@@ -258,6 +258,23 @@ def test_no_straight_move_begins_with_a_tool_that_is_or_may_be_gripped(sense):
 )
 def test_the_first_motion_is_told_before_a_start(steps, said):
     assert said in first_motion(ExperimentFile.model_validate({"name": "test", "steps": steps}))
+
+
+def test_a_source_within_whose_noise_the_limit_lies_neither_supervises_nor_drives():
+    """A CB3 estimates its wrench from the joints' currents."""
+    noisy = wrench_source(125.0, noise_nm=5.0)
+    loop = ControlLoop(CONFIG, {"right": EIT, WRENCH: noisy}, ("robot", "gripper"))
+    rig = started(Rig(loop), GRIP, {"do": "wait", "wait_s": 60})
+    rig.run(2)
+    for torque_nm in (2.4, -4.9):
+        loop.on_torque(TorqueSample(WRENCH, torque_nm, "", rig.t_ns, rig.t_ns))
+        rig.step()
+    assert phase(rig) is ExperimentPhase.RUNNING
+    stop(rig)
+    loop.acknowledge()
+    steps = [{"do": "wait", "wait_s": 1}]
+    driven = ExperimentFile.model_validate({"name": "one", "torque_source": WRENCH, "steps": steps})
+    assert "its torque is known to 5 N·m only, and the smallest limit is 0." in (loop.start(driven, rig.t_ns) or "")
 
 
 async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():

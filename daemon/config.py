@@ -34,7 +34,7 @@ from shearloop.drivers.defaults import (
     URCAP_PORT,
 )
 from shearloop.drivers.hosts import is_loopback_host, why_no_host
-from shearloop.drivers.robotiq.models import DEFAULT_MODEL, ModelName
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.mistakes import shown
@@ -314,8 +314,13 @@ class DaemonConfig(ConfigModel):
         """The folders of the experiments that a request may name: the configured ones and `experiment`'s."""
         return (*self.experiments, *((self.experiment.parent,) if self.experiment is not None else ()))
 
+    @property
+    def gripper_model(self) -> GripperModel | None:
+        """The model of the configured gripper, if there is one."""
+        return MODELS[self.gripper.model] if self.gripper is not None else None
+
     @model_validator(mode="after")
-    def _loop_is_whole(self) -> "DaemonConfig":
+    def _measures_and_is_consistent(self) -> "DaemonConfig":
         if not self.fingertips and self.skin is None and self.load_cell is None:
             raise ValueError("nothing is measured: give `fingertips`, a `skin` or a `load_cell`")
         if taken := sorted(TAKEN_NAMES & self.fingertips.keys()):

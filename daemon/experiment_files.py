@@ -6,7 +6,7 @@ they are. So a request names only files in the configured folders, and the reply
 
 import asyncio
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
@@ -16,9 +16,11 @@ from typing import TypeVar
 import structlog
 
 from shearloop.daemon.commissioning import Commissioning
-from shearloop.daemon.control.experiment_check import check_devices, check_steps
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.control.experiment_check import check_devices, check_steps, experiment_mistakes
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
 from shearloop.daemon.errors import InvalidExperimentError
+from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.errors import UserError
 from shearloop.files import read_file
@@ -37,6 +39,20 @@ Found = TypeVar("Found")
 def read_experiment(path: Path) -> ExperimentFile:
     """Return the experiment of a file; raises UserError for an invalid one, or one beyond its limits."""
     return _checked(read_document(path), None, None)
+
+
+def check_experiment(
+    config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None = None
+) -> ExperimentFile | None:
+    """Return the configured experiment, if any; raises UserError if the configured devices cannot run it.
+
+    `sources` are all torques but the robot's; `robot` has its limits and its cap, where they are known.
+    """
+    path = config.experiment
+    if path is None:
+        return None
+    document = read_document(path)
+    return without_mistakes(document, experiment_mistakes(document.content, config, sources, robot))
 
 
 def _checked(document: Document, robot: Commissioning | None, gripper: GripperModel | None) -> ExperimentFile:

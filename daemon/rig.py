@@ -1,47 +1,37 @@
-"""The rig: builds robot, gripper and control loop from the configuration, and checks its experiment."""
+"""The rig: builds robot, gripper and control loop from the configuration."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, commissioning_of, measured_widths
 from shearloop.daemon.config import DaemonConfig, GripperConfig
-from shearloop.daemon.control import experiment_check, experiment_schema
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment_schema import first_motion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
+from shearloop.daemon.control.loop_runner import ControlLoopRunner, wrench_source
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.state_publisher import loop_state
-from shearloop.daemon.experiment_files import ExperimentFiles, read_document, without_mistakes
+from shearloop.daemon.experiment_files import ExperimentFiles, check_experiment
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.rig_memory import RigMemory, memory_path
 from shearloop.daemon.sensing.sessions import COMBINED, torque_sources
-from shearloop.daemon.sensors import (
-    EMULATED_PATIENCE,
-    EMULATED_STALE_S,
-    Sensors,
-    Sessions,
-    build_sensors,
-    is_patient,
-    patience_of,
-)
+from shearloop.daemon.sensors import Sensors, Sessions, build_sensors
 from shearloop.daemon.supervisor import Supervisor, Task
-from shearloop.daemon.torques import TorqueSource
+from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.hosts import is_loopback_host
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
-from shearloop.drivers.robotiq.models import MODELS, GripperModel
 from shearloop.drivers.robotiq.socket_client import REPLY_DEADLINE_S, SocketClient
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
@@ -250,96 +240,10 @@ def build_rig(
     )
     robot.holds = loop.may_hold
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
-    experiments = ExperimentFiles(config.experiment_folders, commissioning, gripper_model(config))
+    experiments = ExperimentFiles(config.experiment_folders, commissioning, config.gripper_model)
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
     memory = RigMemory(memory_path(settings.host), loop, sensors.load_cell) if not config.autostart else None
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
     if memory is not None:
         tasks["memory"] = memory
     return sensors, Rig(loop, runner, tasks, experiments, recorder, memory, commissioning)
-
-
-def gripper_model(config: DaemonConfig) -> GripperModel | None:
-    """Return the model of the configured gripper, if there is one."""
-    return MODELS[config.gripper.model] if config.gripper is not None else None
-
-
-def check_experiment(
-    config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None = None
-) -> experiment_schema.ExperimentFile | None:
-    """Return the configured experiment, if any; raises UserError if the configured devices cannot run it.
-
-    `sources` are all torques but the robot's; `robot` has its limits and its cap, where they are known.
-    """
-    path = config.experiment
-    if path is None:
-        return None
-    document = read_document(path)
-    return without_mistakes(document, experiment_mistakes(document.content, config, sources, robot))
-
-
-def experiment_mistakes(
-    content: object, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None = None
-) -> list[experiment_schema.Mistake]:
-    """Return each step and key of an experiment's content that its own limits or the devices do not allow."""
-    driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
-    file = experiment_schema.outline(content)
-    mistakes = experiment_check.check_steps(file)
-    limits, cap = (robot.settings.limits, robot.cap) if robot is not None else (None, None)
-    mistakes += experiment_check.check_devices(file, limits, gripper_model(config), cap)
-    if file.torque_source and file.steps:
-        mistakes += _undriven(file.torque_source, driving, config)
-        if file.torque_source == WRENCH and robot is not None:
-            noise_nm, limit_nm = robot.settings.facts.estimated_nm, file.tightest_nm
-            if noise_nm >= limit_nm:
-                mistakes.append((("torque_source",), experiment_check.too_noisy(WRENCH, noise_nm, limit_nm)))
-    if config.gripper is None:
-        cure = "add a `gripper` section to the configuration, or take the step out"
-        mistakes += [
-            (("steps", number), f"{step.do} needs a gripper, and none is configured; {cure}")
-            for number, step in enumerate(file.steps)
-            if isinstance(step, experiment_schema.GripperStep)
-        ]
-    return mistakes + _unadaptable(file, sources)
-
-
-def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[experiment_schema.Mistake]:
-    """Return the mistake of a `torque_source` that measures no torque, if it is one."""
-    if drive in driving:
-        return []
-    near = "".join(f"; did you mean {name}?" for name in get_close_matches(drive, driving, 1))
-    return [(("torque_source",), f"`{drive}` {_why_not_driving(drive, config)}; there are {', '.join(driving)}{near}")]
-
-
-def _unadaptable(
-    file: experiment_schema.ExperimentFile, sources: Mapping[str, TorqueSource]
-) -> list[experiment_schema.Mistake]:
-    """Return each `adapt` step without a known torque, a gain to correct, or a twist before it."""
-    found: list[experiment_schema.Mistake] = []
-    twisted = False
-    for number, step in enumerate(file.steps):
-        if isinstance(step, experiment_schema.TareStep | experiment_schema.GripperStep):
-            twisted = False
-        twisted = twisted or isinstance(step, experiment_schema.TwistingStep)
-        if not isinstance(step, experiment_schema.AdaptStep) or "fingertip" not in step.model_fields_set:
-            continue
-        named = [name for name, source in sources.items() if source.has_gain]
-        if step.fingertip not in named:
-            known = f"choose one of {', '.join(named)}" if named else "calibrate one with `shearloop calibrate`"
-            why = f"adapt corrects `{step.fingertip}`, which has no calibration on recordings; {known}"
-            found.append((("steps", number), why))
-        if step.reference not in (*sources, WRENCH):
-            cure = "add a `load_cell` section to the configuration, or write `reference: wrench`"
-            found.append((("steps", number), f"adapt needs a load cell, and none is configured; {cure}"))
-        if not twisted:
-            cure = "put an `identify` or a `twist` before it, after the last `tare`, `grip` or `release`"
-            found.append((("steps", number), f"adapt needs a twisted tool; {cure}"))
-    return found
-
-
-def _why_not_driving(drive: str, config: DaemonConfig) -> str:
-    if drive in config.fingertips:
-        return "is a fingertip without a calibration, which has no torque: add `calibration`, or choose another"
-    if drive == "skin" and config.skin is not None:
-        return "has no torque without a radius: add `skin.tool_radius_mm`, or choose another"
-    return "is not a measured torque: choose another, or configure its device"

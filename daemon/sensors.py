@@ -9,6 +9,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.patience import patience_of
 from shearloop.daemon.recorder.recorder import Recorder
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask
 from shearloop.daemon.sensing.fingertip_task import ToolHolder
@@ -24,27 +25,12 @@ from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.estimation import Session
 
-# An emulated rig cannot hurt: its deadlines are longer by this factor, so that it survives a busy computer.
-EMULATED_PATIENCE = 10.0
-# A torque of an emulated sensor, and a state of an emulated robot, is fresh for this long.
-EMULATED_STALE_S = 5.0
-
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
     """Return the load cell's calibration; raises DriverError if it cannot be used."""
     if config.calibration is None:
         return LoadCalibration.of_torque_lines()
     return load_device_calibration(config.calibration, LoadCalibration)
-
-
-def patience_of(config: DaemonConfig) -> float:
-    """Return the factor on the deadlines of a rig's devices: above 1 for an emulated rig alone."""
-    return EMULATED_PATIENCE if is_patient(config) else 1.0
-
-
-def is_patient(config: DaemonConfig) -> bool:
-    """Return whether deadlines fit a busy computer: nothing that is emulated can hurt."""
-    return config.emulated and config.emulated_deadlines == "patient"
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,12 +119,12 @@ def build_sensors(
         sources = {name: inputs(name) for name in ReplayedSkin.sources}
         tareable[SKIN] = tasks[SKIN] = skin = SkinTask(config.skin, publisher, clock, loop, sources)
         tasks[SKIN_CURRENT] = skin.source
-    lever: LoadCell | None = None
-    if (cell := config.load_cell) is not None:
-        calibration = load_cell_calibration(cell)
-        lever = LoadCell(link(LOAD_CELL, cell.device), calibration, cell.rate_hz, inputs(LOAD_CELL), patience)
-        tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(lever, publisher, clock, loop, cell.rate_hz)
-    return Sensors(tasks, tareable, pairs, lever)
+    load_cell: LoadCell | None = None
+    if (own_cell := config.load_cell) is not None:
+        calibration, rate_hz = load_cell_calibration(own_cell), own_cell.rate_hz
+        load_cell = LoadCell(link(LOAD_CELL, own_cell.device), calibration, rate_hz, inputs(LOAD_CELL), patience)
+        tareable[LOAD_CELL] = tasks[LOAD_CELL] = LoadCellTask(load_cell, publisher, clock, loop, rate_hz)
+    return Sensors(tasks, tareable, pairs, load_cell)
 
 
 def _longest_tare_s(fingertip: FingertipConfig) -> float:

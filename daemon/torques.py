@@ -10,6 +10,8 @@ from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
 # The paper's ten frames take 5.4 s.
 LONGEST_TARE_S = 30.0
+# The source of the robot's own torque.
+WRENCH = "wrench"
 
 
 @dataclass(frozen=True, slots=True)

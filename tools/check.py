@@ -51,11 +51,10 @@ class Parts:
 
 def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulators) -> Parts:
     """Return what each part of the configuration in this file is; opens every file that it names."""
-    from shearloop.daemon.control.loop_runner import WRENCH
-    from shearloop.daemon.experiment_files import read_document
-    from shearloop.daemon.rig import check_experiment, experiment_mistakes, gripper_model
+    from shearloop.daemon.control.experiment_check import experiment_mistakes
+    from shearloop.daemon.experiment_files import check_experiment, read_document
     from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, torque_sources
-    from shearloop.daemon.torques import TorqueSource
+    from shearloop.daemon.torques import WRENCH, TorqueSource
 
     parts, sessions, combined = Parts(), {}, None
     with parts.of("emulators"):
@@ -94,7 +93,7 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
             document = read_document(config.experiment)
             mistakes = experiment_mistakes(document.content, config, sources, robot)
             limits = robot.settings.limits if robot is not None else None
-            _add_plan(parts, document, mistakes, limits, gripper_model(config), warm_up_s)
+            _add_plan(parts, document, mistakes, limits, config.gripper_model, warm_up_s)
         experiment = check_experiment(config, sources, robot)
         if experiment is not None:
             text = (

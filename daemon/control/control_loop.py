@@ -23,8 +23,8 @@ from shearloop.daemon.control.experiment_schema import (
     first_motion_before_grip,
 )
 from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
+from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
-from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import Compute, WristController, at_once
 from shearloop.daemon.loop_config import LoopConfig

@@ -1,10 +1,12 @@
 """Checks of an experiment: the steps that turn the tool, and the steps that limits or devices do not allow. No I/O."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from typing import NamedTuple
 
-from shearloop.daemon.commissioning import MotionCap
+from shearloop.daemon.commissioning import Commissioning, MotionCap
+from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ApproachStep,
@@ -24,7 +26,9 @@ from shearloop.daemon.control.experiment_schema import (
     TwistStep,
     demand,
     direction_of,
+    outline,
 )
+from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
@@ -236,3 +240,68 @@ def _outside_gripper(step: Step, model: GripperModel | None) -> str:
             beyond = model.why_beyond(step.width_mm, model.speed_mm_s[0], model.force_n[0])
             return f"asks for {beyond}" if beyond else ""
     return ""
+
+
+def experiment_mistakes(
+    content: object, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None = None
+) -> list[Mistake]:
+    """Return each step and key of an experiment's content that its own limits or the devices do not allow."""
+    driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
+    file = outline(content)
+    mistakes = check_steps(file)
+    limits, cap = (robot.settings.limits, robot.cap) if robot is not None else (None, None)
+    mistakes += check_devices(file, limits, config.gripper_model, cap)
+    if file.torque_source and file.steps:
+        mistakes += _undriven(file.torque_source, driving, config)
+        if file.torque_source == WRENCH and robot is not None:
+            noise_nm, limit_nm = robot.settings.facts.estimated_nm, file.tightest_nm
+            if noise_nm >= limit_nm:
+                mistakes.append((("torque_source",), too_noisy(WRENCH, noise_nm, limit_nm)))
+    if config.gripper is None:
+        cure = "add a `gripper` section to the configuration, or take the step out"
+        mistakes += [
+            (("steps", number), f"{step.do} needs a gripper, and none is configured; {cure}")
+            for number, step in enumerate(file.steps)
+            if isinstance(step, GripperStep)
+        ]
+    return mistakes + _unadaptable(file, sources)
+
+
+def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[Mistake]:
+    """Return the mistake of a `torque_source` that measures no torque, if it is one."""
+    if drive in driving:
+        return []
+    near = "".join(f"; did you mean {name}?" for name in get_close_matches(drive, driving, 1))
+    return [(("torque_source",), f"`{drive}` {_why_not_driving(drive, config)}; there are {', '.join(driving)}{near}")]
+
+
+def _unadaptable(file: ExperimentFile, sources: Mapping[str, TorqueSource]) -> list[Mistake]:
+    """Return each `adapt` step without a known torque, a gain to correct, or a twist before it."""
+    found: list[Mistake] = []
+    twisted = False
+    for number, step in enumerate(file.steps):
+        if isinstance(step, TareStep | GripperStep):
+            twisted = False
+        twisted = twisted or isinstance(step, TwistingStep)
+        if not isinstance(step, AdaptStep) or "fingertip" not in step.model_fields_set:
+            continue
+        named = [name for name, source in sources.items() if source.has_gain]
+        if step.fingertip not in named:
+            known = f"choose one of {', '.join(named)}" if named else "calibrate one with `shearloop calibrate`"
+            why = f"adapt corrects `{step.fingertip}`, which has no calibration on recordings; {known}"
+            found.append((("steps", number), why))
+        if step.reference not in (*sources, WRENCH):
+            cure = "add a `load_cell` section to the configuration, or write `reference: wrench`"
+            found.append((("steps", number), f"adapt needs a load cell, and none is configured; {cure}"))
+        if not twisted:
+            cure = "put an `identify` or a `twist` before it, after the last `tare`, `grip` or `release`"
+            found.append((("steps", number), f"adapt needs a twisted tool; {cure}"))
+    return found
+
+
+def _why_not_driving(drive: str, config: DaemonConfig) -> str:
+    if drive in config.fingertips:
+        return "is a fingertip without a calibration, which has no torque: add `calibration`, or choose another"
+    if drive == "skin" and config.skin is not None:
+        return "has no torque without a radius: add `skin.tool_radius_mm`, or choose another"
+    return "is not a measured torque: choose another, or configure its device"

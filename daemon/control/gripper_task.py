@@ -9,7 +9,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
-from shearloop.daemon.control.samples import GripperStatus
+from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.errors import DriverError

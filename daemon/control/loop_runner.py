@@ -14,19 +14,18 @@ from shearloop.daemon.control.experiment import Experiment, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
+from shearloop.daemon.control.inputs import ArmStatus
 from shearloop.daemon.control.safety import Fault, FaultCode
-from shearloop.daemon.control.samples import ArmStatus
 from shearloop.daemon.control.state_publisher import PUBLISH_EVERY, StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import error_text
-from shearloop.daemon.torques import Tareable, TorqueSample, TorqueSource
+from shearloop.daemon.torques import WRENCH, Tareable, TorqueSample, TorqueSource
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
 from shearloop.errors import ActionError
 
-WRENCH = "wrench"
 # Without a new state the loop decides after this time, half of the time after which the arm's state is stale.
 LONGEST_SILENCE_S = 0.5 * ARM_STALE_S
 # While nothing moves, a loop is late only after this.

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
-from shearloop.daemon.control.samples import ArmStatus
+from shearloop.daemon.control.inputs import ArmStatus
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque

@@ -29,7 +29,6 @@ from shearloop.cli.options import path_of
 from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
-from shearloop.daemon.control.loop_runner import WRENCH
 from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
@@ -37,6 +36,7 @@ from shearloop.daemon.rig import LOOP_KEYS
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
+from shearloop.daemon.torques import WRENCH
 from shearloop.tools.task_row import task_row
 from tests.paper_curve import paper_curve
 from tests.sample_messages import sample

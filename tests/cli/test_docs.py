@@ -17,7 +17,7 @@ from shearloop.cli import COMMANDS, command_module
 from shearloop.cli.completion import arguments_of, full_parser, parts_of
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import STEP_KINDS
-from shearloop.daemon.rig import check_experiment
+from shearloop.daemon.experiment_files import check_experiment
 from shearloop.daemon.torques import TorqueSource
 from shearloop.estimation.estimator_names import ESTIMATORS
 from shearloop.tools.bank_config import load_bank_plan

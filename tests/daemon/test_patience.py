@@ -9,11 +9,11 @@ from shearloop.daemon import rig
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import Watched, detect_faults
+from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyMonitor
-from shearloop.daemon.control.samples import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.patience import EMULATED_PATIENCE, patience_of
 from shearloop.daemon.rig import make_loop, open_settings
-from shearloop.daemon.sensors import EMULATED_PATIENCE
 from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.errors import UserError
@@ -81,7 +81,7 @@ async def test_the_gripper_of_an_emulated_rig_may_answer_later(emulated, deadlin
         (tmp_path / "rig.yaml").write_text(yaml.safe_dump({**content, "robot": "ur.yaml"}))
         robot_at("127.0.0.1", tmp_path)
         config = load_daemon_config(tmp_path / "rig.yaml")
-        client = rig.make_gripper_client(config.gripper, rig.patience_of(config))
+        client = rig.make_gripper_client(config.gripper, patience_of(config))
         await client.connect()
         with pytest.raises(DeviceLostError, match=f"within {deadline}"):
             await client.read()

@@ -12,7 +12,7 @@ import yaml
 
 from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
-from shearloop.daemon.rig import check_experiment
+from shearloop.daemon.experiment_files import check_experiment
 from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.ur.settings import ForceBound, TorqueBound, read_settings
 from shearloop.errors import UserError

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.sensors import is_patient
+from shearloop.daemon.patience import is_patient
 from shearloop.drivers.ur.settings import UrSettings
 
 # The wrist stands this long after the last decision (docs/safety.md).

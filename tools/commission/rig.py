@@ -5,9 +5,10 @@ from contextlib import AbstractContextManager, aclosing
 from typing import Protocol
 
 from shearloop.daemon.config import DaemonConfig, LoadCellConfig
+from shearloop.daemon.patience import patience_of
 from shearloop.daemon.rig import gripper_calibration, make_gripper_client
 from shearloop.daemon.sensing.sessions import fingertip_table
-from shearloop.daemon.sensors import load_cell_calibration, patience_of
+from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.drivers.connection import SerialLink
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.load_cell import LoadCell, LoadSample

@@ -23,6 +23,7 @@ from shearloop.daemon.clock import Clock, ClockReading
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.patience import patience_of
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.sensing.fingertip_messages import (
     adapted_message,
@@ -38,7 +39,7 @@ from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session
 from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
 from shearloop.daemon.sensing.snapshots import SnapshotError, restored
-from shearloop.daemon.sensors import load_cell_calibration, patience_of
+from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent

@@ -14,10 +14,10 @@ from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.gripper_task import OPENING
-from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner, wrench_source
-from shearloop.daemon.control.samples import GripperStatus
+from shearloop.daemon.control.inputs import GripperStatus
+from shearloop.daemon.control.loop_runner import ControlLoopRunner, wrench_source
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.torques import TorqueSample
+from shearloop.daemon.torques import WRENCH, TorqueSample
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, MoveLinear, RobotState, WristSpeed
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS, FakeArm, HandlerBench

@@ -9,8 +9,8 @@ import numpy as np
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import Action, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
+from shearloop.daemon.control.inputs import ArmStatus, GripperStatus
 from shearloop.daemon.control.safety import Fault, FaultCode
-from shearloop.daemon.control.samples import ArmStatus, GripperStatus
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample, TorqueSource
 from shearloop.emulators.scene import Twin, TwinSettings

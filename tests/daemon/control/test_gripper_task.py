@@ -13,7 +13,7 @@ from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.samples import GripperStatus
+from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.drivers.errors import DriverError
 from shearloop.errors import ActionError
 from shearloop.estimation.confidence import TWO_SIDED_95

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from shearloop.daemon.control.action_executor import along_tool
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.loop_runner import WRENCH, ControlLoopRunner
+from shearloop.daemon.control.loop_runner import ControlLoopRunner
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging.messages import LoopStop
+from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
 from shearloop.errors import ActionError

@@ -7,12 +7,13 @@ import pytest
 from structlog.testing import capture_logs
 
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
+from shearloop.daemon.control.inputs import GripperStatus
+from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.daemon.control.samples import GripperStatus
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import wire_map
 from shearloop.daemon.run_summary import RunSummary
+from shearloop.daemon.torques import WRENCH
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven
 from tests.drivers.ur.handler_bench import SETTINGS
 

@@ -14,10 +14,10 @@ from shearloop.daemon.control.control_loop import LOADED_NM, ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
 from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, first_motion
-from shearloop.daemon.control.loop_runner import WRENCH, wrench_source
+from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.torques import TorqueSample
+from shearloop.daemon.torques import WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop

@@ -15,7 +15,8 @@ import yaml
 from shearloop.cli.rehearsal import rehearsal, sentences_of_run
 from shearloop.daemon.commissioning import CAPPED_NM, CAPPED_RAD_PER_S, commissioning_of
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
-from shearloop.daemon.rig import check_experiment, open_settings
+from shearloop.daemon.experiment_files import check_experiment
+from shearloop.daemon.rig import open_settings
 from shearloop.errors import UserError
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.procedure import STAGES, commission

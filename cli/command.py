@@ -11,7 +11,7 @@ from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.callers import caller
 
-COMMANDS = {
+DAEMON_COMMANDS = {
     "tare": "set the zero of the torque sensors, with nothing gripped and no experiment running",
     "status": "show the experiment and the state of each task",
     "experiments": "list the experiments that `start` may name",
@@ -39,10 +39,12 @@ Exit status: 0 done, 1 refused, 2 no answer. On the daemon's own machine `stop` 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `command`."""
     parser.description = "Send a command to a running daemon and print the reply."
-    width = max(map(len, COMMANDS))
-    parser.epilog = "commands:\n" + "".join(f"  {name:<{width}}  {what}\n" for name, what in COMMANDS.items()) + EPILOG
+    width = max(map(len, DAEMON_COMMANDS))
+    parser.epilog = (
+        "commands:\n" + "".join(f"  {name:<{width}}  {what}\n" for name, what in DAEMON_COMMANDS.items()) + EPILOG
+    )
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("name", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
+    parser.add_argument("name", choices=DAEMON_COMMANDS, metavar="COMMAND", help="one of the commands below")
     parser.add_argument("--source", metavar="NAME", help="for tare: name of the sensor (default: all)")
     add_option(parser, "--experiment", Path, "FILE", "for start (default: that of the configuration)")
     parser.add_argument("--yes", action="store_true", help="for release: the tool may drop; for tare: nothing is held")

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
-from shearloop.cli.command import COMMANDS
+from shearloop.cli.command import DAEMON_COMMANDS
 from shearloop.cli.config_schema import MODELS, Section, references, schema_of, schema_text, sections
 from shearloop.daemon.control.safety import TABLE, Response
 from shearloop.daemon.messaging.messages import TOPICS, Message
@@ -39,7 +39,7 @@ def topics() -> str:
 
 def commands() -> str:
     """Return the table of commands."""
-    return table(("command", "what it does"), [(f"`{name}`", what) for name, what in COMMANDS.items()])
+    return table(("command", "what it does"), [(f"`{name}`", what) for name, what in DAEMON_COMMANDS.items()])
 
 
 def subscribers() -> str:

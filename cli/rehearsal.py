@@ -42,7 +42,7 @@ def rehearsal(config: "DaemonConfig", path: Path) -> Iterator[Rehearsal]:
     if config.emulated or config.emulators:
         raise UserError(f"{path} is emulated already: run it without --emulate")
     with tempfile.TemporaryDirectory(prefix="shearloop-") as folder:
-        yield _Stage(config, path, Path(folder)).rehearsal()
+        yield _DeviceReplacer(config, path, Path(folder)).rehearsal()
 
 
 def sentences_of_run(config: "DaemonConfig") -> Iterator[str]:
@@ -64,7 +64,7 @@ def sentences_of_run(config: "DaemonConfig") -> Iterator[str]:
         yield f"recordings go into {config.recording.folder}"
 
 
-class _Stage:
+class _DeviceReplacer:
     """Replaces one device after the other."""
 
     def __init__(self, config: "DaemonConfig", path: Path, folder: Path) -> None:

@@ -181,7 +181,7 @@ class CommandHandler:
         self._arm = arm
         self._executor = MotionExecutor(settings, arm, now_ns)
         self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s)
-        self._held_reason = NOT_ENABLED
+        self._disabled_reason = NOT_ENABLED
         self._daemon_alive_ns = now_ns
         # Whether the gripper holds something, as the daemon says.
         self._held_tool = False
@@ -239,7 +239,7 @@ class CommandHandler:
             case Enable() | Unlock():
                 refusal = unfit or self._executor.violation(sample)
                 if not refusal:
-                    self._held_reason = ""
+                    self._disabled_reason = ""
                 return CommandReply(refusal=refusal)
             case ZeroForceTorque():
                 return CommandReply(refusal=unfit or self._zero_wrench(sample))
@@ -263,7 +263,7 @@ class CommandHandler:
             if not self.at_rest:
                 # The next sample may be fit again; a refused stop stops the arm all the same.
                 self._executor.leave_to_watchdog(unfit)
-            return f"Nothing can be sent, and the arm stops by itself. {unfit}"
+            return f"{unfit} Nothing can be sent, and the arm stops by itself."
         return self._executor.stop_on_command(number, command, sample, now_ns)
 
     def _zero_wrench(self, sample: RtdeSample) -> str:
@@ -288,7 +288,7 @@ class CommandHandler:
         unfit = self._why_unfit(sample)
         if unfit:
             # Nothing can be sent. The arm stops by itself, or by its watchdog, which is not fed now.
-            self._held_reason = unfit
+            self._disabled_reason = unfit
             if not self.at_rest:
                 # The program may turn the wrist on, also when it is resumed.
                 self._executor.leave_to_watchdog(unfit)
@@ -297,7 +297,7 @@ class CommandHandler:
             return None
         beyond = self._executor.violation(sample)
         if beyond:
-            self._held_reason = beyond
+            self._disabled_reason = beyond
             self._executor.stop(sample, now_ns, beyond)
         elif now_ns - self._daemon_alive_ns > self._settings.silence_timeout_s * 1e9:
             silent = f"the daemon was silent for {self._settings.silence_timeout_s:g} s"
@@ -330,17 +330,17 @@ class CommandHandler:
         """Return why motion is refused, or the empty string."""
         if self._recovery is not None:
             return BEING_MADE_READY
-        return self._why_unfit(sample) or self._executor.violation(sample) or self._held_reason
+        return self._why_unfit(sample) or self._executor.violation(sample) or self._disabled_reason
 
     def _end_recovery(self, recovery: Recovery) -> tuple[int, CommandReply] | None:
         self._recovery = None
         if recovery.ready:
             self._executor.enable()
         if recovery.unlock_number is None:
-            self._held_reason = recovery.refusal or self._held_reason
+            self._disabled_reason = recovery.refusal or self._disabled_reason
             return None
         if recovery.ready:
-            self._held_reason = ""
+            self._disabled_reason = ""
         return recovery.unlock_number, CommandReply(refusal=recovery.refusal or "")
 
     def end_program(self, sample: RtdeSample) -> None:

@@ -12,7 +12,7 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.cli.command import COMMANDS
+from shearloop.cli.command import DAEMON_COMMANDS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import EXPERIMENTS, Commands
 from shearloop.daemon.messaging.callers import UNKNOWN, caller, caller_of
@@ -131,7 +131,7 @@ def test_foreign_messages_are_an_error(tmp_path):
 def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
     server = pytest.importorskip("shearloop.daemon.web.server", reason="the live page needs the extra `view`")
     handled = Commands(rig=None, sensors=None, experiment=None, health=None, daemon_end=None).handlers()
-    assert set(COMMANDS) == set(handled) == {*server.NEEDS_TOKEN, STATUS, STOP, EXPERIMENTS}
+    assert set(DAEMON_COMMANDS) == set(handled) == {*server.NEEDS_TOKEN, STATUS, STOP, EXPERIMENTS}
 
 
 async def test_commands_are_told_with_their_answer_and_questions_are_not():

@@ -1,6 +1,6 @@
 """A daemon that breaks on request, for `benchmarks.stop_times`: `python -m benchmarks.breakable_daemon run CONFIG`.
 
-SIGUSR1 blocks its event loop for `BLOCKED_S`. SIGUSR2 makes the pipe to the robot's process lose each write. Each
+SIGUSR1 blocks its event loop for `BLOCKED_S`. SIGUSR2 makes the pipe to the worker lose each write. Each
 writes its time in ns into the pipe `cause` in the configuration's folder.
 """
 
@@ -30,7 +30,7 @@ def block_event_loop(_number: int, _frame: FrameType | None) -> None:
 
 
 def lose_commands(_number: int, _frame: FrameType | None) -> None:
-    """Replace the pipe to the robot's process; the process keeps an open, silent input."""
+    """Replace the pipe to the worker; the process keeps an open, silent input."""
     for connection in [one for one in gc.get_objects() if isinstance(one, WorkerConnection)]:
         pipe = connection._stdin.get_extra_info("pipe") or connection._stdin.get_extra_info("socket")
         os.dup(pipe.fileno())

@@ -5,7 +5,7 @@
 
 A daemon runs in this process, with the default estimator. One frame is traced in all tasks and threads: from its first
 byte to the subscriber's receipt of the estimate. Then the daemon runs an experiment on the emulated rig. One estimate
-is traced from its arrival in the control loop to the speed that the robot's worker process gives to ur-rtde, with the
+is traced from its arrival in the control loop to the speed that the worker gives to ur-rtde, with the
 decisions that lie between. Of several frames and estimates the one with the fewest functions counts: messages that a
 task publishes once a second do not belong to it. Generators count once, and comprehensions do not count.
 """
@@ -168,7 +168,7 @@ async def trace_command(rig: Path, folder: Path) -> Way:
 
 @contextlib.contextmanager
 def traced_worker(folder: Path) -> Iterator[None]:
-    """Let the robot's process be traced: the daemon starts it with a launcher that calls `run_worker`."""
+    """Let the worker be traced: the daemon starts it with a launcher that calls `run_worker`."""
     launcher, python = folder / "python", sys.executable
     call = f"from pathlib import Path; from benchmarks.call_trace import run_worker; run_worker(Path('{folder}'))"
     launcher.write_text(f'#!/bin/sh\nexec "{python}" -c "{call}"\n')

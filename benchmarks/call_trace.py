@@ -1,6 +1,6 @@
 """Records which functions of the package a thread calls, in this process and in the robot's.
 
-It imports little: the robot's process has to answer within seconds.
+It imports little: the worker has to answer within seconds.
 """
 
 import json
@@ -104,7 +104,7 @@ def module_of(filename: str) -> str | None:
 
 
 def run_worker(folder: Path) -> None:
-    """Run the robot's process; write the shortest path of a wrist speed into a file of the folder."""
+    """Run the worker; write the shortest path of a wrist speed into a file of the folder."""
     trace = WorkerTrace(folder / WORKER)
     trace.recording = True
     trace.install()
@@ -112,7 +112,7 @@ def run_worker(folder: Path) -> None:
 
 
 class WorkerTrace(WayTrace):
-    """Records the ways of wrist speeds through the robot's process; the shortest one is in a file."""
+    """Records the ways of wrist speeds through the worker; the shortest one is in a file."""
 
     def __init__(self, path: Path) -> None:
         begun = worker.handle_commands.__code__

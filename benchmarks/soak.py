@@ -4,7 +4,7 @@
 
 The real daemon and drivers on the emulated rig, whose boards, gel and fingers are `--speed` times as fast. Every
 experiment turns the tool until a device fails, in the random order of the seed; then the device works again. The daemon
-records all the time. Writes the memory and the descriptors of the daemon and of the robot's process before each fault.
+records all the time. Writes the memory and the descriptors of the daemon and of the worker before each fault.
 """
 
 import random
@@ -25,7 +25,7 @@ FAULTS = [cause for cause in CAUSES if cause.command and not cause.straight]
 
 
 def usage(rig: RunningRig) -> dict[str, float]:
-    """Return the memory in MB and the number of descriptors of the daemon and of the robot's process."""
+    """Return the memory in MB and the number of descriptors of the daemon and of the worker."""
     found = {}
     for name, pid in (("daemon", rig.daemon.pid), ("worker", rig.worker_pid())):
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()

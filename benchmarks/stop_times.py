@@ -145,7 +145,7 @@ class RunningRig:
         self.daemon, _ = self._daemons.enter_context(running_daemon(self._config, "benchmarks.breakable_daemon"))
 
     def worker_pid(self) -> int:
-        """Return the robot's process."""
+        """Return the worker."""
         children = Path(f"/proc/{self.daemon.pid}/task/{self.daemon.pid}/children").read_text().split()
         for pid in children:
             if b"shearloop.drivers.ur.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():

@@ -123,7 +123,7 @@ def make_loop(
     `supplied` is of the rig's report.
     """
     sources = {**sources, WRENCH: wrench_source(robot.rate_hz, robot.facts.estimated_nm)}
-    # Controller, identification and commands plan with what the robot's process lets through.
+    # Controller, identification and commands plan with what the worker lets through.
     limited = {
         name: min(getattr(config.loop, name), getattr(robot.limits, name).inner)
         for name in ("wrist_speed_rad_per_s", "wrist_acceleration_rad_per_s2")

@@ -22,7 +22,7 @@ D_M = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)
 ALPHA_RAD = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 # Elbow up, the tool pointing straight down.
 HOME_RAD = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
-# Data sheet of the UR5e: 180 degrees per second. A linear move that needs more, near a singularity, ends in a
+# Data sheet of the UR5e: 180 degrees per second. A straight move that needs more, near a singularity, ends in a
 # protective stop.
 JOINT_SPEED_LIMIT_RAD_PER_S = math.pi
 # UR's forum: a CB3 estimates forces to ± 10 N and ± 5 N·m; the components, so that their norm is within that.
@@ -269,7 +269,7 @@ class Arm:
         )
 
     def move_to(self, pose: Vector, speed: float, acceleration: float) -> None:
-        """Begin a linear move."""
+        """Begin a straight move."""
         speed *= self.speed_slider
         self.motion = LinearMove(self._frame, frame_of_pose(pose), speed, acceleration, self._tool)
 
@@ -278,7 +278,7 @@ class Arm:
         self.motion = Speed(np.zeros(6), deceleration, True, self.braking_rad_per_s2) if self.moving else None
 
     def halt_on_line(self, deceleration: float) -> None:
-        """Slow a linear move down to rest on its line; anything else as `halt` does."""
+        """Slow a straight move down to rest on its line; anything else as `halt` does."""
         if isinstance(self.motion, LinearMove):
             self.motion.stop(deceleration)
         else:

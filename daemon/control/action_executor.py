@@ -211,7 +211,7 @@ class ActionExecutor:
     async def _rest(self) -> None:
         """Wait until no motion is under way; raises ActionError.
 
-        Resting joints are not enough: after a stop the robot's process is busy a little longer, and refuses a move.
+        Resting joints are not enough: after a stop the worker is busy a little longer, and refuses a move.
         """
         sender = self.sender
         try:
@@ -271,7 +271,7 @@ async def tare_all(sensors: Iterable[Tareable], within_s: float = LONGEST_TARE_S
 
 
 def _accepted(reply: CommandReply) -> None:
-    """Raise ActionError for a command that the robot's process refused."""
+    """Raise ActionError for a command that the worker refused."""
     if not reply.accepted:
         raise ActionError(reply.refusal)
 

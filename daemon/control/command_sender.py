@@ -1,4 +1,4 @@
-"""Sends wrist speeds and stops to the robot's process, and keeps the speed that it accepted last."""
+"""Sends wrist speeds and stops to the worker, and keeps the speed that it accepted last."""
 
 import asyncio
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from shearloop.drivers.ur.messages import CommandReply, Stop, WristSpeed
 
 @dataclass(slots=True)
 class CommandSender:
-    """Sends wrist speeds and stops to the robot's process; a refusal is a fault of the control loop."""
+    """Sends wrist speeds and stops to the worker; a refusal is a fault of the control loop."""
 
     robot: UrRobot
     control_loop: ControlLoop
     stops: StopTimeline
     clock: Clock
-    # The speed that the robot's process accepted last.
+    # The speed that the worker accepted last.
     sent_rad_per_s: float = 0.0
     # Commands that wait for their replies.
     unanswered: int = 0

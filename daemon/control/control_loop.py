@@ -373,7 +373,7 @@ class ControlLoop:
     def tick(self, t_ns: int, late_s: float = 0.0, sent_rad_per_s: float | None = None) -> ControlOutput:
         """Return the commands for now; the loop is `late_s` late.
 
-        `sent_rad_per_s` is the wrist speed that the robot's process accepted last, None while it has not answered.
+        `sent_rad_per_s` is the wrist speed that the worker accepted last, None while it has not answered.
         """
         if sent_rad_per_s is not None:
             self.wrist.sent(sent_rad_per_s)

@@ -134,7 +134,7 @@ class ControlLoopRunner:
             return
         try:
             self._decide()
-        except Exception:  # noqa: BLE001 - the robot's process stops the arm as it ends
+        except Exception:  # noqa: BLE001 - the worker stops the arm as it ends
             structlog.get_logger().exception("the loop crashed at its last decision")
 
     @property
@@ -259,7 +259,7 @@ class ControlLoopRunner:
         """End an unlocking or a release, and halt the fingers that it moves; return whether one was under way."""
         stopped = self.actions.stop_unlocking()
         if stopped:
-            # The robot's process ends its part.
+            # The worker ends its part.
             self._robot.send(self._sender.stop_command)
         return stopped
 

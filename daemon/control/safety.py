@@ -177,7 +177,7 @@ class FaultCode(Enum):
     )
     COMMAND_UNANSWERED = Rule(
         Response.NOTE,
-        "the robot's process ended before it answered a command: {detail}.",
+        "the robot's worker ended before it answered a command: {detail}.",
         "It restarts automatically; once the robot is connected again, `shearloop command unlock`.",
     )
     STEP_OVERDUE = Rule(

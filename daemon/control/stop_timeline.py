@@ -56,7 +56,7 @@ class StopTimeline:
         )
 
     def on_sent(self, now_ns: int) -> None:
-        """Take the reply of the robot's process to the stop."""
+        """Take the reply of the worker to the stop."""
         stop = self._stop
         if stop is not None and self._sent_ns is None:
             self._sent_ns, self._stands_ns = now_ns, None

@@ -75,7 +75,7 @@ class WristController:
             self._pending.append(torque)
 
     def sent(self, speed_rad_per_s: float) -> None:
-        """Take the speed that the robot's process accepted last."""
+        """Take the speed that the worker accepted last."""
         self._sent_rad_per_s = speed_rad_per_s
         if self.controller is not None:
             self.controller.sent(speed_rad_per_s)

@@ -1,4 +1,4 @@
-"""The one limit of the speeds that the daemon forms; the robot's process and its script check what they are sent."""
+"""The one limit of the speeds that the daemon forms; the worker and the script on the robot check what they get."""
 
 import math
 from dataclasses import dataclass

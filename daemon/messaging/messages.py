@@ -241,9 +241,9 @@ class LoopStop(Message):
     faults: str = column("", "codes of the faults that stopped it, separated by commas, the cause's first")
     response: str = column("", "the safety response")
     decided_after_s: float = column("s", "from the measurement or request that caused it to the decision")
-    sent_after_s: float | None = column("s", "until the robot's process had sent the stop; nil if it did not answer")
+    sent_after_s: float | None = column("s", "until the robot's worker had sent the stop; nil if it did not answer")
     stands_after_s: float | None = column("s", "until the robot measured a standstill; nil if it did not within 5 s")
-    refusal: str = column("", "why the robot's process did not send the stop, in sentences; empty when it did")
+    refusal: str = column("", "why the robot's worker did not send the stop, in sentences; empty when it did")
     blocked_after_s: float | None = column(
         "s", "until the robot's state showed that it takes no command; nil unless the stop was refused"
     )
@@ -318,11 +318,11 @@ def stop_times(loop_stop: Mapping[str, Any]) -> str:
         value = loop_stop.get(key)
         return None if value is None else f"after {with_unit(LoopStop.topic, key, value, '.3f')}"
 
-    sent = f"sent {after('sent_after_s')}" if after("sent_after_s") else "no reply of the robot's process"
+    sent = f"sent {after('sent_after_s')}" if after("sent_after_s") else "no reply of the robot's worker"
     stands = f"standstill {after('stands_after_s')}" if after("stands_after_s") else "no standstill measured"
     if loop_stop.get("refusal"):
         blocked = after("blocked_after_s")
-        sent = f"not sent, because the robot was blocked {blocked}" if blocked else "refused by the robot's process"
+        sent = f"not sent, because the robot was blocked {blocked}" if blocked else "refused by the robot's worker"
         stands += ", by the robot's own stop" if after("stands_after_s") else ""
     return f"decided {after('decided_after_s')}, {sent}, {stands}"
 

@@ -1,4 +1,4 @@
-"""The UR arm: `client.UrRobot` in the daemon's event loop, and ur-rtde in a worker process behind a pipe.
+"""The UR arm: `client.UrRobot` in the daemon's event loop, and ur-rtde in a worker behind a pipe.
 
 In the daemon: `client` runs the worker, `settings` has limits and deadlines, `messages` passes between both. In
 the `worker`: `command_handler` accepts or refuses commands, `motion` keeps one within the limits, `arm` calls

@@ -1,4 +1,4 @@
-"""The arm through ur-rtde. Only this module calls ur-rtde, and only the worker process imports this module.
+"""The arm through ur-rtde. Only this module calls ur-rtde, and only the worker imports this module.
 
 ur-rtde is not thread-safe. Its calls block for up to 301 s, its constructors hold the interpreter lock, and it crashes
 its process when RTDE is lost or it has connected again. So it has a process of its own, with an alarm before each call.
@@ -61,7 +61,7 @@ class UrArm:
         self._control = kind(settings.host, settings.rate_hz, flags)
         _set_timer_slack(0)
         self._script_port = ScriptPort(settings.host, _UPLOAD_S)
-        # A linear move was begun, and the wrist has not turned since.
+        # A straight move was begun, and the wrist has not turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
         # In the base's frame: of a controller that cannot zero its wrench, or that has zeroed it with a load.
@@ -93,7 +93,7 @@ class UrArm:
         return self._primary.read() if self._primary is not None else []
 
     def wrist(self, command: WristSpeed, left_s: float) -> bool:
-        """Turn wrist 3 for `left_s` at most, and hold the other joints; not during a linear move."""
+        """Turn wrist 3 for `left_s` at most, and hold the other joints; not during a straight move."""
         self._may_move_linearly = False
         self._write_deadline(left_s)
         speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
@@ -104,7 +104,7 @@ class UrArm:
         return self._send_once(self._control.speedStop, deceleration_rad_per_s2)
 
     def move(self, command: MoveLinear) -> bool:
-        """Begin a linear move; `RtdeSample.moving_linearly` shows its end."""
+        """Begin a straight move; `RtdeSample.moving_linearly` shows its end."""
         if not self.script_readiness.wait():
             return False
         self._may_move_linearly = True
@@ -113,13 +113,13 @@ class UrArm:
         return self._send_once(self._control.moveL, [*command.pose], speed, acceleration, asynchronous=True)
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
-        """Begin to end a linear move."""
+        """Begin to end a straight move."""
         # ur-rtde does not report whether the stop was accepted; the heartbeat after it does.
         self._send_once(self._control.stopJ, deceleration_rad_per_s2, asynchronous=True)
         return self.send_heartbeat()
 
     def send_heartbeat(self, left_s: float | None = None) -> bool:
-        """Feed the robot's watchdog; a linear move goes on for `left_s` at most."""
+        """Feed the robot's watchdog; a straight move goes on for `left_s` at most."""
         if left_s is not None:
             self._write_deadline(left_s)
         return self.script_readiness.wait() and bool(self._control.kickWatchdog())

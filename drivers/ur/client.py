@@ -1,4 +1,4 @@
-"""The daemon's end of the robot: `UrRobot` runs the worker process and replaces it when it dies.
+"""The daemon's end of the robot: `UrRobot` runs the worker and replaces it when it dies.
 
 A new worker has motion disabled. No command is sent twice, and nothing moves before the next `Enable` or `Unlock`.
 """
@@ -29,7 +29,7 @@ SettingsFor: TypeAlias = Callable[[str, str], UrSettings]
 EXIT_S = 3.0
 # The worker's own alarms end it at a known place; the daemon kills it this much later.
 GRACE_S = 1.0
-# The module of the worker process.
+# The module of the worker.
 WORKER = "shearloop.drivers.ur.worker"
 # The worker's activity once it sends states.
 CONTROLLING = "controlling"
@@ -71,7 +71,7 @@ class UrRobot:
         """`warns`: say at each connection that the deadlines are longer than promised.
 
         `settings_for` returns the settings for a controller of this version and serial number, else these. `worker` is
-        the module of the worker process.
+        the module of the worker.
         """
         self._worker = worker
         self.settings = settings
@@ -154,7 +154,7 @@ class UrRobot:
     def _disconnect(self) -> None:
         self._connection = None
         self.state = None
-        unanswered = messages.CommandReply("The robot's process ended before it answered; nothing is sent again.")
+        unanswered = messages.CommandReply("The robot's worker ended before it answered; nothing is sent again.")
         for number in list(self._replies):
             self.handle_message(number, unanswered)
 
@@ -194,12 +194,12 @@ class UrRobot:
             raise RobotLostError(
                 "other-limits",
                 f"The controller at {settings.host} is not the one before, or not the one of the rig's report: the "
-                "robot's process starts again with the limits for it.",
+                "robot's worker starts again with the limits for it.",
             )
 
 
 class WorkerConnection(asyncio.SubprocessProtocol):
-    """The pipes to one worker process, its end, and the reason for that."""
+    """The pipes to one worker, its end, and the reason for that."""
 
     def __init__(self, settings: UrSettings, robot: UrRobot) -> None:
         self._settings = settings
@@ -300,7 +300,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         cause = ": it lost the controller" if -status in (signal.SIGSEGV, signal.SIGABRT) else ""
         return RobotLostError(
             "crashed",
-            f"The robot's process {end} while {self._activity}{cause}. The script on the robot stops the arm; the "
+            f"The robot's worker {end} while {self._activity}{cause}. The script on the robot stops the arm; the "
             f"process is started again with motion disabled.{self._last_words()}",
         )
 
@@ -309,7 +309,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
             sentence = messages.silent_sentence(self._settings.host, self._settings.connect_timeout_s, self._activity)
         else:
             sentence = (
-                f"The robot's process did not answer for {seconds:.1f} s and was ended. The script on the robot stops "
+                f"The robot's worker did not answer for {seconds:.1f} s and was ended. The script on the robot stops "
                 "the arm; the process is started again with motion disabled."
             )
         return sentence + self._last_words()

@@ -42,11 +42,11 @@ ENDS_ITSELF_S = 2.0
 # A program that does not play within this time after its first upload does not start with this worker.
 STARTS_WITHIN_S = 2.0
 
-NOT_ENABLED = "Motion has not been enabled since the robot's process was started: enable it when the arm may move."
+NOT_ENABLED = "Motion has not been enabled since the robot's worker was started: enable it when the arm may move."
 BEING_MADE_READY = "The robot is being made ready (safety, power, control program); this takes some seconds."
 NOT_STARTING = (
     "The controller took the control program and does not play it: look at the teach pendant for a message, for local "
-    "control, and for the log's last lines. The robot's process is started again with motion disabled."
+    "control, and for the log's last lines. The robot's worker is started again with motion disabled."
 )
 LEAVING = "The daemon disconnects from the robot: start it again to go on."
 

@@ -1,4 +1,4 @@
-"""The messages between the daemon and the robot's worker process, and their bytes.
+"""The messages between the daemon and the worker, and their bytes.
 
 On the pipe each message is a line: its number, its type's name, and its fields in JSON, which pydantic checks.
 """
@@ -384,7 +384,7 @@ class MessageDecoder:
         """
         *lines, self._partial = (self._partial + data).split(b"\n")
         if len(self._partial) > LARGEST_MESSAGE:
-            raise ProtocolError("The pipe to the robot's worker carries a message without an end.")
+            raise ProtocolError("The pipe to the worker carries a message without an end.")
         return [_decode(line) for line in lines]
 
 
@@ -393,4 +393,4 @@ def _decode(line: bytes) -> tuple[int, Message]:
         number, name, content = line.split(b" ", 2)
         return int(number), _ADAPTERS[name.decode()].validate_json(content, strict=True)
     except (ValueError, KeyError) as error:
-        raise ProtocolError(f"The pipe to the robot's worker carries an invalid message: {line[:80]!r}.") from error
+        raise ProtocolError(f"The pipe to the worker carries an invalid message: {line[:80]!r}.") from error

@@ -32,7 +32,7 @@ LONGEST_STOP_S = 1.0
 # Near the end of the range the speed is distance/t and takes effect after the reaction time:
 # x'(s) = -x(s - reaction)/t, which approaches the end without overshoot only for t ≥ e·reaction.
 _NO_OVERSHOOT = math.e
-# A short linear move may never be seen moving: an arm at rest within this distance of the end (m, rad) has arrived.
+# A short straight move may never be seen moving: an arm at rest within this distance of the end (m, rad) has arrived.
 CLOSE, ARRIVED_AFTER_S = 2e-3, 0.2
 # An idle arm may tremble, but not move this fast for this long.
 ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
@@ -64,7 +64,7 @@ ASTRAY = "The arm moved without a command: check whether a person or another pro
 
 @dataclass(slots=True)
 class _Move:
-    """A linear move is under way."""
+    """A straight move is under way."""
 
     end: Six
     begun_ns: int
@@ -98,7 +98,7 @@ class MotionExecutor:
         # A wrist speed is the one last asked for, with the time of its decision.
         self._motion: WristSpeed | _Move | _Braking | None = None
         self._rejected = False
-        # The script's thread for speeds runs; it has to be ended before a linear move.
+        # The script's thread for speeds runs; it has to be ended before a straight move.
         self._speed_thread = False
         self._rested_ns = now_ns
         # How many samples at rest came last.
@@ -123,7 +123,7 @@ class MotionExecutor:
         return rejected
 
     def begin(self, motion_id: int, asked: WristSpeed | MoveLinear, sample: RtdeSample, now_ns: int) -> str:
-        """Turn the wrist at a speed from now on, or begin a linear move; return why not, or the empty string."""
+        """Turn the wrist at a speed from now on, or begin a straight move; return why not, or the empty string."""
         match asked, self._motion:
             case WristSpeed(decided_ns=decided_ns), _ if decided_ns and self._left_s(decided_ns, now_ns) < 0:
                 return f"The wrist speed was decided {(now_ns - decided_ns) / 1e9:.2f} s ago: the computer is too busy."
@@ -134,13 +134,13 @@ class MotionExecutor:
             case WristSpeed(), _Braking():
                 return f"The arm is still stopping ({self.end_reason})."
             case WristSpeed(), _Move():
-                return "A linear move is under way: stop it."
+                return "A straight move is under way: stop it."
             case MoveLinear(pose), _ if outside := self._settings.limits.workspace.why_outside(pose[:3]):
-                return f"The linear move would end at {outside}; nothing moves."
+                return f"The straight move would end at {outside}; nothing moves."
             case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:
-                return "A linear move needs a speed and an acceleration above 0."
+                return "A straight move needs a speed and an acceleration above 0."
             case MoveLinear(), motion if isinstance(motion, _Move | _Braking) or not sample.rests:
-                return "The arm moves: stop it before a linear move."
+                return "The arm moves: stop it before a straight move."
         self.motion_id, self.end_reason = motion_id, ""
         if isinstance(asked, WristSpeed):
             self._motion = replace(asked, decided_ns=asked.decided_ns or now_ns)
@@ -153,7 +153,7 @@ class MotionExecutor:
             deadline_ns = _deadline_ns(now_ns, _nominal_move_s(sent, sample), slack_s, sample)
             self._motion = _Move(sent.pose, now_ns, deadline_ns)
             if not self._arm.move(sent):
-                self._reject("linear move")
+                self._reject("straight move")
         return self.disabled_reason
 
     def stop_on_command(self, motion_id: int, asked: Stop, sample: RtdeSample, now_ns: int) -> str:
@@ -263,7 +263,7 @@ class MotionExecutor:
         move.seen = move.seen or sample.moving_linearly
         reason = line_violation(sample, self._settings.limits)
         if now_ns > move.deadline_ns:
-            reason = "the linear move did not end within its time"
+            reason = "the straight move did not end within its time"
         # The end of the move and the joint speeds come over two connections, and one may lag.
         waited = now_ns - move.begun_ns > ARRIVED_AFTER_S * 1e9
         ended = move.seen or (waited and is_close(sample.tcp_pose, move.end, CLOSE))
@@ -381,7 +381,7 @@ def clip_stop(asked: float, sample: RtdeSample, settings: UrSettings) -> float:
 
 
 def clip_linear(asked: MoveLinear, limits: UrLimits) -> tuple[MoveLinear, tuple[str, ...]]:
-    """Return the linear move within the inner speed and acceleration, and each reason for a change."""
+    """Return the straight move within the inner speed and acceleration, and each reason for a change."""
     reasons: list[str] = []
     speed = _at_most(asked.speed_m_per_s, limits.linear_speed_m_per_s, "linear speed", reasons)
     acceleration = _at_most(
@@ -551,7 +551,7 @@ def _beyond(name: str, value: float, bound: Bound, unit: str) -> str:
 
 
 def line_violation(sample: RtdeSample, limits: UrLimits) -> str:
-    """Return a sentence that names the inner limit that a linear move has reached, or the empty string.
+    """Return a sentence that names the inner limit that a straight move has reached, or the empty string.
 
     The joint angles and forces along a line are not known in advance, so that the move stops at the inner limits.
     """

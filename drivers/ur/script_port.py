@@ -52,7 +52,7 @@ class ScriptPort:
             raise RobotLostError(
                 "script",
                 f"The control program could not be sent to port {port} of the robot at {host}: {system_reason(error)}. "
-                "Look at the teach pendant; the robot's process is started again.",
+                "Look at the teach pendant; the robot's worker is started again.",
             ) from error
 
     def drain(self) -> bool:

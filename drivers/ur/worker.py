@@ -1,4 +1,4 @@
-"""The robot's worker process, `python -m shearloop.drivers.ur.worker`: commands on stdin, states and replies on stdout.
+"""The worker, `python -m shearloop.drivers.ur.worker`: commands on stdin, states and replies on stdout.
 
 It runs 125 cycles a second and sends the state of each. ur-rtde may hang or crash at any time, so that the worker
 holds nothing worth saving. Before each stretch that may hang it sets an alarm, and the kernel ends it in time; the

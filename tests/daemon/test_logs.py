@@ -82,10 +82,10 @@ def test_what_a_terminal_has_no_letters_for_is_spelt_and_what_follows_comes_out(
 def test_the_control_loop_hears_of_a_lost_device_until_it_returns():
     loop = ControlLoop(LoopConfig(), {"right": TorqueSource(name="right", period_s=0.5)}, ("robot",))
     link = LinkReporter("robot", loop)
-    link.on_link_event(LinkEvent(up=False, sentence="the robot's process died", repeated=False))
-    assert "the robot's process died" in " ".join(loop_reasons(loop))
+    link.on_link_event(LinkEvent(up=False, sentence="the worker died", repeated=False))
+    assert "the worker died" in " ".join(loop_reasons(loop))
     link.on_link_event(LinkEvent(up=True, sentence="it is back", repeated=False))
-    assert "the robot's process died" not in " ".join(loop_reasons(loop))
+    assert "the worker died" not in " ".join(loop_reasons(loop))
 
 
 def loop_reasons(loop: ControlLoop) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ def turn(robot: Robot, speed: float, acceleration: float = 2.0) -> None:
 
 
 def down(robot: Robot) -> list[float]:
-    """Return the arguments of a linear move downwards: pose, speed, acceleration."""
+    """Return the arguments of a straight move downwards: pose, speed, acceleration."""
     x, y, z, *turn = robot.arm.pose
     return [x, y, z - 0.2, *turn, 0.1, 0.5]
 

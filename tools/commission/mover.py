@@ -49,7 +49,7 @@ class Mover(ABC):
 
     @abstractmethod
     def stop_worker(self) -> int:
-        """Stop the worker process by SIGSTOP, so that the robot's watchdog gets no commands; return the time."""
+        """Stop the worker by SIGSTOP, so that the robot's watchdog gets no commands; return the time."""
 
     @abstractmethod
     def send(self, request: Event) -> None:
@@ -170,14 +170,14 @@ class MoverProcess(Mover, Opened):
         self._process = self._reader = None
 
     def _kill_worker(self) -> None:
-        """End the worker process, if one is known, and forget it: its number may be another process's later."""
+        """End the worker, if one is known, and forget it: its number may be another process's later."""
         if self._worker:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self._worker, signal.SIGKILL)
         self._worker = 0
 
     def stop_worker(self) -> int:
-        """Stop the worker process; return the time."""
+        """Stop the worker; return the time."""
         if not self._worker:
             # Signals to process 0 go to the whole group of this one.
             raise UserError("no robot's process is known that could be stopped: the robot has not been connected yet")

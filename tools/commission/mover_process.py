@@ -2,7 +2,7 @@
 
 `python -m shearloop.tools.commission.mover_process [WORKER]`: the robot's settings in the first line of the input, then
 one request a line in JSON; events a line in JSON. At the end of the input it stops the arm and disconnects. WORKER is
-the module of the robot's process, by default the daemon's own.
+the module of the worker, by default the daemon's own.
 """
 
 import asyncio
@@ -34,7 +34,7 @@ from shearloop.drivers.ur.messages import (
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.tools.commission.bounds import LARGEST_M
 
-# What a request may bring about at full speed: signals to the worker process, then to this one.
+# What a request may bring about at full speed: signals to the worker, then to this one.
 CAUSES: Final[Mapping[str, tuple[signal.Signals | None, signal.Signals | None]]] = {
     "worker killed": (signal.SIGKILL, None),
     "worker stopped": (signal.SIGSTOP, None),
@@ -184,7 +184,7 @@ class ThisProcess:
     """The surroundings of this process: its events are lines of its output."""
 
     def __init__(self, worker_module: str) -> None:
-        """Take the module of the robot's process."""
+        """Take the module of the worker."""
         self._worker_module = worker_module.encode()
 
     def now_ns(self) -> int:
@@ -207,7 +207,7 @@ class ThisProcess:
             os.kill(os.getpid(), to_self)
 
     def worker_pid(self) -> int:
-        """Return the number of this process's worker process, or 0."""
+        """Return the number of this process's worker, or 0."""
         pid = os.getpid()
         for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
             with contextlib.suppress(OSError):
@@ -216,7 +216,7 @@ class ThisProcess:
         return 0
 
     async def watch(self, robot: UrRobot) -> None:
-        """Report each new worker process, and each loss of the robot."""
+        """Report each new worker, and each loss of the robot."""
         losses = reported = 0
         while True:
             await robot.next_state()

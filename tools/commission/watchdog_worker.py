@@ -1,4 +1,4 @@
-"""The robot's process with a long deadline for straight moves, so that the robot's watchdog alone ends one in time.
+"""The worker with a long deadline for straight moves, so that the robot's watchdog alone ends one in time.
 
 `python -m shearloop.tools.commission.watchdog_worker`, as the daemon's own. The move itself is slow and short.
 """

@@ -79,7 +79,7 @@ class Robot(UrRobot):
         held, self._held, self._unread = self._held, [], []
         self._disconnect()
         for replied, _ in held:
-            replied.set_result(CommandReply("The robot's process ended before it answered."))
+            replied.set_result(CommandReply("The worker ended before it answered."))
 
     def cycle(self, *, read: bool = True) -> None:
         """Let 8 ms pass, and tell who waits for the next state; what is not read now is read with the next one."""

@@ -155,8 +155,8 @@ def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there():
 
 
 def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again():
-    died = "The robot's process died of SIGKILL while controlling. The process is started again with motion disabled."
-    blocked = ArmStatus(0.0, NOW_NS, blocked="Motion has not been enabled since the robot's process was started.")
+    died = "The worker died of SIGKILL while controlling. The process is started again with motion disabled."
+    blocked = ArmStatus(0.0, NOW_NS, blocked="Motion has not been enabled since the worker was started.")
     for senses in (
         LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS), lost={"robot": died}),
         LatestInputs(10.0, arm=blocked),

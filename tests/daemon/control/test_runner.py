@@ -281,7 +281,7 @@ async def test_a_wrist_speed_is_sent_at_each_state():
 
 async def test_the_speed_after_clipping_is_published():
     async with driven(TWIST, cycles=20) as cell:
-        # Close to the limit of the force, the robot's process lets less through.
+        # Close to the limit of the force, the worker lets less through.
         cell.robot.bench.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
         await cell.cycles(150)
         state = next(one for one in reversed(cell.published.messages) if one.topic == "loop.state")
@@ -296,7 +296,7 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         # What is clipped is told in each cycle, so that one is unanswered whenever the process dies.
         cell.robot.bench.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
         await cell.cycles(20)
-        cell.control_loop.on_link("robot", "The robot's process died of SIGKILL.", up=False)
+        cell.control_loop.on_link("robot", "The worker died of SIGKILL.", up=False)
         cell.robot.die(50)
         await asyncio.sleep(0)
         cell.runner.decide_now()

@@ -115,7 +115,7 @@ HAPPENINGS: dict[str, Callable[[Scenario], Any]] = {
     "states are old": lambda scenario: scenario.arm.be(age_ns=300_000_000),
     "states are new": lambda scenario: scenario.arm.be(age_ns=0),
     "states are not read": lambda scenario: scenario.unread(),
-    "the robot's process dies": lambda scenario: scenario.process_dies(),
+    "the worker dies": lambda scenario: scenario.process_dies(),
     "a task dies": lambda scenario: scenario.cell.died.update(right="it died"),
     "the loop dies": lambda scenario: scenario.tick_dies(),
     "torque beyond its limit": lambda scenario: scenario.cell.exceed_torque(),

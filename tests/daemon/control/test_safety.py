@@ -195,7 +195,7 @@ def test_two_things_of_one_kind_are_both_told():
 
 
 def test_a_pause_of_the_daemon_stops_and_what_it_leads_to_is_not_repeated():
-    """Torques and states are old to one who was away, boards are thought to be gone, the robot's process was ended."""
+    """Torques and states are old to one who was away, boards are thought to be gone, the worker was ended."""
     paused, old = (
         Fault(FaultCode.DAEMON_PAUSED, "it stood still for 3.0 s"),
         Fault(FaultCode.STATE_STALE, "the gripper"),

@@ -271,7 +271,7 @@ def enabled(settings: UrSettings = SETTINGS, arm: FakeArm | None = None) -> Hand
 
 
 def moving(cycles: int) -> HandlerBench:
-    """Return a bench that has begun a linear move so many cycles ago."""
+    """Return a bench that has begun a straight move so many cycles ago."""
     bench = enabled()
     assert bench.ask(messages.MoveLinear(POSE, 0.1, 0.1)).accepted
     bench.run(cycles)

@@ -53,7 +53,7 @@ def states(robot: Robot) -> tuple[float, float]:
 
 
 def moving_asynchronously(robot: Robot) -> bool:
-    """Return whether the script reports a linear move under way."""
+    """Return whether the script reports a straight move under way."""
     states = (int(robot.registers[f"output_int_register_{half.first + 2}"]) for half in (LOWER, UPPER))
     return any(state & 1 << 15 for state in states)
 

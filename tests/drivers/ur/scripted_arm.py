@@ -140,7 +140,7 @@ def at_full_speed(script: str) -> tuple[HandlerBench, WristSpeed]:
 
 
 def moving_at_full_speed(script: str, settings: UrSettings = DELIVERED) -> HandlerBench:
-    """Return a bench in a linear move at its largest speed, at the moment of the daemon's last message."""
+    """Return a bench in a straight move at its largest speed, at the moment of the daemon's last message."""
     bench = enabled(settings, ScriptedArm(script, settings))
     bench.run(1)
     x, y, z, *turned = bench.arm.robot.arm.pose

@@ -112,7 +112,7 @@ async def test_worker_lost_during_shutdown_is_not_restarted(play, monkeypatch):
         assert not listened, "it was started again"
         listened.append(conversation)
         run.cancel()
-        raise RobotLostError("crashed", "The robot's process died.")
+        raise RobotLostError("crashed", "The worker died.")
 
     monkeypatch.setattr(WorkerConnection, "listen", listen)
     run = asyncio.create_task(UrRobot(settings_for("127.0.0.254")).run())

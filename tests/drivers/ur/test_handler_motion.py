@@ -1,4 +1,4 @@
-"""Motions and their ends: turning, linear moves, stops."""
+"""Motions and their ends: turning, straight moves, stops."""
 
 import math
 from dataclasses import replace
@@ -100,7 +100,7 @@ def test_linear_move_gets_heartbeats_and_reports_its_arrival():
     assert len(reply.clipped) == 1
     bench.run(20)
     assert set(bench.arm.calls) == {"move", "send_heartbeat"}
-    assert "linear move is under way" in bench.ask(WristSpeed(0.1, 1.0)).refusal
+    assert "straight move is under way" in bench.ask(WristSpeed(0.1, 1.0)).refusal
     bench.arm.be(moving_linearly=False, qd_rad_per_s=(0.1, 0.0, 0.0, 0.0, 0.0, 0.0))
     bench.handler.tick(bench.arm.reading, bench.now_ns)
     assert bench.state.motion == "linear", "its joints still move"

@@ -180,7 +180,7 @@ class MoverProcess(Mover, Opened):
         """Stop the worker; return the time."""
         if not self._worker:
             # Signals to process 0 go to the whole group of this one.
-            raise UserError("no robot's process is known that could be stopped: the robot has not been connected yet")
+            raise UserError("no worker is known that could be stopped: the robot has not been connected yet")
         stopped_ns = self.events.clock.now_ns()
         os.kill(self._worker, signal.SIGSTOP)
         return stopped_ns

@@ -236,9 +236,9 @@ def _play_ur(args: argparse.Namespace) -> Playing:
 def _configure_gripper(parser: argparse.ArgumentParser, printed: str) -> None:
     parser.epilog = (
         f"Prints {printed}, again each time it comes back. On standard input: `object MM` puts something of that width "
-        "between the fingers, `object none` takes it away; `fault CODE` makes the gripper report a fault; `unplug "
-        "[SECONDS]` breaks the connection, `silence [SECONDS]` answers nothing, `slow MILLISECONDS` answers late; "
-        "`normal` ends them, and a fault below 10."
+        "between the fingers, `object none` or `drop` takes it away; `fault CODE` makes the gripper report a fault; "
+        "`unplug [SECONDS]` breaks the connection, `silence [SECONDS]` answers nothing, `slow MILLISECONDS` answers "
+        "late; `normal` ends them, and a fault below 10."
     )
     add_option(parser, "--speed", positive(), "N", "times the gripper's own pace", default=1.0)
     text = f"{', '.join(MODELS)} (default: %(default)s)"

@@ -12,12 +12,10 @@ from scipy.io import loadmat
 
 from shearloop.bank.bank_file import BankDefinition, write_bank
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.cli import main
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
-from shearloop.emulators.boards import EitKitBoard
 from shearloop.emulators.synthetic_skin import NORMAL_N, SLACK_RATIO
 from shearloop.estimation.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
 from tests.cli.emulate_rig.rig import write_rig_bank
@@ -142,14 +140,6 @@ def test_a_mistake_is_one_sentence_and_status_two(arguments, sentence, tmp_path,
     complaint = mistake("emulate", *words)
     assert sentence in complaint
     assert complaint.count("\n") == 1
-
-
-def test_help_names_every_fault(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["emulate", "eit-kit", "--help"])
-    assert ended.value.code == 0
-    printed = capsys.readouterr().out
-    assert [name for name in EitKitBoard.faults if name not in printed] == []
 
 
 async def test_the_command_runs_without_a_terminal(tmp_path):

@@ -284,7 +284,7 @@ class DaemonConfig(ConfigModel):
     loop: LoopConfig = Field(LoopConfig(), description="settings of the closed loop")
     emulated: bool = Field(False, description="every device is emulated on this computer; a real address is refused")
     emulated_deadlines: Literal["patient", "real"] = Field(
-        "patient", description="of an emulated robot: for a busy computer, or as in the robot's settings"
+        "patient", description="of an emulated rig: longer, for a busy computer, or those of a real rig"
     )
     experiment: Path | None = Field(None, description="what `shearloop command start` runs if it names no other")
     autostart: bool = Field(False, description="start `experiment` once all devices are connected; needs `emulated`")

@@ -25,5 +25,5 @@ class LoopConfig(ConfigModel):
 
     @property
     def planned_acceleration_rad_per_s2(self) -> float:
-        """The acceleration that controller and identification plan with; the robot keeps twice as much in reserve."""
+        """The acceleration that controller and identification plan with: half of what the robot is given."""
         return 0.5 * self.wrist_acceleration_rad_per_s2

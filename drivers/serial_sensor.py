@@ -36,6 +36,7 @@ class InputKind(Enum):
     DATA = "data"  # bytes arrived
     TARE = "tare"  # a new zero was asked for, or found
     TOOL = "tool"  # the gripped tool changed
+    MOVED = "moved"  # the fingers moved while a frame was acquired
     ADAPT = "adapt"  # the gain was corrected by the torques in `data`
     STATE = "state"  # the state of parser and estimator, in a recording that begins in the middle of a run
 

@@ -15,7 +15,7 @@ from shearloop.estimation.bank_match import BankMatcher
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.defaults import BASELINE_FRAMES, MAX_GAP_S
 from shearloop.estimation.fingertip_validator import LEAST_NOISE_V
-from shearloop.estimation.session import BankSearch, Session
+from shearloop.estimation.session import FINGERS_MOVED, BankSearch, Session
 from shearloop.estimation.values import ProcessedFrame, TactileFrame
 
 # Frames with more unusable channels than this are refused.
@@ -61,6 +61,11 @@ class PaperSession(Session):
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next frame of one side and return its difference to the idle frame, or the reasons against it."""
+        if frame.fingers_moved:
+            # Neither the idle frame nor a mean has frames from before and after a motion.
+            self._untouched.restart()
+            self._averaged.clear()
+            return ProcessedFrame.refused(frame.usable, FINGERS_MOVED)
         usable = frame.usable & (frame.channels != 0.0)
         if self._before is not None:
             usable &= ~self._unknown
@@ -104,6 +109,11 @@ class UntouchedFrames:
     def missing(self) -> bool:
         """Whether there are fewer than wanted."""
         return len(self.frames) < self.wanted
+
+    def restart(self) -> None:
+        """Forget the frames, unless there are as many as wanted."""
+        if self.missing:
+            self.frames.clear()
 
     @cached_property
     def idle_frame(self) -> FloatArray:

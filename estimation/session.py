@@ -35,6 +35,7 @@ from shearloop.estimation.values import Estimate, Measured, ProcessedFrame, Tact
 from shearloop.words import counted
 
 _REPEATED_FRAME = ("the board sent the same frame again",)
+FINGERS_MOVED = "the fingers moved while this frame was acquired"
 _NO_IDLE_FRAME = ("no idle frame: it took too long, or something was gripped; tare again with nothing gripped",)
 _NEVER_IDLE = "it was not seen untouched since the start; if it holds a tool, release it, tare, and grip again"
 UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
@@ -192,7 +193,16 @@ class Session:
         return replace(estimate, lag_s=processed.lag_s) if processed.lag_s else estimate
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
-        """Take the next frame and return its difference to the idle frame, or the reasons against it."""
+        """Take the next frame and return its difference to the idle frame, or the reasons against it.
+
+        A frame of moving fingers belongs to the grip's memory, and gives neither an estimate nor an idle frame.
+        """
+        processed = self._process(frame)
+        if not frame.fingers_moved:
+            return processed
+        return replace(processed, reasons=(FINGERS_MOVED, *processed.reasons))
+
+    def _process(self, frame: TactileFrame) -> ProcessedFrame:
         checks, idle = self._checks, self._idle
         missing = self._timer.missing_before(frame.t_s)
         if missing is None:
@@ -216,12 +226,16 @@ class Session:
         if is_first and not idle.begun:
             checks.begin(usable)
         checks.accept(channels)
+        if idle.taring and frame.fingers_moved:
+            # Something may have been gripped or released.
+            idle.restart_tare()
+            return ProcessedFrame.refused(usable)
         if idle.taring:
             return ProcessedFrame.refused(usable, idle.add_to_tare(channels))
         if is_first:
             first = "there is no earlier frame to compare with"
             return ProcessedFrame.refused(usable, self._memory.waits() if self._memory.interrupted else first)
-        if not self._memory.positions:
+        if not (self._memory.positions or frame.fingers_moved):
             # Follow the idle frame while nothing is gripped; a session that begins gripped keeps the calibration's.
             for layer in idle.idle_sides(channels):
                 restored = checks.restore(layer, channels, frame)

@@ -108,17 +108,20 @@ class FrameSeries:
 class TactileFrame:
     """Frames of m sides at one time: t_s in seconds (middle of the acquisition), channels (m, c) in volts.
 
-    usable (m, c) is False at dead and saturated channels, `repeated` True where a board sent a frame again. Do not
-    change the arrays afterwards.
+    usable (m, c) is False at dead and saturated channels, `repeated` True where a board sent a frame again.
+    fingers_moved: they opened or closed during a part of the acquisition. Do not change the arrays afterwards.
     """
 
     t_s: float
     channels: FloatArray
     usable: BoolArray
     repeated: bool = False
+    fingers_moved: bool = False
 
     @classmethod
-    def of(cls, t_s: float, channels: FloatArray, usable: BoolArray | None = None) -> "TactileFrame":
+    def of(
+        cls, t_s: float, channels: FloatArray, usable: BoolArray | None = None, *, fingers_moved: bool = False
+    ) -> "TactileFrame":
         """Return a frame; channels that are not finite are unusable."""
         # Contiguous memory makes sums over channels reproducible to the bit.
         channels = np.ascontiguousarray(channels)
@@ -126,7 +129,8 @@ class TactileFrame:
         if not finite.all():
             channels = np.where(finite, channels, 0.0)
             usable = finite if usable is None else finite & usable
-        return cls(t_s, channels, np.ones(channels.shape, dtype=np.bool_) if usable is None else usable)
+        usable = np.ones(channels.shape, dtype=np.bool_) if usable is None else usable
+        return cls(t_s, channels, usable, fingers_moved=fingers_moved)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

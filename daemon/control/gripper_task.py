@@ -3,11 +3,13 @@
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
+from shearloop.daemon.control.finger_motion import FingerMotion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
@@ -40,22 +42,26 @@ class GripperTask:
     control_loop: ControlLoop
     diameters: FingertipDiameters
     measures_diameters: bool = True
+    # The time of commands.
+    clock: Clock = field(default_factory=Clock)
+    _motion: FingerMotion = field(default_factory=FingerMotion)
 
     async def run(self) -> None:
         """Publish every state and pass it on, until cancelled."""
         async with contextlib.aclosing(self.gripper.states()) as states:
             async for state in states:
                 self._publish(state)
-                self.control_loop.on_gripper(status_of(state))
+                self._take(state)
 
     async def grip(self, target: GripStep) -> None:
         """Move to a width and wait for the end; raises DriverError and ActionError."""
-        await self.gripper.activate()
-        sent = await self.gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
-        state = await self.gripper.finish(sent)
+        with self._motion.commanded(self.clock.now_ns()):
+            await self.gripper.activate()
+            sent = await self.gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
+            state = await self.gripper.finish(sent)
         widest_mm = min(target.width_mm, self.gripper.model.stroke_mm)
         # The loop needs the state before the end of the action.
-        self.control_loop.on_gripper(status_of(state))
+        self._take(state)
         if state.object is ObjectStatus.CONTACT_OPENING and state.width_mm < widest_mm - OPEN_WITHIN_MM:
             stopped = f"the fingers met something as they opened, and stopped at {state.width_mm:.1f} mm"
             raise ActionError(f"{stopped}; clear their way")
@@ -81,7 +87,8 @@ class GripperTask:
         # Read now: the latest state may be older than the fault, and activating opens the fingers.
         state = await self.gripper.read()
         if state.fault.needs_activation:
-            await self.gripper.activate(operator_confirmed=True)
+            with self._motion.commanded(self.clock.now_ns()):
+                await self.gripper.activate(operator_confirmed=True)
 
     @property
     def is_holding(self) -> bool | None:
@@ -96,9 +103,17 @@ class GripperTask:
             return None
         return gripped_diameter(state)
 
+    def moved_between(self, from_ns: int, to_ns: int) -> bool:
+        """Return whether the fingers moved at any time of an interval, as far as is known."""
+        return self._motion.moved_between(from_ns, to_ns)
+
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the gripper's part of `health`."""
         return self.gripper.diagnostics()
+
+    def _take(self, state: GripperState) -> None:
+        self._motion.take(state)
+        self.control_loop.on_gripper(status_of(state))
 
     def _publish(self, state: GripperState) -> None:
         tool = combine(own, self.diameters.latest(state.t_ns)) if (own := gripped_diameter(state)) is not None else None

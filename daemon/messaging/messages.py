@@ -87,7 +87,7 @@ class EitEstimate(Message):
     sigma: float | None = column("cm", "σ of the best-matching cell")
     score: float | None = column("", "normalised cross-correlation of the best cell, 0 to 1")
     runner_up: float | None = column("", "score of the best cell away from the best one")
-    valid: bool = column("", "whether the estimate can be used")
+    valid: bool = column("", "whether the estimate can be used; never of a frame that saw the fingers move")
     reason: str = column("", "why it is not valid, in sentences; empty when it is")
     frame: int = column("", "number of the frame")
     latency_s: float = column("s", "from the arrival of the frame's last byte to this message")

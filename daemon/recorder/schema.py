@@ -131,7 +131,7 @@ def schemas() -> Mapping[str, dict[str, Any]]:
     raw = {
         INPUT: {
             "t_mono_ns": _TIME,
-            "kind": {"type": "string", "description": "opened, started, asked, data, tare, tool, adapt or state"},
+            "kind": {"type": "string", "description": ", ".join(kind.value for kind in InputKind)},
             "data": {"type": "string", "description": "the bytes as Latin-1 text, or the argument of another input"},
         },
         CLOCK_TOPIC: {

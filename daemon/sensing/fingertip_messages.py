@@ -89,6 +89,16 @@ def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, n
     )
 
 
+def moved_as_bytes(frame: int) -> bytes:
+    """Return the raw event's data: the frame during whose acquisition the fingers moved."""
+    return str(frame).encode()
+
+
+def moved_from_bytes(data: bytes) -> int:
+    """Return the frame of a raw event; raises ValueError for other data."""
+    return int(data.decode())
+
+
 def tool_as_bytes(frame: int, tool: Measured | None) -> bytes:
     """Return the raw event's data: the tool that is held from a frame on."""
     return (str(frame) if tool is None else f"{frame} {tool.value!r} {tool.half_width!r}").encode()

@@ -14,6 +14,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.fingertip_messages import (
     adapted_message,
     estimate_message,
+    moved_as_bytes,
     tare_as_bytes,
     tool_as_bytes,
     torques_as_bytes,
@@ -50,6 +51,9 @@ class ToolHolder(Protocol):
 
     def held_tool(self, t_ns: int) -> Measured | None:
         """Return the diameter of the held tool at t_ns, None if it is not known."""
+
+    def moved_between(self, from_ns: int, to_ns: int) -> bool:
+        """Return whether the fingers moved at any time of an interval, as far as is known."""
 
 
 class _Tare:
@@ -123,7 +127,7 @@ class FingertipTask:
     """The I/O of one session: frames of one fingertip or of several together in, estimates out.
 
     Estimates go to the control loop and to subscribers. The gripper gives the held tool, and receives the diameters.
-    `inputs` keeps the moments of tares and of changes of the tool.
+    `inputs` keeps the moments of tares and of changes of the tool, and the frames during which the fingers moved.
     """
 
     name: str
@@ -146,7 +150,7 @@ class FingertipTask:
     async def process(self, *frames: Frame) -> None:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
         number, now_ns = frames[0].seq, self.clock.now_ns()
-        # A replay tares, takes the held tool, and corrects the gain before the same frame.
+        # A replay tares, takes the held tool and the fingers' motion, and corrects the gain before the same frame.
         began_ns = min(frame.t_begin_ns for frame in frames)
         if self._tare.expires(began_ns):
             self._give_up_tare(number, now_ns)
@@ -163,6 +167,9 @@ class FingertipTask:
             self._held = tool
             self.session.set_tool(tool)
             self._record(InputKind.TOOL, now_ns, tool_as_bytes(number, tool))
+        moved = self._fingers_moved(frames)
+        if moved:
+            self._record(InputKind.MOVED, now_ns, moved_as_bytes(number))
         if self._adapting is not None:
             reference, ended = self._adapting
             if not ended.done():
@@ -171,7 +178,7 @@ class FingertipTask:
                     ended.set_result(None)
                 except Exception as error:  # noqa: BLE001 - it fails the step, and the frames go on
                     ended.set_exception(error)
-        estimate = await estimate_frames(self.session, frames)
+        estimate = await estimate_frames(self.session, frames, fingers_moved=moved)
         now_ns = self.clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
         if self.loop is not None:
@@ -193,6 +200,14 @@ class FingertipTask:
     def taring(self) -> bool:
         """Whether the next frames belong to a tare that was asked for."""
         return self._tare.is_under_way(self.clock.now_ns())
+
+    def _fingers_moved(self, frames: tuple[Frame, ...]) -> bool:
+        """Return whether the fingers moved during any part of the frames' acquisition."""
+        if self.gripper is None:
+            return False
+        # The middle of an acquisition is as far from its end as from its beginning.
+        ended_ns = max(2 * frame.t_mid_ns - frame.t_begin_ns for frame in frames)
+        return self.gripper.moved_between(min(frame.t_begin_ns for frame in frames), ended_ns)
 
     def _give_up_tare(self, number: int, now_ns: int) -> None:
         """Leave a tare that no frame has completed in time: later frames could be of any load."""
@@ -269,20 +284,20 @@ class FingertipTask:
             self.inputs.record(RawEvent(kind, t_ns, data))
 
 
-def tactile_frame(frames: tuple[Frame, ...]) -> TactileFrame:
+def tactile_frame(frames: tuple[Frame, ...], *, fingers_moved: bool = False) -> TactileFrame:
     """Return the boards' frames of one time, one for each side, without their saturated and dead channels."""
     repeated = any(frame.repeated and frame.channels.any() for frame in frames)
     t_s = sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9
     usable = [~(frame.saturated | frame.dead) for frame in frames]
-    return TactileFrame(t_s, np.array([frame.channels for frame in frames]), np.array(usable), repeated)
+    return TactileFrame(t_s, np.array([frame.channels for frame in frames]), np.array(usable), repeated, fingers_moved)
 
 
-async def estimate_frames(session: Session, frames: tuple[Frame, ...]) -> Estimate:
-    """Return the estimate of the boards' frames of one time.
+async def estimate_frames(session: Session, frames: tuple[Frame, ...], *, fingers_moved: bool = False) -> Estimate:
+    """Return the estimate of the boards' frames of one time; `fingers_moved` while they were acquired.
 
     A search of the bank runs in a thread: it can take half a second.
     """
-    frame = tactile_frame(frames)
+    frame = tactile_frame(frames, fingers_moved=fingers_moved)
     if session.search is None:
         return session.estimate(frame)
     return await asyncio.to_thread(session.estimate, frame)

@@ -134,8 +134,8 @@ def _torque_source(session: Session, name: str, period_s: float) -> TorqueSource
         period_s=period_s,
         window_s=period_s * session.averaged_frames,
         measures_torque=calibration.measures_torque,
-        # The first torque after a grip needs the lagged frames too.
-        warm_up_s=_WARM_UP_SHARE * calibration.estimator.motion.n_needed * period_s,
+        # The first torque after a grip needs the lagged frames too, and none is of a frame that saw the fingers move.
+        warm_up_s=_WARM_UP_SHARE * max(calibration.estimator.motion.n_needed, 2) * period_s,
         has_gain=calibration.measures_torque,
     )
 

@@ -7,6 +7,8 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import FORCES_N, SPEEDS_MM_S
 
 MA_PER_COUNT = 10.0
+# The fingers open by themselves.
+_RELEASING_CODE = 11
 # From this fault code on the gripper takes no command before a new activation: a rising edge of ACT.
 FIRST_MAJOR_CODE = 10
 
@@ -140,6 +142,12 @@ class GripperState:
     activation: ActivationStatus
     current_ma: float | None
     fault: GripperFault
+
+    @property
+    def moves(self) -> bool:
+        """Whether the fingers move: on command, in an activation, or in a release of the gripper's own."""
+        by_itself = self.activation is ActivationStatus.ACTIVATING or self.fault.code == _RELEASING_CODE
+        return by_itself or self.object is ObjectStatus.MOVING
 
     @property
     def diameter_mm(self) -> float | None:

@@ -8,6 +8,7 @@ from shearloop.bank.matching import Match, best_match
 from shearloop.estimation import Calibration, Estimate, Session, TactileFrame
 from shearloop.estimation.bank_match import PaperMatcher
 from shearloop.estimation.paper_session import PaperSession, UntouchedFrames
+from shearloop.estimation.session import FINGERS_MOVED
 from tests.paper_curve import paper_curve
 
 K_GRID, SIGMA_GRID = np.linspace(3.0, 4.0, 11), np.linspace(1.0, 2.0, 11)
@@ -36,8 +37,11 @@ def noisy(signal: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
     return HOMOGENEOUS + signal + RANDOM.normal(0.0, 0.002, 896)
 
 
-def estimated(session: Session, number: int, channels: NDArray[np.float64], unusable: int = 0) -> Estimate:
-    return session.estimate(TactileFrame.of(0.541 * number, channels[None], np.arange(896)[None] >= unusable))
+def estimated(
+    session: Session, number: int, channels: NDArray[np.float64], unusable: int = 0, *, fingers_moved: bool = False
+) -> Estimate:
+    usable = np.arange(896)[None] >= unusable
+    return session.estimate(TactileFrame.of(0.541 * number, channels[None], usable, fingers_moved=fingers_moved))
 
 
 def tared(matcher: OneCell, calibration: Calibration | None = None, average: int = 1) -> Session:
@@ -156,6 +160,29 @@ def test_the_latest_frames_are_averaged_and_a_tare_forgets_them():
     assert estimate.lag_s == pytest.approx(0.541)
     session.tare()
     assert estimated(session, 20, noisy(PATTERN)).reasons == ("taking the idle frame, 1 of 10",)
+
+
+def test_frames_before_a_motion_of_the_fingers_are_not_averaged_with_those_after_it():
+    matcher = OneCell()
+    session = tared(matcher, average=2)
+    before, after = noisy(PATTERN), noisy(-PATTERN)
+    estimated(session, 10, before)
+    moved = estimated(session, 11, noisy(PATTERN), fingers_moved=True)
+    assert (moved.valid, moved.torque_nm, moved.reasons) == (False, None, (FINGERS_MOVED,))
+    estimate = estimated(session, 12, after)
+    idle_frame = before - matcher.asked[0]
+    np.testing.assert_allclose(matcher.asked[-1] + idle_frame, after, atol=1e-12)
+    assert estimate.lag_s == 0
+
+
+def test_an_idle_frame_has_frames_after_the_last_motion_of_the_fingers_only():
+    session = tared(OneCell())
+    session.tare()
+    for number in range(10, 15):
+        estimated(session, number, noisy())
+    assert estimated(session, 15, noisy(PATTERN), fingers_moved=True).reasons == (FINGERS_MOVED,)
+    assert estimated(session, 16, noisy()).reasons == ("taking the idle frame, 1 of 10",)
+    assert session.taring
 
 
 def test_frames_before_a_gap_are_not_averaged_with_those_after_it():

@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shearloop.bank.arrays import BoolArray
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import TRUSTED, FrameSeries, Measured, Session, TactileFrame, fit, fitting
+from shearloop.estimation import TRUSTED, Estimate, FrameSeries, Measured, Session, TactileFrame, fit, fitting
 from shearloop.estimation.fingertip_validator import mask_unmeasured
 from shearloop.estimation.gain import ToolLaw, find_twists
-from tests.estimation.conftest import follow, judged, kept, twisting
+from shearloop.estimation.session import FINGERS_MOVED
+from tests.estimation.conftest import IDLE_S, follow, judged, kept, twisting
 
 
 def test_another_recording_is_read_with_honest_intervals(motion_calibration):
@@ -402,3 +404,78 @@ def test_a_session_settles_with_one_twist_and_adapts_by_the_next(motion_calibrat
     correction = session.adapt(torque_of_grip()).correction
     assert correction.twists == 1
     assert correction.factors.mean() == pytest.approx(1.3, abs=0.1)
+
+
+@pytest.fixture
+def moving() -> tuple[FrameSeries, BoolArray]:
+    """A recording, and the frames of which the fingers moved: those that close, one in between, and those that open."""
+    other = twisting(seed=5)
+    gripped = np.flatnonzero((other.t_s > IDLE_S) & (other.t_s < other.t_s[-1] - IDLE_S))
+    moved = np.zeros(len(other.t_s), dtype=np.bool_)
+    moved[[gripped[0] - 1, gripped[0], gripped[40], gripped[-1], gripped[-1] + 1]] = True
+    return other, moved
+
+
+def estimates_of(session: Session, series: FrameSeries, moved: BoolArray) -> list[Estimate]:
+    frames = zip(series.t_s.tolist(), series.channels, moved.tolist(), strict=True)
+    return [session.estimate(TactileFrame.of(t_s, channels, fingers_moved=one)) for t_s, channels, one in frames]
+
+
+def test_no_estimate_is_of_a_frame_during_which_the_fingers_moved(motion_calibration, moving):
+    series, moved = moving
+    session = Session(motion_calibration)
+    found = estimates_of(session, series, moved)
+    plain = estimates_of(Session(motion_calibration), series, np.zeros_like(moved))
+    assert plain[int(np.flatnonzero(moved)[2])].valid
+    for one, other, was_moved in zip(found, plain, moved, strict=True):
+        if was_moved:
+            assert (one.valid, one.torque_nm, one.diameter_mm) == (False, None, None)
+            assert one.reasons[0] == FINGERS_MOVED
+            assert one.reasons[1:] == other.reasons
+        else:
+            # The state of the grip goes on, so that one motion costs one frame.
+            assert (one.valid, one.torque_nm, one.reasons) == (other.valid, other.torque_nm, other.reasons)
+
+
+def test_a_correction_of_the_gain_leaves_frames_of_moving_fingers_out(motion_calibration, moving):
+    series, moved = moving
+    gripped = int(np.flatnonzero(moved)[-2])
+    session = Session(motion_calibration)
+    estimates_of(session, series.between(0, gripped), moved[:gripped])
+    at = float(series.t_s[np.flatnonzero(moved)[2]])
+    assert session.grip_t_s.size > 50
+    assert at not in session.grip_t_s
+
+
+def test_an_idle_frame_is_not_taken_while_the_fingers_move(motion_calibration):
+    other = twisting(seed=5)
+    idle = other.channels[:12].copy()
+    # Halfway to a grip, and still below what counts as one.
+    idle[5] += 0.1 * (np.median(other.channels[60:80], axis=0) - np.median(other.channels[:20], axis=0))
+    session = Session(motion_calibration)
+    session.tare(6)
+    moved = np.arange(12) == 5
+    reasons = [
+        session.estimate(TactileFrame.of(t_s, channels, fingers_moved=one)).reasons
+        for t_s, channels, one in zip(other.t_s[:12].tolist(), idle, moved.tolist(), strict=True)
+    ]
+    assert reasons[4:7] == [("taking the idle frame, 5 of 6",), (FINGERS_MOVED,), ("taking the idle frame, 1 of 6",)], (
+        "something may have been gripped or released"
+    )
+    assert session.taring is False
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_the_idle_frame_does_not_follow_moving_fingers(motion_calibration, moved):
+    other = twisting(seed=5)
+    step = np.median(other.channels[60:80], axis=0) - np.median(other.channels[:20], axis=0)
+    flags = np.arange(22) == 15
+    found = []
+    for touched in (0.0, 0.02):
+        # Too little for a grip: such a frame would count as idle.
+        channels = other.channels[:22] + touched * step * flags[:, None, None]
+        session = Session(motion_calibration)
+        estimates_of(session, replace(other.between(0, 22), channels=channels), flags & moved)
+        found.append(session.process(TactileFrame.of(float(other.t_s[22]), other.channels[22])).difference)
+    assert np.array_equal(*found) == moved
+    assert found[0].any()

@@ -29,6 +29,7 @@ from shearloop.daemon.sensing.fingertip_messages import (
     adapted_message,
     estimate_message,
     frame_message,
+    moved_from_bytes,
     tare_from_bytes,
     tool_from_bytes,
     torques_from_bytes,
@@ -71,7 +72,7 @@ class RecordedEvent:
 
 
 class ReplayEvents(NamedTuple):
-    """What frames do not contain: tares, tools and known torques of the grip by source, each with its first frame.
+    """What frames do not contain: tares, tools, motion of the fingers, and known torques, by source with the frame.
 
     `frame_numbers` holds the frames' numbers by source and arrival, `sample_numbers` the skin samples' numbers by
     their time; they continue from file to file.
@@ -162,6 +163,8 @@ class RecordedRun:
                     case RecordedEvent(raw=RawEvent(kind=InputKind.TOOL, data=data)):
                         number, tool = tool_from_bytes(data)
                         before.append((number, InputKind.TOOL, tool))
+                    case RecordedEvent(raw=RawEvent(kind=InputKind.MOVED, data=data)):
+                        before.append((moved_from_bytes(data), InputKind.MOVED, None))
                     case RecordedEvent(raw=RawEvent(kind=InputKind.ADAPT, data=data)):
                         number, *known = torques_from_bytes(data)
                         before.append((number, InputKind.ADAPT, known))
@@ -402,7 +405,7 @@ class Replay:
         return replace(message, sample=message.sample + self._number_offset[SKIN])
 
     async def _estimate(self, source: str, *frames: Frame) -> None:
-        session, number = self._sessions[source], frames[0].seq
+        session, number, moved = self._sessions[source], frames[0].seq, False
         for first, kind, value in self._events.before_frames.get(source, ()):
             # Of a later file's tools, the first may be held since the file before.
             if kind is InputKind.TOOL and self._latest_frame.get(source, -1) < first <= number:
@@ -413,10 +416,12 @@ class Replay:
                     session.give_up_tare()
                 else:
                     session.tare()
+            elif kind is InputKind.MOVED and first == number:
+                moved = True
             elif kind is InputKind.ADAPT and first == number:
                 self._adapt(source, frames, *value)
         self._latest_frame[source] = number
-        estimate = await estimate_frames(session, frames)
+        estimate = await estimate_frames(session, frames, fingers_moved=moved)
         # The replayed latency is 0; the recording holds the live one.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)
         self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -180,6 +181,29 @@ async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path):
         assert task_of(rig, measures_diameters=False).held_tool(state.t_ns) is None, "the maker's widths are no gauge"
         await task.release()
         assert task.held_tool((await rig.driver.read()).t_ns) is None
+
+
+async def test_fingers_move_from_a_command_to_its_end(tmp_path):
+    async with reading("socket", tmp_path) as (rig, reader, felt):
+        task = replace(reader, clock=SimpleNamespace(now_ns=rig.monotonic_ns))
+
+        async def next_state_ns() -> int:
+            seen = len(felt)
+            while len(felt) == seen:  # noqa: ASYNC110 - the driver is asked, as the loop is
+                await asyncio.sleep(0)
+            return felt[-1].t_ns
+
+        rig.model.object_mm = 40.0
+        await rig.driver.activate()
+        for act in (lambda: task.grip(GRIP), task.release, task.open_by_operator):
+            rested_ns = await next_state_ns()
+            began_ns = await next_state_ns()
+            await act()
+            ended_ns = rig.monotonic_ns()
+            assert task.moved_between(began_ns, ended_ns)
+            assert not task.moved_between(rested_ns + 1, began_ns)
+        rested_ns = await next_state_ns()
+        assert not task.moved_between(rested_ns + 1, await next_state_ns())
 
 
 async def test_absent_gripper_is_reported(tmp_path, monkeypatch):

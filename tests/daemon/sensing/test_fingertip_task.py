@@ -13,15 +13,17 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
+from shearloop.daemon.control.finger_motion import FingerMotion
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes
-from shearloop.daemon.sensing.fingertip_messages import tare_from_bytes
+from shearloop.daemon.sensing.fingertip_messages import moved_from_bytes, tare_from_bytes
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import Frame
+from shearloop.drivers.robotiq.messages import ActivationStatus, GripperState, ObjectStatus, fault_of
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import ActionError
 from shearloop.estimation import Estimate, TactileFrame
@@ -133,6 +135,15 @@ def estimates(
     name: str, publisher: RecordingPublisher, session: FakeSession, clock: Clock | None = None, **options: Any
 ) -> FingertipTask:
     return FingertipTask(name, session, publisher, clock or Clock(), **options)
+
+
+def gripper_state(t_ns: int, status: ObjectStatus) -> GripperState:
+    return GripperState(t_ns, 100, 20.0, 0.5, status, ActivationStatus.ACTIVE, None, fault_of(0))
+
+
+def resting_gripper() -> SimpleNamespace:
+    diameters = SimpleNamespace(update=lambda *_: None)
+    return SimpleNamespace(held_tool=lambda _: None, moved_between=lambda *_: False, diameters=diameters)
 
 
 def pairs(publisher: RecordingPublisher) -> CombinedTask:
@@ -391,7 +402,7 @@ async def test_a_tare_that_lost_its_board_on_the_way_gives_no_estimate_until_the
 async def test_no_idle_frame_is_of_a_gripped_tool(complete, said, log):
     """The daemon was started again with a tool in the fingers: the paper's method takes its first frames for idle."""
     session, raw = Taring(), list[RawEvent]()
-    gripper = SimpleNamespace(held_tool=lambda _: None, diameters=SimpleNamespace(update=lambda *_: None))
+    gripper = resting_gripper()
     task = estimates("right", RecordingPublisher(), session, gripper=gripper, inputs=SimpleNamespace(record=raw.append))
     for number, gripper.is_holding in enumerate([*said, True]):
         await task.process(frame(number))
@@ -404,7 +415,7 @@ async def test_no_idle_frame_is_of_a_gripped_tool(complete, said, log):
 
 async def test_whoever_waits_for_a_tare_is_told_at_once_that_the_gripper_holds_something():
     clock, session = FixedClock(), Taring()
-    held = SimpleNamespace(held_tool=lambda _: None, diameters=SimpleNamespace(update=lambda *_: None))
+    held = resting_gripper()
     held.is_holding = False
     task = estimates("right", RecordingPublisher(), session, clock, gripper=held)
     async with running(task.tare_and_wait(60.0)) as (waiting,):
@@ -420,9 +431,48 @@ async def test_whoever_waits_for_a_tare_is_told_at_once_that_the_gripper_holds_s
     assert not task.taring
 
 
+@pytest.mark.parametrize(
+    ("from_ms", "to_ms", "moved"),
+    [(-700, -541, False), (-700, -539, True), (-300, -200, True), (-1, 500, True), (1, 500, False)],
+)
+async def test_a_frame_is_of_moving_fingers_if_they_moved_during_any_part_of_its_acquisition(from_ms, to_ms, moved):
+    """Both fingertips' frames end at the same time, 80 ms before they arrive."""
+    clock, raw, seen = FixedClock(), list[RawEvent](), list[bool]()
+    motion, arrives_ns = FingerMotion(), clock.t_ns
+    ended_ns = arrives_ns - 80 * MS
+    for t_ms, status in ((from_ms - 50, "AT_TARGET"), (to_ms, "AT_TARGET")):
+        if t_ms == to_ms:
+            with motion.commanded(ended_ns + from_ms * MS):
+                pass
+        motion.take(gripper_state(ended_ns + t_ms * MS, ObjectStatus[status]))
+
+    class Seeing(FakeSession):
+        def estimate(self, frame: TactileFrame) -> Estimate:
+            seen.append(frame.fingers_moved)
+            return super().estimate(frame)
+
+    gripper = resting_gripper()
+    gripper.is_holding, gripper.moved_between = False, motion.moved_between
+    inputs = SimpleNamespace(record=raw.append)
+    task = estimates(COMBINED, RecordingPublisher(), Seeing(), clock, gripper=gripper, inputs=inputs)
+    await task.process(frame(7, arrives_ns), frame(7, arrives_ns))
+    assert seen == [moved]
+    assert [(one.kind, moved_from_bytes(one.data)) for one in raw] == [(InputKind.MOVED, 7)] * moved
+
+
+async def test_a_pair_is_of_moving_fingers_if_one_of_its_frames_is():
+    clock, seen = FixedClock(), list[tuple[int, int]]()
+    gripper = resting_gripper()
+    gripper.is_holding, gripper.moved_between = False, lambda *interval: bool(seen.append(interval))
+    task = estimates(COMBINED, RecordingPublisher(), FakeSession(), clock, gripper=gripper)
+    await task.process(frame(3, clock.t_ns), frame(3, clock.t_ns - 200 * MS))
+    ended_ns = clock.t_ns - 80 * MS
+    assert seen == [(ended_ns - 200 * MS - PERIOD_NS, ended_ns)]
+
+
 async def test_an_idle_frame_outlives_the_grip_after_it():
     session = Taring()
-    gripper = SimpleNamespace(held_tool=lambda _: None, diameters=SimpleNamespace(update=lambda *_: None))
+    gripper = resting_gripper()
     task = estimates("right", RecordingPublisher(), session, gripper=gripper)
     for number, gripper.is_holding in enumerate([False, False, True, True]):
         await task.process(frame(number))

@@ -5,7 +5,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from shearloop.daemon.recorder.schema import message_json, recorded_topic
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import Measured, Session
+from shearloop.estimation.session import FINGERS_MOVED
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.message_content import read_content
 from shearloop.tools.recordings.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
@@ -43,10 +44,15 @@ class Gripper:
     """Holds a tool while the number of estimates is within a range, and says nothing of it else."""
 
     is_holding = False
+    # The numbers of estimates from frames during which the fingers moved.
+    moves: Collection[int] = ()
 
     def __init__(self, estimates: FingertipTask, tool: Measured, held: range) -> None:
         self._estimates, self._tool, self._held = estimates, tool, held
         self.diameters = FingertipDiameters("combined")
+
+    def moved_between(self, _from_ns: int, _to_ns: int) -> bool:
+        return self._estimates.count in self.moves
 
     def held_tool(self, _t_ns: int) -> Measured | None:
         return self._tool if self._estimates.count in self._held else None
@@ -290,6 +296,31 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     for one in after:
         assert [estimates[one["frame"]][key] for key in said] == [one[key] for key in said]
     assert estimates[zeroed]["reason"].startswith("taking the idle frame, 1 of")
+
+
+async def record_motion(config: Path) -> list[dict[str, Any]]:
+    """Run a daemon whose fingers move now and then, also during a tare; return what was published as estimates."""
+    async with recording_daemon(config) as (daemon, _, published, until):
+        right = daemon.sensors.tasks["right"]
+        right.gripper = Gripper(right, OTHER_TOOL, range(0))
+        right.gripper.moves = (*range(3, 6), 20, *range(ZEROED + 10, ZEROED + 12))
+        await until(ZEROED)
+        right.tare()
+        await until(ENOUGH)
+    return [content for topic, content in published if topic == "eit.estimate"]
+
+
+def test_frames_of_moving_fingers_are_replayed_as_such(config, tmp_path):
+    live = asyncio.run(record_motion(config(recording={"folder": "recordings"})))
+    moved = [FINGERS_MOVED in one["reason"] for one in live]
+    assert sum(moved) == 6
+    assert not any(one["valid"] for one, was_moved in zip(live, moved, strict=True) if was_moved)
+    (path,) = (tmp_path / "recordings").iterdir()
+    again, comparison = asyncio.run(replayed(path, math.inf))
+    assert comparison.compared["eit.estimate"] >= ENOUGH
+    assert comparison.different == Counter(), comparison.examples
+    reasons = [content["reason"] for topic, content in again if topic == "eit.estimate"]
+    assert reasons[: len(live)] == [one["reason"] for one in live]
 
 
 async def record_run(config: Path, per_experiment: int) -> None:

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
@@ -14,6 +15,7 @@ from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.emulators.boards import LOAD_PERIOD_S
 from shearloop.emulators.emulated_rig import SIDES
+from shearloop.estimation.session import FINGERS_MOVED
 from shearloop.studies.emulated_calibration import SEED, calibrate, record
 from shearloop.tools.bank_config import load_bank_plan
 from tests.daemon.test_closed_loop import HOST, running_rig, started
@@ -128,6 +130,19 @@ def check_replay(path: Path, result: dict[str, Any]) -> None:
     assert early.get("eit.estimate.combined", 0) < len(found["eit.estimate.combined"]) / 2, (path.name, early)
 
 
+def count_moved(found: Contents, period_s: float) -> int:
+    """Hold every estimate to be void that is of a frame during which the gripper's states show motion; count them."""
+    moving_ns = np.array([one["t_mono_ns"] for one in found["gripper.state"] if one["object"] == "moving"])
+    moved = 0
+    for side in SIDES:
+        for one in found[f"eit.estimate.{side}"]:
+            if (np.abs(moving_ns - one["t_mono_ns"]) < 0.49e9 * period_s).any():
+                assert not one["valid"], one
+                assert FINGERS_MOVED in one["reason"] or "the same frame again" in one["reason"], one
+                moved += 1
+    return moved
+
+
 @pytest.mark.parametrize("speed", [1, 30])
 def test_recordings_of_three_experiments_and_a_tare(speed, config, files, tmp_path, ran, monkeypatch):
     monkeypatch.setattr("tests.fixtures.daemons.DEADLINE_S", PATIENCE_S)
@@ -159,5 +174,6 @@ def test_recordings_of_three_experiments_and_a_tare(speed, config, files, tmp_pa
         out = ran("recording", "replay", one, "--speed", "max", *publish, "--check", "--json").out
         # The daemon's log stands before it.
         check_replay(one, json.loads(out.splitlines()[-1]))
+    assert sum(count_moved(contents(one), FRAME_PERIOD_S / speed) for one in recordings) >= len(SIDES)
     if TWIST in STEPS[speed]:
         assert any(row["valid"] for one in recordings for row in contents(one)["eit.estimate.combined"])

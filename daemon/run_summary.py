@@ -53,15 +53,20 @@ _Events: TypeAlias = Sequence[tuple[int, str]]
 
 @dataclass(frozen=True, slots=True)
 class TorqueSeries:
-    """A torque over time: ns of CLOCK_MONOTONIC and N·m, both (n,)."""
+    """A torque over time: ns of CLOCK_MONOTONIC and N·m, both (n,). `half_ns` is half the acquisition of one torque."""
 
     t_ns: FloatArray
     torque_nm: FloatArray
+    half_ns: float = 0.0
 
     def between(self, from_ns: float, to_ns: float) -> "TorqueSeries":
-        """Return the part within a time interval."""
+        """Return the torques whose middle is within a time interval."""
         inside = (self.t_ns >= from_ns) & (self.t_ns <= to_ns)
-        return TorqueSeries(self.t_ns[inside], self.torque_nm[inside])
+        return TorqueSeries(self.t_ns[inside], self.torque_nm[inside], self.half_ns)
+
+    def acquired_between(self, from_ns: float, to_ns: float) -> "TorqueSeries":
+        """Return the torques whose whole acquisition is within a time interval."""
+        return self.between(from_ns + self.half_ns, to_ns - self.half_ns)
 
 
 @dataclass(slots=True)
@@ -99,6 +104,8 @@ class _Run:
     # By source, the reasons without their numbers.
     invalid: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     torques: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
+    # By source, the times in ns of all torques, also of those that are not valid.
+    times_ns: defaultdict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
 
 
 class RunSummary:
@@ -170,6 +177,8 @@ def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
     if topic == "robot.state" and step is not None:
         step.wrist_to_rad = content["wrist_rad"]
         step.wrist_from_rad = step.wrist_to_rad if step.wrist_from_rad is None else step.wrist_from_rad
+    if topic in TORQUES:
+        run.times_ns[source].append(content["t_mono_ns"])
     if topic in TORQUES and content.get("torque_nm") is not None and content.get("valid", True):
         run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
     elif topic in TORQUES and not content.get("valid", True):
@@ -255,7 +264,13 @@ def _named(driving: str, truth: TorqueSeries | None) -> str:
 
 
 def _all_torques(run: _Run, truth: TorqueSeries | None) -> dict[str, TorqueSeries]:
-    sources = {name: TorqueSeries(*map(np.array, zip(*values, strict=True))) for name, values in run.torques.items()}
+    sources: dict[str, TorqueSeries] = {}
+    for name, values in run.torques.items():
+        t_ns, torque_nm = map(np.array, zip(*values, strict=True))
+        # A sensor acquires all the time: the acquisition of one torque takes one period.
+        periods_ns = np.diff(run.times_ns[name])
+        half_ns = 0.5 * float(np.median(periods_ns)) if periods_ns.size else 0.0
+        sources[name] = TorqueSeries(t_ns, torque_nm, half_ns)
     return sources if truth is None else {TRUE: truth, **sources}
 
 
@@ -266,21 +281,21 @@ def _held(
     sources = _all_torques(run, truth)
     yield f"    set point {_torque(set_nm, '+.3f')}, held for {held_s:.0f} s; {_named(driving, truth)}"
     for name, series in sources.items():
-        held = series.between(from_ns, step.to_ns).torque_nm
+        held = series.acquired_between(from_ns, step.to_ns).torque_nm
         if held.size:
             mean = f"    {name:<11} {_torque(held.mean(), '+.4f')} on average, standard deviation {held.std():.4f}"
             yield f"{mean}, within ± {BAND:.0%} for {np.mean(_in_band(held, set_nm)):.0%} of the time"
     # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
     names = sorted(set(sources) - {driving}, key=lambda name: (name != TRUE, name != LOAD_CELL, name))
     for name in names[:1]:
-        during = sources[name].between(step.from_ns, step.to_ns)
+        during = sources[name].acquired_between(step.from_ns, step.to_ns)
         reached_s = recovered_s((during.t_ns - step.from_ns) / 1e9, during.torque_nm, set_nm)
         if reached_s < np.inf:
             yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point changed, by {name}"
         for t_ns, description in events:
             # The next disturbance has a line of its own.
             next_ns = min((other_ns for other_ns, _ in events if other_ns > t_ns), default=None)
-            after = sources[name].between(t_ns, step.to_ns if next_ns is None else next_ns - 1)
+            after = sources[name].acquired_between(t_ns, step.to_ns if next_ns is None else next_ns - 1)
             if after.torque_nm.size:
                 worst_nm = np.abs(after.torque_nm - set_nm).max()
                 back_s = recovered_s((after.t_ns - t_ns) / 1e9, after.torque_nm, set_nm)

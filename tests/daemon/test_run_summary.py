@@ -60,6 +60,21 @@ def summary_of_hold(truth: TorqueSeries | None, happened: list[tuple[int, str]],
     return summary_of(*messages, loop_state(44, phase="done", hold=0), truth=truth, sent=happened)
 
 
+@pytest.mark.parametrize("before_s", [0.001, 0.023, 0.26])
+def test_a_torque_that_was_acquired_beyond_the_hold_in_part_does_not_count(before_s):
+    """A fingertip's frame takes 0.54 s; the middle of the last one lies shortly before a release."""
+    period_s, end_s = 0.54, 44.0
+    times_s = end_s - before_s - period_s * np.arange(54)[::-1]
+    messages = [loop_state(10), loop_state(times_s[0] - 0.001, hold=1)]
+    for number, t_s in enumerate(times_s):
+        # The first is half of what was before the hold, and the last half of opening fingers.
+        torque_nm = {0: 0.05, 53: -0.05}.get(number, 0.1)
+        said = {"torque_nm": torque_nm, "valid": number != 20, "reason": "disturbed"}
+        messages.append({"source": "right", "t_mono_ns": round(t_s * S), **said})
+    text = summary_of(*messages, loop_state(end_s, step=3, step_name="release"), loop_state(46, phase="done"))
+    assert "right       +0.1000 N·m on average, standard deviation 0.0000, within ± 10% for 100% of the time" in text
+
+
 def truth_that_falls_at(t_s: float, for_s: float) -> TorqueSeries:
     times = np.arange(0.0, 44.0, 0.1)
     torque = np.where(times < 13.0, 0.0, 0.1) - 0.03 * ((times >= t_s) & (times < t_s + for_s))
@@ -274,7 +289,9 @@ def test_each_number_of_a_hold_follows_from_the_messages(seed):
     lines = in_text(r"    (\S+|true torque) +(\S+) N·m on average, standard deviation (\S+), .* for (\d+)%", text)
     assert sorted(line[0] for line in lines) == ["load_cell", "right", "true torque"]
     for name, mean, deviation, share in lines:
-        during = [value for t_s, value in taken[name] if HOLD_S <= t_s <= END_S]
+        # A sensor's torque counts if its whole acquisition lies in the hold.
+        half_s = 0.0 if name == "true torque" else 0.5 / rates_hz[name]
+        during = [value for t_s, value in taken[name] if HOLD_S + half_s <= t_s <= END_S - half_s]
         average = sum(during) / len(during)
         assert float(mean) == pytest.approx(average, abs=0.51e-4), name
         squares = sum((value - average) ** 2 for value in during)

@@ -34,7 +34,7 @@ from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_b
 from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
-from shearloop.estimation.values import FrameSeries, Measured, TactileFrame, check_finite, distinct
+from shearloop.estimation.values import FrameSeries, Measured, check_finite, distinct
 from shearloop.words import counted
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
@@ -276,8 +276,8 @@ def _replay(
         session = Session(calibration, matcher=matcher)
         grip, was_held = grip + 1, False
         truths = zip(series.torque_at_frames(), series.diameter_mm, strict=True)
-        for i, (t_s, channels, truth) in enumerate(zip(series.t_s.tolist(), series.channels, truths, strict=True)):
-            processed = session.process(TactileFrame.of(t_s, channels))
+        for i, (frame, truth) in enumerate(zip(series.frames(), truths, strict=True)):
+            processed, t_s = session.process(frame), frame.t_s
             if was_held and not processed.held_frames:
                 grip += 1
             was_held = processed.held_frames > 0

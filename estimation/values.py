@@ -1,7 +1,7 @@
 """Values that estimators take and return: series of frames, single frames, measurements, estimates."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -37,7 +37,8 @@ class FrameSeries:
     was measured at torque_t_s (p,) on the same clock. diameter_mm (n,) is NaN where unknown; gripper_mm is then the
     gripper's width, if there was a gripper. Diameters are not fitted to gripper_mm. first_frame is the first frame's
     number in the whole recording, load_doubt why the torque's times may be wrong, left_out what is not among the frames
-    and torques, with its number. emulated says that every device was emulated.
+    and torques, with its number. emulated says that every device was emulated. fingers_moved (n, m) says which frames
+    saw the fingers open or close, None where that is not known.
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 
@@ -53,6 +54,7 @@ class FrameSeries:
     load_doubt: str = ""
     left_out: tuple[str, ...] = ()
     emulated: bool = False
+    fingers_moved: BoolArray | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and times."""
@@ -63,11 +65,19 @@ class FrameSeries:
                 f"{n} frames of {m} sides need channels of shape {expected} and {n} diameters, not "
                 f"{self.channels.shape} and {self.diameter_mm.shape}"
             )
+        if self.fingers_moved is not None and self.fingers_moved.shape != (n, m):
+            raise CalibrationError(f"{n} frames of {m} sides do not match motions of shape {self.fingers_moved.shape}")
         if self.torque_t_s.shape != self.torque_nm.shape:
             raise CalibrationError(f"{self.torque_t_s.shape} times do not match {self.torque_nm.shape} torques")
         for name, times in (("frames", self.t_s), ("torques", self.torque_t_s)):
             if (np.diff(times) < 0).any():
                 raise CalibrationError(f"the times of the {name} must not decrease; sort them")
+
+    def frames(self) -> "Iterator[TactileFrame]":
+        """Yield the frames as a session takes them."""
+        for number, (t_s, channels) in enumerate(zip(self.t_s.tolist(), self.channels, strict=True)):
+            moved = self.fingers_moved is not None and bool(self.fingers_moved[number].any())
+            yield TactileFrame.of(t_s, channels, fingers_moved=moved)
 
     def torque_at_frames(self) -> FloatArray:
         """Return the (n,) torque in N·m at the middle of each frame, NaN where no reading is near."""
@@ -82,7 +92,8 @@ class FrameSeries:
                 "choose among those"
             )
         layers = [self.sides.index(side) for side in sides]
-        return replace(self, sides=sides, channels=self.channels[:, layers])
+        moved = None if self.fingers_moved is None else self.fingers_moved[:, layers]
+        return replace(self, sides=sides, channels=self.channels[:, layers], fingers_moved=moved)
 
     def between(self, start: int, stop: int) -> Self:
         """Return frames `start` to `stop` with all torques."""
@@ -93,6 +104,7 @@ class FrameSeries:
             channels=self.channels[part],
             diameter_mm=self.diameter_mm[part],
             first_frame=self.first_frame + start,
+            fingers_moved=None if self.fingers_moved is None else self.fingers_moved[part],
         )
 
     @property

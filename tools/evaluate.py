@@ -15,7 +15,7 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.bank_file import Bank
-from shearloop.estimation import Calibration, Estimate, FrameSeries, Session, TactileFrame
+from shearloop.estimation import Calibration, Estimate, FrameSeries, Session
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.learned_frames import CANNOT_TELL_FRAMES, LearnedFrames
 from shearloop.estimation.load_delay import load_delay_warning
@@ -74,9 +74,9 @@ def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | 
     session = Session(calibration, bank)
     session.set_tool(chosen.tool_mm)
     estimates, latency = [], []
-    for t_s, channels in zip(chosen.t_s, chosen.channels, strict=True):
+    for frame in chosen.frames():
         begun = time.perf_counter()
-        estimates.append(session.estimate(TactileFrame.of(float(t_s), channels)))
+        estimates.append(session.estimate(frame))
         latency.append(1e3 * (time.perf_counter() - begun))
     profile_nm = None if calibration.profile is None else calibration.profile.predict(chosen)
     return EstimateTrack(chosen, tuple(estimates), np.array(latency), profile_nm, session.why_no_torque)

@@ -66,6 +66,7 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
     times = np.array([recording.sides[side].t_mid_ns[row] for side, row in zip(wanted, rows, strict=True)])
     paired = np.ptp(times, axis=0) <= _LARGEST_APART * period_ns
     lines = [recording.sides[side].lines[row][paired] for side, row in zip(wanted, rows, strict=True)]
+    moved = [recording.sides[side].fingers_moved[row][paired] for side, row in zip(wanted, rows, strict=True)]
     start = int(recording.sides[known[0]].t_mid_ns[0])
     t_s = (times[:, paired] - start).mean(axis=0) / 1e9
     diameter_mm, gripper_mm = tool_of(recording, first.t_mid_ns, tool_mm)
@@ -81,6 +82,7 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
         load_doubt=recording.notes.get(LOAD_DOUBT_NOTE, ""),
         left_out=recording.left_out + (() if paired.all() else (_unpaired(wanted[0], ~paired),)),
         emulated=recording.emulated,
+        fingers_moved=np.stack(moved, axis=1),
     )
 
 

@@ -161,6 +161,7 @@ def kept(recordings: Sequence[Series], rows: Sequence[BoolArray]) -> list[Series
                 t_s=one.t_s[own],
                 channels=one.channels[own],
                 diameter_mm=one.diameter_mm[own],
+                fingers_moved=None if one.fingers_moved is None else one.fingers_moved[own],
                 torque_t_s=one.torque_t_s[near],
                 torque_nm=one.torque_nm[near],
             )

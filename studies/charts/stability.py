@@ -222,6 +222,7 @@ def select_rows(series: SliceSeries, chosen: BoolArray) -> SliceSeries:
     return replace(
         series, t_s=t_s, channels=series.channels[chosen], torque_t_s=t_s, torque_nm=series.torque_at_frames()[chosen],
         diameter_mm=series.diameter_mm[chosen],
+        fingers_moved=None if series.fingers_moved is None else series.fingers_moved[chosen],
     )  # fmt: skip
 
 

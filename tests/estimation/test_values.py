@@ -86,6 +86,17 @@ def test_what_does_not_belong_together_is_refused(changed, message):
         replace(EMPTY, **changed)
 
 
+def test_frames_know_which_of_their_sides_saw_the_fingers_move():
+    moved = np.array([[False, False], [True, False], [False, True]])
+    series = replace(EMPTY, sides=("right", "left"), channels=np.zeros((3, 2, 896)), fingers_moved=moved)
+    assert [one.fingers_moved for one in series.frames()] == [False, True, True]
+    assert [one.fingers_moved for one in series.select_sides(("left",)).frames()] == [False, False, True]
+    assert [one.fingers_moved for one in series.between(1, 2).frames()] == [True]
+    assert [one.fingers_moved for one in EMPTY.frames()] == [False] * 3
+    with pytest.raises(CalibrationError, match="do not match motions"):
+        replace(EMPTY, fingers_moved=moved)
+
+
 def test_a_missing_side_is_named():
     with pytest.raises(CalibrationError, match="not left"):
         EMPTY.select_sides(("left",))

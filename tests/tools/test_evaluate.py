@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.estimation import Estimate, FrameSeries
-from shearloop.tools.evaluate import EstimateTrack, figures_by_load, figures_of, write_estimates
+from shearloop.estimation import Estimate, FrameSeries, fit
+from shearloop.estimation.session import FINGERS_MOVED
+from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, write_estimates
+from tests.estimation.conftest import twisting
 
 torques = st.floats(-0.2, 0.2).map(lambda one: round(one, 4))
 frames = st.tuples(torques, st.none() | st.tuples(torques, st.floats(0, 0.1), st.floats(0, 0.1)))
@@ -35,6 +37,16 @@ def winkler_by_hand(truth, low, high):
     if truth > high:
         score += 2 / 0.05 * (truth - high)
     return score
+
+
+def test_an_evaluation_judges_no_frame_that_saw_the_fingers_move():
+    calibration, series = fit("motion_regression", [twisting()], "rig"), twisting(seed=5)
+    moved = np.zeros((len(series.t_s), 2), dtype=np.bool_)
+    moved[70, 1] = True
+    plain, track = (estimate_series(calibration, replace(series, fingers_moved=one)) for one in (None, moved))
+    assert plain.estimates[70].valid
+    assert track.estimates[70].reasons == (FINGERS_MOVED,)
+    assert sum(one.valid for one in track.estimates) == sum(one.valid for one in plain.estimates) - 1
 
 
 @given(st.lists(frames, min_size=1, max_size=12), st.floats(0.0, 0.1))

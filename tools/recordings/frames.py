@@ -1,9 +1,10 @@
 """The frames, torques and tools of a recording as arrays, for whoever fits or judges an estimator."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from pydantic_core import from_json
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.recorder import schema
-from shearloop.daemon.sensing.fingertip_messages import tool_from_bytes
+from shearloop.daemon.sensing.fingertip_messages import moved_from_bytes, tool_from_bytes
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import Measured
 from shearloop.tools.recordings.reader import open_recording, reading, unusable
@@ -32,10 +33,14 @@ _IDENTITY_KEYS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SideFrames:
-    """One side's frames by rising time: t_mid_ns (n,) in Unix nanoseconds, lines (n, v) in volts."""
+    """One side's frames by rising time: t_mid_ns (n,) in Unix nanoseconds, lines (n, v) in volts.
+
+    fingers_moved (n,) says which frames saw the fingers open or close, as far as it was recorded.
+    """
 
     t_mid_ns: NDArray[np.int64]
     lines: NDArray[np.float64]
+    fingers_moved: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +64,13 @@ class Recording:
     emulated: bool = False
 
 
+class _Row(NamedTuple):
+    t_mid_ns: int
+    line: list[float]
+    # None in an imported recording.
+    number: int | None
+
+
 def _detail(error: Exception) -> str:
     return f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
 
@@ -66,7 +78,8 @@ def _detail(error: Exception) -> str:
 def read_recording(path: str | Path) -> Recording:
     """Read the frames, torques and tools of a recording; raises UserError for a file that cannot be used."""
     path = Path(path)
-    frames: dict[str, list[tuple[int, list[float]]]] = {}
+    frames: dict[str, list[_Row]] = {}
+    moved: dict[str, set[int]] = {}
     torques: list[tuple[int, float]] = []
     tools: list[tuple[int, Measured | None]] = []
     repeated, distrusted, why = Counter[str](), 0, ""
@@ -91,16 +104,19 @@ def read_recording(path: str | Path) -> Recording:
                         raise ValueError(f"a line of {len(line)} values")
                     rows = frames.setdefault(sides[topic], [])
                     # The board repeated an old frame.
-                    if not rows or rows[-1][1] != line:
-                        rows.append((t_ns, line))
+                    if not rows or rows[-1].line != line:
+                        rows.append(_Row(t_ns, line, content.get("frame")))
                     else:
                         repeated[sides[topic]] += 1
                 elif content["kind"] == InputKind.TOOL.value:
                     tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
+                elif content["kind"] == InputKind.MOVED.value:
+                    side = topic.removeprefix(schema.input_topic(""))
+                    moved.setdefault(side, set()).add(moved_from_bytes(schema.input_event(content).data))
             except (KeyError, TypeError, ValueError) as error:
                 raise unusable(path, f"a message on {topic} does not match its schema ({_detail(error)})") from error
     with reading(path):
-        side_frames = {side: _side_frames(rows) for side, rows in frames.items()}
+        side_frames = {side: _side_frames(rows, moved.get(side, set())) for side, rows in frames.items()}
     notes = {key: value for key, value in identity.items() if key not in _IDENTITY_KEYS}
     experiment = metadata.get(schema.EXPERIMENT_METADATA, {})
     if schema.DIAMETER_NOTE in experiment:
@@ -129,6 +145,8 @@ def _left_out(distrusted: int, torques: int, why: str, repeated: Counter[str]) -
         yield f"{counted(number, 'frame')} of the {side} side, repeated by the board"
 
 
-def _side_frames(rows: list[tuple[int, list[float]]]) -> SideFrames:
-    t_mid_ns, lines = zip(*rows, strict=True)
-    return SideFrames(np.array(t_mid_ns, np.int64), np.array(lines, np.float64))
+def _side_frames(rows: list[_Row], moved: Collection[int]) -> SideFrames:
+    t_mid_ns, lines, numbers = zip(*rows, strict=True)
+    return SideFrames(
+        np.array(t_mid_ns, np.int64), np.array(lines, np.float64), np.array([number in moved for number in numbers])
+    )

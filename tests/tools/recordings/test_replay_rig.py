@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -132,7 +133,14 @@ def check_replay(path: Path, result: dict[str, Any]) -> None:
 
 def count_moved(found: Contents, period_s: float) -> int:
     """Hold every estimate to be void that is of a frame during which the gripper's states show motion; count them."""
-    moving_ns = np.array([one["t_mono_ns"] for one in found["gripper.state"] if one["object"] == "moving"])
+    # The first state of a motion may have been asked for before the command.
+    moving_ns = np.array(
+        [
+            one["t_mono_ns"]
+            for before, one in pairwise(found["gripper.state"])
+            if before["object"] == one["object"] == "moving"
+        ]
+    )
     moved = 0
     for side in SIDES:
         for one in found[f"eit.estimate.{side}"]:
@@ -174,6 +182,8 @@ def test_recordings_of_three_experiments_and_a_tare(speed, config, files, tmp_pa
         out = ran("recording", "replay", one, "--speed", "max", *publish, "--check", "--json").out
         # The daemon's log stands before it.
         check_replay(one, json.loads(out.splitlines()[-1]))
-    assert sum(count_moved(contents(one), FRAME_PERIOD_S / speed) for one in recordings) >= len(SIDES)
+    moved = [count_moved(contents(one), FRAME_PERIOD_S / speed) for one in recordings]
+    # Frames as fast as 30 times fall between two states of the gripper.
+    assert speed > 1 or sum(moved) >= len(SIDES)
     if TWIST in STEPS[speed]:
         assert any(row["valid"] for one in recordings for row in contents(one)["eit.estimate.combined"])

@@ -1,5 +1,6 @@
 """Which tool a daemon's recording is of: by its experiment, by the gripper, by who calibrates; and if they disagree."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
 from shearloop.daemon.recorder.recorder import Identity, Recorder
 from shearloop.daemon.recorder.schema import basic_identity
-from shearloop.daemon.sensing.fingertip_messages import tool_as_bytes
+from shearloop.daemon.sensing.fingertip_messages import moved_as_bytes, tool_as_bytes
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.estimation import Measured
@@ -31,8 +32,13 @@ class Held(Clock):
         return self.t_ns
 
 
-def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float | None = None) -> Path:
-    """Record 40 frames as a daemon does; from the frame with each number on the gripper holds another tool, or none."""
+def recorded(
+    folder: Path, *held: tuple[int, Measured | None], named_mm: float | None = None, moved: Collection[int] = ()
+) -> Path:
+    """Record 40 frames as a daemon does; from the frame with each number on the gripper holds another tool, or none.
+
+    The fingers moved during the frames `moved`.
+    """
     clock, values = Held(), dict(held)
     recorder = Recorder(folder, Identity(basic_identity("a test")), clock)
     recorder.record_experiment("twist", tool_mm=named_mm)
@@ -42,6 +48,9 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
         if number in values:
             tool = tool_as_bytes(number, values[number])
             recorder.input_recorder("right").record(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool))
+        if number in moved:
+            event = RawEvent(InputKind.MOVED, clock.t_ns, moved_as_bytes(number))
+            recorder.input_recorder("right").record(event)
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
         t_ns = clock.t_ns - PERIOD_NS // 2
         message = sample(EitFrame, source="right", t_mono_ns=t_ns, line=line, frame=number, age_s=0.3)
@@ -58,6 +67,13 @@ def test_the_experiment_names_its_tool(tmp_path, ran):
     assert read_series(path, tool_mm=30.0)[0].tool_mm == Measured(20.0, 0.0), "a recording that names it knows better"
     assert summarise(path).tool_mm == "20"
     assert "  tool     20 mm\n" in ran("recording", "info", path).out
+
+
+def test_a_recording_knows_which_frames_saw_the_fingers_move(tmp_path):
+    (series,) = read_series(recorded(tmp_path, moved=(3, 4, 39)))
+    assert [number for number, one in enumerate(series.frames()) if one.fingers_moved] == [3, 4, 39]
+    (series,) = read_series(recorded(tmp_path / "resting"))
+    assert not any(one.fingers_moved for one in series.frames())
 
 
 def test_the_gripper_says_which_tool_it_held(tmp_path):

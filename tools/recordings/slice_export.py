@@ -146,7 +146,7 @@ class _Sweep:
         if tares and self._tare_from_ns is None:
             self._tare_from_ns = now_ns
         elif self._tare_from_ns is not None and not tares:
-            self._end_tare(self._tare_from_ns)
+            self._end_tare(self._tare_from_ns, now_ns)
             self._tare_from_ns = None
         # A safety hold or a pause keeps the angle, so the hold continues.
         number = 0 if content["phase"] in ("done", "stopped") or not content["slices"] else content["hold"]
@@ -161,11 +161,11 @@ class _Sweep:
             self._hold = (number, now_ns, content["slices"])
         return found
 
-    def _end_tare(self, began_ns: int) -> None:
+    def _end_tare(self, began_ns: int, ended_ns: int) -> None:
         for source, frames in self._frames.items():
-            # The acquisition of the first frame began before the step, maybe with a tool in the fingers.
-            from_ns = began_ns + _half_period_ns(frames)
-            lines = [line for t_ns, line in frames if t_ns >= from_ns]
+            # The whole acquisition of a frame must lie in the step: before and after it the fingers may move.
+            half_ns = _half_period_ns(frames)
+            lines = [line for t_ns, line in frames if began_ns + half_ns <= t_ns <= ended_ns - half_ns]
             if lines:
                 self._homogeneous[source] = np.mean(lines, axis=0)
 
@@ -175,7 +175,9 @@ class _Sweep:
         # The whole acquisition of a frame must lie in the hold.
         half_ns = _half_period_ns(known)
         frames = [frame for frame in known if from_ns + half_ns <= frame[0] <= to_ns - half_ns]
-        torques = np.array([row for row in self._torques if from_ns < row[0] < to_ns]).reshape(-1, 2)
+        load_half_ns = _half_period_ns(self._torques)
+        whole = [row for row in self._torques if from_ns + load_half_ns <= row[0] <= to_ns - load_half_ns]
+        torques = np.array(whole).reshape(-1, 2)
         if source not in self._homogeneous:
             return "no `tare` step came before the hold"
         if len(frames) < MIN_FRAMES or not len(torques):
@@ -209,6 +211,6 @@ def _save_mat(path: Path, written: list[Path], **arrays: Any) -> None:
     written.append(path)
 
 
-def _half_period_ns(frames: Collection[tuple[int, FloatArray]]) -> float:
-    """Return half the duration of an acquisition, 0 for fewer than two frames."""
-    return 0.5 * float(np.median(np.diff([t_ns for t_ns, _ in frames]))) if len(frames) > 1 else 0.0
+def _half_period_ns(measured: Collection[tuple[int, object]]) -> float:
+    """Return half the duration of an acquisition of frames or torques, 0 for fewer than two."""
+    return 0.5 * float(np.median(np.diff([t_ns for t_ns, _ in measured]))) if len(measured) > 1 else 0.0

@@ -94,6 +94,25 @@ def test_each_hold_becomes_a_slice_for_reproduce(tmp_path):
     np.testing.assert_allclose(raw - rest, 0.15, atol=1e-6)
 
 
+def test_the_homogeneous_frame_has_no_frame_that_was_acquired_beyond_the_tare_in_part(tmp_path):
+    sweep = Sweep(tmp_path, tared=False)
+    # A tool is taken out right before the step, and gripped right after it.
+    sweep.frames(0.1, 2.0)
+    # The step begins within the next frame, and ends within the last one.
+    sweep.t_s += 0.75 * PERIOD_S
+    sweep.loop(step_name="tare")
+    sweep.t_s -= 0.75 * PERIOD_S
+    sweep.frames(0.05, PERIOD_S)
+    sweep.frames(0.0, 4.0)
+    sweep.frames(0.05, PERIOD_S)
+    sweep.t_s += 0.25 * PERIOD_S
+    sweep.loop(step_name="grip")
+    sweep.frames(0.1, 1.0)
+    sweep.hold(1, 0.15)
+    sweep.export(tmp_path)
+    np.testing.assert_allclose(read_line(tmp_path / "torque_slices" / "TorqueSliceHom.mat"), sweep.rest, atol=1e-6)
+
+
 def test_a_second_sweep_continues_the_numbers(tmp_path):
     for diameter_mm in (10.2, 20.4):
         sweep = Sweep(tmp_path, "diameter")

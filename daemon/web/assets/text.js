@@ -13,7 +13,8 @@ export function show(element, shown) {
 }
 
 // Reasons that are normal between a tare and the first torque of a grip, not faults.
-const WAITING = /^(no [^:]+: |not valid: )?(no grip|gripped too recently|taking the idle frame|there is no earlier frame)/;
+const WAITING =
+  /^(no [^:]+: |not valid: )?(no grip|gripped too recently|the fingers moved|taking the idle frame|there is no earlier frame)/;
 
 export function warn(element, sentence) {
   put(element, sentence);

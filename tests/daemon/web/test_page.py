@@ -8,6 +8,7 @@ from playwright.sync_api import Route
 
 from shearloop.daemon.messaging.messages import TOPICS, units
 from shearloop.daemon.web.message_store import conductivity_profile
+from shearloop.estimation.session import FINGERS_MOVED
 from tests.daemon.web.fake_daemon import CAUSE, MESSAGES, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
@@ -267,7 +268,10 @@ def test_what_is_invalid_or_faulty_says_why_and_shows_no_number(said, shown, bro
     assert browsed.layout()["spilt"] == []
 
 
-@pytest.mark.parametrize(("reason", "waits"), [("gripped too recently: 4 more", True), ("another gel", False)])
+@pytest.mark.parametrize(
+    ("reason", "waits"),
+    [("gripped too recently: 4 more", True), (f"{FINGERS_MOVED}; no grip", True), ("another gel", False)],
+)
 def test_what_is_normal_before_the_first_torque_is_no_warning(reason, waits, browsed):
     browsed.open()
     browsed.daemon.say(estimate={**NO_ESTIMATE, "valid": False, "reason": reason})

@@ -87,6 +87,8 @@ def run(args: argparse.Namespace) -> int:
         status = process.wait()
     if status:
         return status
+    # Half a minute has passed.
+    check_ports(config, settings.host if settings is not None else None)
     with page(config, port):
         return _call(run_command, str(folder / name), "--show", *played)
 

@@ -13,6 +13,7 @@ from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefus
 from shearloop.daemon.sensors import Sensors
 from shearloop.daemon.supervisor import HealthReporter
 from shearloop.errors import UserError
+from shearloop.printable import printable
 
 if TYPE_CHECKING:
     # Only a rig with a robot loads them.
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
     from shearloop.daemon.rig import Rig
 
 EXPERIMENTS = "experiments"
+# The arguments of each command that acts, with their types.
+ARGUMENTS: Mapping[str, Mapping[str, type]] = {
+    "tare": {"source": str, "confirmed": bool},
+    "start": {"experiment": str, "ask": bool, "confirmed": bool},
+    "release": {"confirmed": bool, "ask": bool},
+}
 STOP_DELAY_S = 0.05
 
 
@@ -66,6 +73,7 @@ class Commands:
         """Carry out a command, and report its result."""
         refusal = None
         try:
+            check_arguments(name, request)
             return await handler(request)
         except CommandRefusedError as error:
             refusal = str(error)
@@ -163,12 +171,32 @@ class Commands:
         if spare_daemon:
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
-        if self.rig is not None and (held := self.rig.control_loop.held) is not None:
+        if self.rig is not None and (held := self.rig.control_loop.may_still_hold) is not None:
             # Somebody who presses twice must still be able to open the gripper.
             return {"stopped": "", "held": held}
         # Nothing moves, so the daemon itself stops, once the reply is sent.
         asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
         return {"ended": True}
+
+
+def check_arguments(name: str, request: Request) -> None:
+    """Raise CommandRefusedError for an argument that a command does not have, or of another type.
+
+    A misspelt `experiment` would start the configured one, and a `confirmed` of "no" would confirm.
+    A stop takes anything.
+    """
+    if name == STOP:
+        return
+    known = ARGUMENTS.get(name, {})
+    for key, value in request.items():
+        if key in ("command", "by"):
+            continue
+        if key not in known:
+            has = f"; it has {', '.join(known)}" if known else "; it has none"
+            raise CommandRefusedError(f"`{name}` has no argument {printable(key)[:40]!r}{has}")
+        if not isinstance(value, known[key]) or value == "":
+            kind = "true or false" if known[key] is bool else "text"
+            raise CommandRefusedError(f"`{key}` is {printable(repr(value))[:40]}, and has to be {kind}")
 
 
 def required_rig(rig: "Rig | None") -> "Rig":

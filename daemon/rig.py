@@ -175,7 +175,7 @@ class Rig:
     tasks: Mapping[str, Task]
     experiments: ExperimentFiles
     recorder: Recorder | None
-    # None for a rig that starts by itself: its emulated devices end with the daemon.
+    # None where the emulated devices end with the daemon.
     memory: RigMemory | None = None
     commissioning: Commissioning | None = None
 
@@ -242,7 +242,9 @@ def build_rig(
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, commissioning, config.gripper_model)
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
-    memory = RigMemory(memory_path(settings.host), loop, sensors.load_cell) if not config.autostart else None
+    # Devices that this process emulates end with it, and with them every grip and stop.
+    ends_with_us = config.autostart or (config.emulated and bool(config.emulators))
+    memory = None if ends_with_us else RigMemory(memory_path(settings.host), loop, sensors.load_cell, robot)
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
     if memory is not None:
         tasks["memory"] = memory

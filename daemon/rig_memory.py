@@ -19,10 +19,12 @@ import structlog
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.ur.client import UrRobot
 from shearloop.errors import UserError
 from shearloop.files import replace_file
 
 VERSION = 1
+_AXES = 6
 # The file is written at this interval, and at the start of each experiment.
 FOLLOWS_S = 0.1
 
@@ -42,6 +44,8 @@ class Remembered:
     # with a tool in the fingers nobody can take another zero.
     load_zero: float | None = None
     load_nm_per_count: float | None = None
+    # The zero of the wrench in this grip.
+    wrench_zero: tuple[float, ...] | None = None
 
     @classmethod
     def of(cls, loop: ControlLoop) -> "Remembered":
@@ -68,6 +72,7 @@ class RigMemory:
     path: Path
     loop: ControlLoop
     load_cell: LoadCell | None = None
+    robot: UrRobot | None = None
     error: str = ""
     # The experiment that is about to begin.
     starting: str = ""
@@ -83,6 +88,9 @@ class RigMemory:
         if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:
             structlog.get_logger().info("the load cell keeps the zero of the present grip")
             cell.tare(zero)
+        if self.robot is not None and remembered.wrench_zero is not None:
+            x, y, z, about_x, about_y, about_z = remembered.wrench_zero
+            self.robot.restore_wrench_zero((x, y, z, about_x, about_y, about_z))
 
     async def run(self) -> None:
         """Write every change until cancelled."""
@@ -103,6 +111,8 @@ class RigMemory:
         if self.load_cell is not None and self.loop.may_hold():
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)
+        if self.robot is not None and self.loop.may_hold():
+            state = replace(state, wrench_zero=self.robot.wrench_zero)
         await self.save(state)
 
     async def save(self, state: Remembered) -> None:
@@ -175,7 +185,12 @@ def read_memory(path: Path) -> Remembered:
         if content.pop("version") != VERSION:
             raise ValueError("it has another version")
         stop = tuple((str(code), str(detail)) for code, detail in content.pop("stop"))
-        return Remembered(stop=stop, **content)
+        zero = content.pop("wrench_zero", None)
+        if zero is not None:
+            zero = tuple(float(value) for value in zero)
+            if len(zero) != _AXES:
+                raise ValueError("a wrench has six values")
+        return Remembered(stop=stop, wrench_zero=zero, **content)
     except FileNotFoundError:
         return Remembered()
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:

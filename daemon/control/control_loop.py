@@ -223,6 +223,13 @@ class ControlLoop:
         force = f"with at most {force_n:g} N" if force_n is not None else "with an unknown force"
         return f"its fingers hold something {gripper.width_mm:.1f} mm wide, {force}"
 
+    @property
+    def may_still_hold(self) -> str | None:
+        """The object between the fingers, or why a tool that was gripped may still be there; None without one."""
+        if self.held is not None or self._gripped.force_n is None:
+            return self.held
+        return self._why_uncertain()
+
     def may_hold(self) -> bool:
         """Return whether the gripper holds something, or does not know; a grip of an earlier process counts."""
         if "gripper" not in self._watched.required:

@@ -118,7 +118,7 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, allowed_s: float, t_ns
     latest = inputs.torques.get(source.name)
     if source.name in inputs.lost:
         gone = "not connected yet" if latest is None else "gone"
-        return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} is {gone}: {inputs.lost[source.name]}")
+        return Fault(FaultCode.SENSOR_LOST, f"{source.name} is {gone}: {inputs.lost[source.name]}")
     if latest is None:
         return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9

@@ -58,6 +58,12 @@ class FaultCode(Enum):
         "Check the sensor's cable and its task in `shearloop listen health`.",
         hold_at_most_s=5.0,
     )
+    SENSOR_LOST = Rule(
+        _HOLD,
+        "a torque sensor is not connected: {detail}.",
+        "Connect it again; the daemon finds it by itself. If the wrist stopped, then `shearloop command unlock`.",
+        hold_at_most_s=5.0,
+    )
     ESTIMATE_INVALID = Rule(
         _HOLD,
         "the torque estimate is not valid: {detail}.",

@@ -92,6 +92,15 @@ class UrRobot:
         # Those who wait for the next state.
         self._waiting: list[asyncio.Future[messages.RobotState]] = []
 
+    @property
+    def wrench_zero(self) -> Six:
+        """What the wrench is measured from, where the controller's own zero is another one."""
+        return self._wrench_zero
+
+    def restore_wrench_zero(self, zero: Six) -> None:
+        """Take the zero of a process before this one, before the worker starts."""
+        self._wrench_zero = zero
+
     def diagnostics(self) -> Diagnostics:
         """Return the robot's values for `health`; counts are since the process began."""
         return {

@@ -220,7 +220,8 @@ async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_
 async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig_config, tiny_bank):
     """The stop that opens the gripper ends the experiment, and that the daemon, within the same millisecond."""
     twist = {"do": "twist", "angles_rad": [0.3], "speed_rad_per_s": 0.1, "limits": {"torque_nm": 0.02}}
-    path = ending_with(rig_config, {"do": "grip", "width_mm": 5, "force_n": 60}, twist)
+    grip = {"do": "grip", "width_mm": 5, "force_n": 60}
+    path = ending_with(rig_config, {"do": "release"}, {"do": "tare"}, grip, twist)
     async with running_rig(path, tiny_bank) as (daemon, watcher, _cause, _command):
         await daemon.ending.wait()
     assert not daemon.finished
@@ -235,7 +236,7 @@ async def test_a_board_that_is_unplugged_holds_the_wrist(rig_config, tiny_bank, 
         await started(command, experiment(tmp_path, SLOW_TWIST))
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
         fault("unplug load")
-        state = await watcher.until("loop.state", lambda state: FaultCode.ESTIMATE_STALE.text in state["faults"])
+        state = await watcher.until("loop.state", lambda state: FaultCode.SENSOR_LOST.text in state["faults"])
         assert state["phase"] in ("held", "stopped")
         assert state["speed_command_rad_per_s"] == 0.0
 

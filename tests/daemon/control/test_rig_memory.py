@@ -12,8 +12,10 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.rig_memory import Remembered, RigMemory, lock_robot, memory_path, read_memory, write_memory
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
+from shearloop.drivers.ur.client import UrRobot
 from shearloop.errors import UserError
 from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, started, stop
+from tests.drivers.ur.handler_bench import SETTINGS
 
 WAIT = {"do": "wait", "wait_s": 60}
 
@@ -125,6 +127,24 @@ async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_on
     await memory.save_present()
     RigMemory(path, new_loop(), free := load_cell())
     assert free.calibration.tare_counts == 8000.0
+
+
+async def test_the_wrench_keeps_its_zero_with_the_grip(tmp_path):
+    path, zero = tmp_path / "robot.json", (0.0, 1.0, 0.0, 0.0, 0.0, -0.11)
+    rig = started(Rig(new_loop()), GRIP, WAIT)
+    before, after, free = UrRobot(SETTINGS), UrRobot(SETTINGS), UrRobot(SETTINGS)
+    memory = RigMemory(path, rig.control_loop, robot=before)
+    before.restore_wrench_zero(zero)
+    rig.run(2)
+    await memory.save_present()
+    RigMemory(path, new_loop(), robot=after)
+    assert after.wrench_zero == zero
+    rig.force_n = 0.0
+    stop(rig)
+    rig.run(0.6)
+    await memory.save_present()
+    RigMemory(path, new_loop(), robot=free)
+    assert free.wrench_zero == (0.0,) * 6
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"version": 0, "stop": []}', '{"version": 1, "stop": 3}', "\x00"])

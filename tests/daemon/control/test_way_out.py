@@ -107,6 +107,17 @@ def test_no_tare_while_something_is_held():
     assert "shearloop command release" in refusal
 
 
+@pytest.mark.parametrize("gripped", [True, False])
+def test_after_a_grip_fingers_that_were_halted_may_still_hold_the_tool(gripped):
+    rig = started(Rig(new_loop()), *[GRIP] * gripped, WAIT)
+    rig.run(3)
+    stop(rig)
+    rig.force_n, rig.hand = 0.0, replace(rig.hand, uncertain=True)
+    rig.run(0.6)
+    said = rig.control_loop.may_still_hold
+    assert ("does not know whether it holds a tool" in said) if gripped else said is None
+
+
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
 def test_a_tare_with_an_uncertain_gripper_has_to_be_confirmed(sense):
     rig = held(**sense)

@@ -1,5 +1,6 @@
 import asyncio
 import os
+import re
 import socket
 import threading
 from collections.abc import Mapping
@@ -163,6 +164,24 @@ def test_who_sends_a_command_is_one_printable_line(by, shown):
     assert caller_of({"by": by}) == shown
     assert len(caller_of({"by": "x" * 500})) <= 80
     assert caller("shearloop command").endswith(f"@{os.uname().nodename}, shearloop command")
+
+
+@pytest.mark.parametrize(
+    ("name", "request_", "why"),
+    [
+        ("release", {"confirmed": "no"}, "`confirmed` is 'no', and has to be true or false"),
+        ("release", {"confirmed": 1}, "has to be true or false"),
+        ("tare", {"confirmed": "no"}, "has to be true or false"),
+        ("start", {"exper1ment": "a.yaml"}, "`start` has no argument 'exper1ment'; it has experiment, ask, confirmed"),
+        ("start", {"experiment": ""}, "`experiment` is '', and has to be text"),
+        ("start", {"experiment": False}, "has to be text"),
+        ("unlock", {"ask": True}, "`unlock` has no argument 'ask'; it has none"),
+    ],
+)
+async def test_an_argument_that_a_command_does_not_have_moves_nothing(name, request_, why):
+    commands = Commands(rig=None, sensors=None, experiment=None, health=None, daemon_end=asyncio.Event())
+    with pytest.raises(CommandRefusedError, match=re.escape(why)):
+        await commands.handlers()[name]({"command": name, "by": "ann", **request_})
 
 
 async def test_tare_is_refused_during_an_experiment():

@@ -121,13 +121,13 @@ class ActionExecutor:
                 ) from error
             self.fingers_move = False
 
-    def stop_unlocking(self) -> bool:
-        """End an unlocking, and halt the fingers that it moves; return whether one was under way."""
+    def stop_unlocking(self) -> str | None:
+        """End the operator's `unlock` or `release`, and halt the fingers that it moves; return its name, or None."""
         if self._unlocking is None or not self._unlocking.cancel():
-            return False
+            return None
         if self.fingers_move:
             self.cancel()
-        return True
+        return self._unlocking.get_name()
 
     def abort(self) -> None:
         """Cancel the present action unless it is the last one of a stop.

@@ -101,13 +101,12 @@ class ControlLoopRunner:
             await self.actions.close()
 
     def stop(self, *, also_idle: bool = False) -> str | None:
-        """End the experiment, also during its start, or the unlocking; return its name, or None.
+        """End the experiment, also during its start, or the unlocking or the release; return its name, or None.
 
         The next start waits for `unlock`. `also_idle`: also where nothing moves.
         """
         self._stop_count += 1
-        experiment, unlocking = self._control_loop.running, self.stop_unlocking()
-        stopped = "unlock" if unlocking else None
+        experiment, stopped = self._control_loop.running, self.stop_unlocking()
         if experiment is not None:
             stopped = experiment.file.name
         if stopped is not None or also_idle:
@@ -255,10 +254,10 @@ class ControlLoopRunner:
         self._control_loop.on_release_ended()
         return None
 
-    def stop_unlocking(self) -> bool:
-        """End an unlocking or a release, and halt the fingers that it moves; return whether one was under way."""
+    def stop_unlocking(self) -> str | None:
+        """End an unlocking or a release, and halt the fingers that it moves; return the command's name, or None."""
         stopped = self.actions.stop_unlocking()
-        if stopped:
+        if stopped is not None:
             # The worker ends its part.
             self._robot.send(self._sender.stop_command)
         return stopped

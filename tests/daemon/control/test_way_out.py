@@ -81,7 +81,7 @@ async def test_a_stop_ends_a_release_and_halts_the_fingers():
         releasing = asyncio.create_task(cell.runner.release())
         await cell.cycles(5)
         assert "wait for the end" in (await cell.runner.start(experiment(WAIT)) or "")
-        assert cell.runner.stop() == "unlock"
+        assert cell.runner.stop() == "release"
         await cell.cycles(5)
         assert await releasing == "the release was stopped; send `release` again"
         assert cell.gripper.asked == ["open", "halt"]

@@ -281,7 +281,7 @@ async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, wait
         await log.says("waiting to start")
         ready.set()
         path = tmp_path / ("experiment.yaml" if own else "another.yaml")
-        await daemon.commands.handlers()["start"]({"experiment": path})
+        await daemon.commands.handlers()["start"]({"experiment": str(path)})
         if not own:
             await log.says(LEFT_TO_OPERATOR)
             daemon.stop()

@@ -4,9 +4,9 @@
 
 RECORDINGS holds streams. Each twist of a recording is left out in turn, after the first 1, 2 and 3, which are left out
 too and adapt the gain. Factors on the torque emulate grips of other gains. The last rows are a calibration on one grip
-of a 30 mm cylinder, adapted in the other one, both ways: the only grips whose gain did change. A cell holds RMSE and
-score of loaded frames in mN·m, and their coverage: not adapted; as `shearloop adapt` does; with all followed that
-twists show; and as if the gain drifted by a tenth within a grip. Writes adaptation.json.
+of a 30 mm cylinder, adapted in the other one, both ways: the only grips whose gain did change. Columns: not
+adapted; as `shearloop adapt` does it; as if all that twists show were followed; as if the gain drifted by a tenth
+within a grip. Each cell has RMSE and score of the loaded frames, in mN·m, and their coverage. Writes adaptation.json.
 """
 
 from collections.abc import Iterator, Sequence

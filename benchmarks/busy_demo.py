@@ -23,12 +23,16 @@ LONGEST_S = 900.0
 
 
 def run_demo(folder: Path) -> dict[str, Any]:
-    """Run one demo; return its exit status, its time in s, and the lines of its summary."""
+    """Run one demo; return its exit status, None without an end, its time in s, and what happened."""
     began_s = time.monotonic()
-    ended = subprocess.run(DEMO, cwd=folder, capture_output=True, text=True, check=False, timeout=LONGEST_S)
+    try:
+        ended = subprocess.run(DEMO, cwd=folder, capture_output=True, text=True, check=False, timeout=LONGEST_S)
+    except subprocess.TimeoutExpired:
+        return {"status": None, "took_s": LONGEST_S, "happened": "it did not end"}
     took_s = time.monotonic() - began_s
-    _, _, summary = ended.stdout.rpartition(HAPPENED)
-    return {"status": ended.returncode, "took_s": took_s, "summary": summary.splitlines()}
+    _, found, summary = ended.stdout.partition(HAPPENED)
+    happened = (summary if found else ended.stderr).splitlines()
+    return {"status": ended.returncode, "took_s": took_s, "happened": happened[0] if happened else ""}
 
 
 def main() -> None:
@@ -44,8 +48,8 @@ def main() -> None:
         with busy_processes(args.busy):
             for number in range(args.runs):
                 runs.append(run_demo(Path(name)))
-                status, took_s, summary = runs[-1].values()
-                print(table_row(number + 1, status, took_s, summary[0] if summary else ""), flush=True)
+                run = runs[-1]
+                print(table_row(number + 1, run["status"], run["took_s"], run["happened"]), flush=True)
                 write_figures(args.out, {"busy": args.busy, "runs": runs})
     done = sum(run["status"] == 0 for run in runs)
     print(json.dumps({"busy": args.busy, "runs": len(runs), "done": done}))

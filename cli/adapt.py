@@ -9,9 +9,6 @@ from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
 from shearloop.tools.outputs import check_overwrite
 
-# A gain that differs by less is printed as 1.00.
-_UNCHANGED = 0.005
-
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -58,9 +55,7 @@ def run(args: argparse.Namespace) -> int:
     names = adapted.sides if len(factors) == len(adapted.sides) else (" and ".join(adapted.sides),)
     gains = {name: {"gain": gain, "error": error} for name, gain, error in zip(names, factors, errors, strict=True)}
     sentences = [f"{name}: torque times {one['gain']:.2f} ± {one['error']:.2f}." for name, one in gains.items()]
-    if all(abs(factor - 1) < _UNCHANGED for factor in factors):
-        sentences.append("The twists deviate no more than by chance: the gain stays as it is.")
-    sentences.append(f"To the sum {correction.offset_nm:+.4f} N·m is added.")
+    sentences.append(f"Offset: {correction.offset_nm:+.4f} N·m.")
     twists = correction.twists
     sentences.append(f"{twists} twist{'s' * (twists > 1)} of known torque decided. Written to {args.out}.")
     figures = {"path": str(args.out), "gains": gains, "twists": twists, "gain_spread": correction.spread.between}

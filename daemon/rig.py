@@ -148,6 +148,7 @@ def make_gripper(
     config: GripperConfig,
     loop: ControlLoop,
     publisher: Publisher,
+    clock: Clock,
     patience: float,
     supplied: Supplied = NOTHING_SUPPLIED,
 ) -> GripperTask:
@@ -160,7 +161,7 @@ def make_gripper(
     calibration = measured or calibration
     hand = RobotiqGripper(client, calibration, monitor=LinkMonitor(LinkReporter("gripper", loop)))
     measures = config.calibration is not None or measured is not None
-    return GripperTask(hand, publisher, loop, FingertipDiameters(COMBINED), measures_diameters=measures)
+    return GripperTask(hand, publisher, loop, FingertipDiameters(COMBINED), clock, measures)
 
 
 @dataclass
@@ -230,7 +231,7 @@ def build_rig(
     loop = make_loop(config, settings, sources, supervisor.dead, supplied)
     gripper = None
     if config.gripper is not None:
-        gripper = make_gripper(config.gripper, loop, publisher, patience_of(config), supplied)
+        gripper = make_gripper(config.gripper, loop, publisher, clock, patience_of(config), supplied)
     sensors = build_sensors(config, publisher, clock, recorder, sessions, loop, gripper)
     robot = UrRobot(
         settings,

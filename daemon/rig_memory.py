@@ -1,4 +1,4 @@
-"""What must outlive the daemon's process: a stop, the experiment that runs, and the grip with the load cell's zero.
+"""What must outlive the daemon's process: a stop, the experiment that runs, and the grip with its zeros.
 
 There is a file for each robot.
 """
@@ -12,19 +12,21 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import structlog
+from pydantic import ConfigDict
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.settings import Six
 from shearloop.errors import UserError
 from shearloop.files import replace_file
+from shearloop.mistakes import validated
 
 VERSION = 1
-_AXES = 6
 # The file is written at this interval, and at the start of each experiment.
 FOLLOWS_S = 0.1
 
@@ -32,6 +34,8 @@ FOLLOWS_S = 0.1
 @dataclass(frozen=True, slots=True)
 class Remembered:
     """The state of a rig; empty without a stop, an experiment and a grip."""
+
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     # The name of the experiment that runs.
     running: str = ""
@@ -45,7 +49,7 @@ class Remembered:
     load_zero: float | None = None
     load_nm_per_count: float | None = None
     # The zero of the wrench in this grip.
-    wrench_zero: tuple[float, ...] | None = None
+    wrench_zero: Six | None = None
 
     @classmethod
     def of(cls, loop: ControlLoop) -> "Remembered":
@@ -67,7 +71,7 @@ class Remembered:
 
 @dataclass(slots=True)
 class RigMemory:
-    """Keeps a rig's state in a file, which is replaced as a whole; the task follows loop and load cell."""
+    """Keeps a rig's state in a file, which is replaced as a whole; the task follows loop, load cell and robot."""
 
     path: Path
     loop: ControlLoop
@@ -89,8 +93,8 @@ class RigMemory:
             structlog.get_logger().info("the load cell keeps the zero of the present grip")
             cell.tare(zero)
         if self.robot is not None and remembered.wrench_zero is not None:
-            x, y, z, about_x, about_y, about_z = remembered.wrench_zero
-            self.robot.restore_wrench_zero((x, y, z, about_x, about_y, about_z))
+            structlog.get_logger().info("the wrench keeps the zero of the present grip")
+            self.robot.restore_wrench_zero(remembered.wrench_zero)
 
     async def run(self) -> None:
         """Write every change until cancelled."""
@@ -184,13 +188,7 @@ def read_memory(path: Path) -> Remembered:
         content: Any = json.loads(path.read_text(encoding="utf-8"))
         if content.pop("version") != VERSION:
             raise ValueError("it has another version")
-        stop = tuple((str(code), str(detail)) for code, detail in content.pop("stop"))
-        zero = content.pop("wrench_zero", None)
-        if zero is not None:
-            zero = tuple(float(value) for value in zero)
-            if len(zero) != _AXES:
-                raise ValueError("a wrench has six values")
-        return Remembered(stop=stop, wrench_zero=zero, **content)
+        return validated(content, Remembered, str(path), ValueError)
     except FileNotFoundError:
         return Remembered()
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:

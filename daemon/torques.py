@@ -45,7 +45,7 @@ class TorqueSource:
     `from_robot`: the torque comes with the robot's state, so its age is checked there. `measures_torque` is False for a
     fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
     the first torque; 0 for a source that measures without a grip. `has_gain`: an `adapt` step can correct its gain.
-    `noise_nm`: the torque is known to this; it says nothing about smaller ones.
+    `noise_nm`: the torque is known to this; such a source supervises beyond it only, and drives nothing gentler.
     """
 
     name: str
@@ -57,10 +57,6 @@ class TorqueSource:
     warm_up_s: float = 0.0
     has_gain: bool = False
     noise_nm: float = 0.0
-
-    def is_within_noise(self, limit_nm: float) -> bool:
-        """Return whether its noise alone may reach a limit."""
-        return 0.0 < limit_nm <= self.noise_nm
 
     def fresh_s(self, config: LoopConfig) -> float:
         """Return how long after its arrival a torque is fresh."""

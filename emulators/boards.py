@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from shearloop.emulators.numbers import number_between
 from shearloop.emulators.ports import PtyPort
 
-# Lateness of this process or of the reader that is made up for, in periods, and at least: a real board does not wait
-# for a busy computer, and fast rates are kept on average. Whatever keeps the board waiting keeps the emulated arm
-# waiting.
+# Lateness that is made up for, in periods, and at least: a real board does not wait for a busy computer, and fast rates
+# are kept on average. Lines that are late hold what is measured as they are sent.
 CATCH_UP_PERIODS, CATCH_UP_S = 9, 0.05
 # The mean over 4882 lines of the paper's rig.
 LOAD_PERIOD_S = 1 / 10.9

@@ -71,7 +71,7 @@ def joints_within(
 
     The tool keeps its direction. The point keeps a quarter of the box from each face, or as far as HOME_RAD is.
     """
-    # A fifth of the start-up time of an emulated rig, which needs it only in a given workspace.
+    # It takes long to import, and an emulated rig needs it in a given workspace only.
     from scipy.optimize import least_squares
 
     tool = frame_of_pose(tcp_offset)

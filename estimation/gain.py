@@ -452,7 +452,7 @@ def log_gain(predicted: FloatArray, truth: FloatArray) -> float | None:
 def _beyond_chance(
     known: "Callable[[float], _Equations]", equations: "_Equations", shown: FloatArray, beyond_chance: float
 ) -> FloatArray:
-    """Return what is followed of the unknowns that twists have `shown`: what is not explained by chance.
+    """Return the part of the unknowns that twists have `shown` which chance does not explain.
 
     `known` returns the equations for a spread of the gain from grip to grip, `beyond_chance` is the one that the sum of
     the fingertips shows.

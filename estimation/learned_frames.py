@@ -35,6 +35,11 @@ class LearnedFrames:
         every = [self.digests, *(frame_digests(channels).ravel() for channels in frames)]
         return type(self)(np.unique(np.concatenate(every))[:MOST_DIGESTS], self.complete)
 
+    @property
+    def is_sample(self) -> bool:
+        """Whether more frames were learned from than are kept: then fewer are found than were used."""
+        return len(self.digests) == MOST_DIGESTS
+
     def include(self, channels: FloatArray) -> BoolArray:
         """Return which of n frames (n, m, c) are among these, by the signals of one fingertip or more."""
         return np.asarray(np.isin(frame_digests(channels), self.digests).any(axis=1))

@@ -103,8 +103,8 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
                 text += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
             if robot is not None and experiment.torque_source != WRENCH:
                 noise_nm = robot.settings.facts.estimated_nm
-                if noise_nm >= experiment.tightest_nm:
-                    text += f"; the wrench does not supervise it, because it is known to {noise_nm:g} N·m only"
+                if noise_nm:
+                    text += f"; the wrench supervises it to {noise_nm:g} N·m beyond its limits only"
             parts.texts["experiment"] = text
     return parts
 

@@ -143,15 +143,16 @@ def evaluate_recordings(
 def known_data(learned: LearnedFrames, tracks: Sequence[EstimateTrack], paths: Sequence[Path]) -> list[str]:
     """Return a sentence for each track with judged frames that the calibration has learned from.
 
-    A calibration that does not tell them all is named too.
+    The first one says so where its file does not tell them.
     """
     found = [] if learned.complete else [CANNOT_TELL_FRAMES]
     for track, path in zip(tracks, paths, strict=True):
         judged = track.series.channels[judged_frames(track)]
         if known := int(learned.include(judged).sum()):
+            at_least, frames = "at least " if learned.is_sample else "", counted(len(judged), "judged frame")
             found.append(
-                f"the calibration has learned from {known} of {counted(len(judged), 'judged frame')} of {path}; errors "
-                "on known frames are smaller than on new ones, so judge it on others"
+                f"the calibration has learned from {at_least}{known} of {frames} of {path}; errors on known frames are "
+                "smaller than on new ones, so judge it on others"
             )
     return found
 

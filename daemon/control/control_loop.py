@@ -3,7 +3,6 @@
 A plain object without I/O or clock: inputs come in, `ControlOutput` go out, and events report their results.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -75,8 +74,6 @@ class _GrippedTool:
     # A stop has opened the gripper, or why it did not open, until the operator acknowledges it.
     released: bool = False
     release_error: str | None = None
-    # The causes of the latest stop, once it is acknowledged, until the next start.
-    acknowledged: str = ""
 
 
 class ControlLoop:
@@ -121,6 +118,8 @@ class ControlLoop:
             patience=patience,
         )
         self._gripped = _GrippedTool()
+        # The causes of the latest stop, once it is acknowledged, until the next start.
+        self._acknowledged = ""
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
 
@@ -314,10 +313,9 @@ class ControlLoop:
             known = ", ".join(self._wrists)
             return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
         driving = self._sources[file.torque_source]
-        if driving.is_within_noise(file.tightest_nm):
+        if driving.noise_nm >= file.tightest_nm:
             return too_noisy(driving.name, driving.noise_nm, file.tightest_nm)
-        others = self._others(driving, file.tightest_nm)
-        watched = replace(self._watched, driving=driving, supervising=others, limits=file.limits)
+        watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
         faults = detect_faults(self.inputs, watched, self.config, t_ns)
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
@@ -349,6 +347,7 @@ class ControlLoop:
             expected=expected,
             release_error=before.release_error,
         )
+        self._acknowledged = ""
         self.runs += 1
         # Until the first tick, the status must not show the end of the previous run.
         phase, activity = self.experiment.phase.value, self.experiment.command.activity
@@ -374,7 +373,7 @@ class ControlLoop:
         self._gripped.release_error = None
         if self.safety.stopped:
             causes = "; ".join(fault.cause for fault in self.safety.stop_faults)
-            self._gripped.acknowledged = f"the stop is acknowledged; its cause was: {causes}"
+            self._acknowledged = f"the stop is acknowledged; its cause was: {causes}"
         self.safety.acknowledge()
 
     def tick(self, t_ns: int, late_s: float = 0.0, sent_rad_per_s: float | None = None) -> ControlOutput:
@@ -421,10 +420,8 @@ class ControlLoop:
             return self._ended(decision)
         return self._run_step(running, decision, arm.wrist_rad, t_ns)
 
-    def _others(self, driving: TorqueSource, limit_nm: float = math.inf) -> tuple[TorqueSource, ...]:
-        """Return the sources that supervise: those whose noise alone does not reach the limit."""
-        others = (source for source in self._sources.values() if source is not driving)
-        return tuple(source for source in others if not source.is_within_noise(limit_nm))
+    def _others(self, driving: TorqueSource) -> tuple[TorqueSource, ...]:
+        return tuple(source for source in self._sources.values() if source is not driving)
 
     def _why_uncertain(self) -> str | None:
         """Return why the gripper cannot say whether it holds a tool, or None."""
@@ -515,7 +512,7 @@ class ControlLoop:
         phase = experiment.phase.value if experiment is not None else "idle"
         reason = experiment.stop_reason if experiment is not None else ""
         if experiment is not None and experiment.phase is ExperimentPhase.STOPPED and not self.safety.stopped:
-            reason = self._gripped.acknowledged or reason
+            reason = self._acknowledged or reason
         self.status = LoopStatus(phase, reason, WristCommand(), decision)
         release = decision.response is Response.STOP_AND_RELEASE and not self._gripped.released
         self._gripped.released |= release

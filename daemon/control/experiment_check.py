@@ -114,7 +114,7 @@ def too_noisy(source: str, noise_nm: float, limit_nm: float) -> str:
     """Return why a source cannot drive an experiment with this torque limit."""
     return (
         f"`torque_source: {source}`: its torque is known to {noise_nm:g} N·m only, and the smallest limit is "
-        f"{limit_nm:g} N·m, which its noise alone may pass; let a fingertip or the load cell drive, or raise the limit"
+        f"{limit_nm:g} N·m, which its noise alone may pass; let a fingertip or the load cell drive"
     )
 
 

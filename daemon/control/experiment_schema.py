@@ -1,7 +1,7 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias, get_args
 
@@ -358,10 +358,9 @@ AS_ASKED: Final = Speeds()
 SETTLES_S: Final = 1.0
 
 
-def _steps_rad(step: TwistStep) -> list[float]:
-    """Return how far the wrist turns between the angles of a round, from the last one of the round before."""
-    angles_rad = step.angles_rad
-    return [abs(later - earlier) for earlier, later in pairwise((angles_rad[-1], *angles_rad))]
+def _travel_rad(angles_rad: Sequence[float]) -> float:
+    """Return how far the wrist turns from angle to angle."""
+    return sum(abs(later - earlier) for earlier, later in pairwise(angles_rad))
 
 
 def demand(step: Step, speeds: Speeds = AS_ASKED) -> Demand:
@@ -378,10 +377,15 @@ def demand(step: Step, speeds: Speeds = AS_ASKED) -> Demand:
             stands_s = step.hold_s * len(angles_rad) * step.repeats
             # How far an absolute angle is from the grip is known only there.
             reach = [0.2 if step.absolute else abs(angle_rad) for angle_rad in angles_rad]
-            moves = [2.0 * one_rad for one_rad in reach] if step.return_to_start else _steps_rad(step)
-            settles_s = SETTLES_S * len(angles_rad) * (2 if step.return_to_start else 1)
-            speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
-            moves_s = step.repeats * (sum(moves) / speed_rad_per_s + settles_s)
+            moves = step.repeats * len(angles_rad)
+            if step.return_to_start:
+                moves, travel_rad = 2 * moves, step.repeats * 2.0 * sum(reach)
+            else:
+                # Each round begins at the last angle of the one before, the first one at the grip.
+                between_rounds_rad = abs(angles_rad[0] - angles_rad[-1])
+                travel_rad = reach[0] + step.repeats * _travel_rad(angles_rad)
+                travel_rad += (step.repeats - 1) * between_rounds_rad
+            moves_s = travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s) + SETTLES_S * moves
             return Demand(0.0, 0.0 if step.absolute else max(reach), stands_s, moves_s)
         case WaitStep(wait_s=wait_s):
             return Demand(stands_s=wait_s)

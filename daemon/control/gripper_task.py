@@ -41,9 +41,9 @@ class GripperTask:
     publisher: Publisher
     control_loop: ControlLoop
     diameters: FingertipDiameters
-    measures_diameters: bool = True
     # The time of commands.
-    clock: Clock = field(default_factory=Clock)
+    clock: Clock
+    measures_diameters: bool = True
     _motion: FingerMotion = field(default_factory=FingerMotion)
 
     async def run(self) -> None:
@@ -80,7 +80,8 @@ class GripperTask:
 
     async def halt(self) -> None:
         """Stop the fingers; raises DriverError."""
-        await _tried(self.gripper.halt)
+        with self._motion.commanded(self.clock.now_ns()):
+            await _tried(self.gripper.halt)
 
     async def unlock(self) -> None:
         """Activate again after a fault, once the operator says that the fingers are clear; raises DriverError."""

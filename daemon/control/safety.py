@@ -25,7 +25,8 @@ class Rule:
 
     A fault that `is_past` is detected after it is over, such as a pause of the loop. A fault that `explains` is
     reported first, and faults that only hold the wrist count as its consequences: queued data is old, and boards
-    seem lost. One that `stops_at_rest` is a stop also where nothing moved: somebody was near the arm, or touched it.
+    seem lost. Faults with one `timer` are one hold: a board that is silent is lost soon after. One that `stops_at_rest`
+    is a stop also where nothing moved: somebody was near the arm, or touched it.
     """
 
     response: Response
@@ -35,6 +36,7 @@ class Rule:
     is_past: bool = False
     explains: bool = False
     stops_at_rest: bool = False
+    timer: str = ""
 
     @property
     def kind(self) -> str:
@@ -57,12 +59,14 @@ class FaultCode(Enum):
         "no new torque has arrived: {detail}.",
         "Check the sensor's cable and its task in `shearloop listen health`.",
         hold_at_most_s=5.0,
+        timer="torque source",
     )
     SENSOR_LOST = Rule(
         _HOLD,
         "a torque sensor is not connected: {detail}.",
         "Connect it again; the daemon finds it by itself. If the wrist stopped, then `shearloop command unlock`.",
         hold_at_most_s=5.0,
+        timer="torque source",
     )
     ESTIMATE_INVALID = Rule(
         _HOLD,
@@ -211,6 +215,11 @@ class FaultCode(Enum):
         """The name in words: the code in messages."""
         return self.name.lower().replace("_", " ")
 
+    @property
+    def timer(self) -> str:
+        """The name of its hold timer."""
+        return self.value.timer or self.name
+
     @classmethod
     def of_text(cls, text: str) -> "FaultCode":
         """Return the fault of a message's code; raises KeyError for an unknown one."""
@@ -278,8 +287,8 @@ class SafetyMonitor:
     def __init__(self, patience: float = 1.0) -> None:
         """`patience` is the factor on the longest holds; above 1 on an emulated rig alone."""
         self._patience = patience
-        # Hold timers of each fault and of the wrist, and the faults that held it at the last judgement.
-        self._held_ns: dict[FaultCode, int] = {}
+        # Hold timers of faults and of the wrist, and the faults that held it at the last judgement.
+        self._held_ns: dict[str, int] = {}
         self._wrist_ns = 0
         self._holding: frozenset[FaultCode] = frozenset()
         # Each fault's contribution to the wrist's timer, for the report.
@@ -360,11 +369,12 @@ class SafetyMonitor:
         passed_ns = 0 if self._judged_ns is None else t_ns - self._judged_ns
         holding = frozenset(fault.code for fault in active if fault.rule.hold_at_most_s is not None)
         held = self._holding.union(code for code in holding if TABLE[code].is_past)
+        run, needed = ({code.timer for code in codes} for codes in (held, holding))
         counted = {
-            code: _counted(self._held_ns.get(code, 0), passed_ns, held=code in held)
-            for code in (*self._held_ns, *holding)
+            timer: _counted(self._held_ns.get(timer, 0), passed_ns, held=timer in run)
+            for timer in (*self._held_ns, *needed)
         }
-        self._held_ns = {code: held_ns for code, held_ns in counted.items() if held_ns or code in holding}
+        self._held_ns = {timer: held_ns for timer, held_ns in counted.items() if held_ns or timer in needed}
         self._wrist_ns = _counted(self._wrist_ns, passed_ns, held=bool(held))
         if not self._wrist_ns:
             self._share_ns.clear()
@@ -380,7 +390,7 @@ class SafetyMonitor:
     def _response(self, fault: Fault) -> Response:
         rule = fault.rule
         longest_s = rule.hold_at_most_s
-        if longest_s is not None and self._held_ns[fault.code] > self._patience * longest_s * 1e9:
+        if longest_s is not None and self._held_ns[fault.code.timer] > self._patience * longest_s * 1e9:
             return Response.STOP_AND_KEEP_GRIP
         return rule.response
 

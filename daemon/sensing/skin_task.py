@@ -186,7 +186,8 @@ class ReplayedSkin:
 
     def restore(self, text: bytes) -> None:
         """Continue from a recorded state; raises SnapshotError for one that does not fit."""
-        state = restored(text, self._estimator.fixed)
+        like = {"estimator": self._estimator, "validator": self._validator, "averager": self._averager}
+        state = restored(text, self._estimator.fixed, like)
         self._validator, self._averager = state["validator"], state["averager"]
         self._latest, self._estimator = state["latest"], state["estimator"]
         self._daq = state.get("parser", self._daq)

@@ -9,7 +9,7 @@ import json
 import re
 import sys
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from enum import Enum
 from typing import Any, Literal
 
@@ -51,10 +51,15 @@ def snapshot(state: Mapping[str, object], fixed: Mapping[str, object]) -> bytes:
     return json.dumps(_Encoder(names).value(dict(state))).encode("ascii")
 
 
-def restored(text: bytes, fixed: Mapping[str, object]) -> dict[str, Any]:
-    """Return the objects of a snapshot; raises SnapshotError for one that does not fit."""
+def restored(text: bytes, fixed: Mapping[str, object], like: Mapping[str, object]) -> dict[str, Any]:
+    """Return the objects of a snapshot, in place of objects `like` them that have just been made.
+
+    Raises SnapshotError for one that does not fit, also where it lacks an attribute that these objects have: another
+    version has written it.
+    """
+    known = {type(part): _attributes(part).keys() for part in _parts(like).values()}
     try:
-        found = _Decoder(_parts(fixed)).value(json.loads(text))
+        found = _Decoder(_parts(fixed), known).value(json.loads(text))
     # Another version's snapshot, or a spoilt one, raises many types of exceptions.
     except Exception as error:
         raise SnapshotError(f"the state does not fit this version: {error!r}") from error
@@ -158,8 +163,10 @@ class _Encoder:
 class _Decoder:
     """Turns JSON into values, in their order."""
 
-    def __init__(self, fixed: Mapping[str, object]) -> None:
+    def __init__(self, fixed: Mapping[str, object], known: Mapping[type, Collection[str]]) -> None:
         self._fixed = fixed
+        # The attributes that objects of a class begin with.
+        self._known = known
         self._met: list[Any] = []
 
     def value(self, form: Any) -> Any:
@@ -195,15 +202,19 @@ class _Decoder:
                 found.update({self.value(key): self.value(one) for key, one in form["items"]})
                 return found
             case "object":
-                kind_of = _class(form)
-                # A model cannot be copied without what pydantic keeps beside its attributes.
-                is_model = issubclass(kind_of, BaseModel)
-                made = self._meet(kind_of.model_construct() if is_model else kind_of.__new__(kind_of))
-                for name, one in form["attributes"].items():
-                    object.__setattr__(made, name, self.value(one))
-                return made
+                return self._object(_class(form), form["attributes"])
             case unknown:
                 raise SnapshotError(f"the state has a {unknown!r}")
+
+    def _object(self, kind: Any, attributes: Mapping[str, Any]) -> Any:
+        if missing := [name for name in self._known.get(kind, ()) if name not in attributes]:
+            raise SnapshotError(f"{kind.__name__} has no {', '.join(missing)}")
+        # A model cannot be copied without what pydantic keeps beside its attributes.
+        is_model = issubclass(kind, BaseModel)
+        made = self._meet(kind.model_construct() if is_model else kind.__new__(kind))
+        for name, one in attributes.items():
+            object.__setattr__(made, name, self.value(one))
+        return made
 
     def _meet(self, value: Any) -> Any:
         self._met.append(value)

@@ -162,6 +162,10 @@ class UrArm:
         self._script_port.send(control_program(self._settings, self._registers, self._held))
         self.script_readiness.command_sent()
 
+    def forget_load(self) -> None:
+        """Keep no load for a program that has not answered: the gripper has let go."""
+        self._held = None
+
     def arm_watchdog(self) -> bool:
         """Return whether the uploaded program answers; its watchdog is armed then."""
         armed = self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)

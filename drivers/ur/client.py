@@ -84,6 +84,7 @@ class UrRobot:
         self.states = 0
         # Whether the gripper holds something, or may: then a new program keeps the zero of the wrench.
         self.holds: Callable[[], bool] = lambda: False
+        self._told_held = False
         self._wrench_zero: Six = (0.0,) * 6
         self._connection: WorkerConnection | None = None
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
@@ -122,15 +123,18 @@ class UrRobot:
         if self._connection is None or self.state is None:
             replied.set_result(messages.CommandReply(f"The robot is not connected. {self.monitor.latest.sentence}"))
         else:
-            if isinstance(command, messages.Unlock):
-                self._send_held(self._connection)
+            self._tell_held(self._connection)
             self._number += 1
             self._replies[self._number] = replied
             self._connection.send(command, self._number)
         return replied
 
-    def _send_held(self, connection: "WorkerConnection") -> None:
-        connection.send(messages.Held(self.holds(), self._wrench_zero))
+    def _tell_held(self, connection: "WorkerConnection") -> None:
+        """Tell the worker of a change of what is held, before any command that follows from it."""
+        held = self.holds()
+        if held is not self._told_held:
+            self._told_held = held
+            connection.send(messages.Held(held))
 
     def keep_moving(self) -> None:
         """Let a straight move that is under way go on for `silence_timeout_s`; each decision calls this."""
@@ -152,7 +156,8 @@ class UrRobot:
         connection = WorkerConnection(self.settings, self)
         await asyncio.get_running_loop().subprocess_exec(lambda: connection, sys.executable, "-m", self._worker)
         connection.send(self.settings)
-        self._send_held(connection)
+        self._told_held = self.holds()
+        connection.send(messages.Held(self._told_held, self._wrench_zero))
         self._connection = connection
         try:
             await connection.listen()
@@ -174,6 +179,8 @@ class UrRobot:
                 before, self.state = self.state, message
                 self._wrench_zero = message.wrench_zero
                 self.states += 1
+                if self._connection is not None:
+                    self._tell_held(self._connection)
                 if before is None:
                     connected = f"The robot at {self.settings.host} is connected."
                     said = (connected, self._warning, self._promise, message.blocked)

@@ -249,7 +249,11 @@ class CommandHandler:
 
     def take_held(self, message: Held) -> None:
         """Note whether something is held, for the next start of the program, and the zero of another worker."""
-        self._held_tool, self._arm.wrench_zero = message.held, message.wrench_zero
+        self._held_tool = message.held
+        if message.wrench_zero is not None:
+            self._arm.wrench_zero = message.wrench_zero
+        if not message.held:
+            self._arm.forget_load()
         if self._recovery is not None:
             self._recovery.held = message.held
 

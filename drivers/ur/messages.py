@@ -138,14 +138,14 @@ class Unlock:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Whether the gripper holds something, or may; and the zero of the wrench that another worker had.
+    """Whether the gripper holds something, or may; and for a new worker the zero of the wrench that another one had.
 
-    Sent to each new worker, and before an `Unlock`.
+    Sent to each new worker, and at each change.
     """
 
     __pydantic_config__: ClassVar = {"ser_json_inf_nan": "constants"}
     held: bool
-    wrench_zero: Six
+    wrench_zero: Six | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -188,4 +188,7 @@ def test_the_duration_knows_of_the_robots_speed_and_of_the_approach_to_each_angl
     # 8 rad, and 40 angles or 20 that are come near to.
     assert duration_s(twist, None) == pytest.approx(8 / 3 + 40.0)
     assert duration_s(twist, robot) == pytest.approx(8 / fastest_rad_per_s + 40.0)
-    assert duration_s({**twist, "return_to_start": False}, robot) == pytest.approx(8 / fastest_rad_per_s + 20.0)
+    # From the grip to the first angle it is half as far as between the others.
+    assert duration_s({**twist, "return_to_start": False}, robot) == pytest.approx(7.8 / fastest_rad_per_s + 20.0)
+    once = {**twist, "angles_rad": [0.4], "speed_rad_per_s": 0.02, "repeats": 1, "return_to_start": False}
+    assert duration_s(once, robot) == pytest.approx(20.0 + 1.0)

@@ -52,6 +52,7 @@ async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last
     assert board.port.appearances.qsize() == 1
 
 
+@pytest.mark.real_time
 async def test_a_busy_computer_that_keeps_the_emulator_waiting_leaves_no_gap_between_its_frames(tmp_path):
     period_s, line = 0.1, format_line(np.where(PAPER_TABLE.zero_slots, 0, 0.25))
 

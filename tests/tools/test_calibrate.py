@@ -64,10 +64,11 @@ class Process(contextlib.AbstractContextManager["Process", None]):
         )
 
     def measure(self, mass_g: int, *, on_stderr: bool = False) -> None:
-        """Press Enter until a step is done: on a busy computer it may have met readings from before the mass."""
+        """Press Enter, twice at most: on a busy computer the first readings may be from before the mass."""
         self.tell("")
-        while not self.hear(("  ", "Put"), on_stderr=on_stderr).startswith(f"{mass_g} g:"):
+        if self.hear(("  ", "Put"), on_stderr=on_stderr).startswith("Put"):
             self.tell("")
+            self.hear(f"  {mass_g} g:", on_stderr=on_stderr)
 
     def end(self) -> tuple[int, str, str]:
         out, err = self._child.communicate(timeout=30)

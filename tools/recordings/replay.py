@@ -370,7 +370,8 @@ class Replay:
         pairs: list[tuple[Frame, ...]] = []
         try:
             if source in self._sessions:
-                state = restored(text, self._sessions[source].fixed)
+                session = self._sessions[source]
+                state = restored(text, session.fixed, {"session": session, "parser": self._frame_parsers.get(source)})
                 self._sessions[source] = state["session"]
                 if source in self._frame_parsers:
                     self._frame_parsers[source] = state["parser"]
@@ -378,7 +379,7 @@ class Replay:
                     self._pairing = state["pairing"]
                     pairs += state["pairs"]
             elif source == LOAD_CELL:
-                self._load_parser = restored(text, {})["parser"]
+                self._load_parser = restored(text, {}, {"parser": self._load_parser})["parser"]
             elif self._skin is not None:
                 self._skin.restore(text)
         except (SnapshotError, KeyError) as error:

@@ -39,12 +39,10 @@ class _Copy(threading.Thread):
     gets a pipe.
     """
 
-    def __init__(self, pipe: Path, out: IO[bytes]) -> None:
+    def __init__(self, pipe: int, out: IO[bytes]) -> None:
+        """Take the pipe's descriptor, which the copy closes."""
         super().__init__(name="rerun", daemon=True)
-        os.mkfifo(pipe)
-        # Opened before its writer, and read from once that has opened it.
-        self._pipe, self._out = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK), out
-        os.set_blocking(self._pipe, True)
+        self._pipe, self._out = pipe, out
         self._error: OSError | None = None
 
     def run(self) -> None:
@@ -76,8 +74,17 @@ class _RerunFile:
         self._width_cm = float(np.ptp([x for x, _ in fingertip.outline().contour]))
         # The SDK may be switched off by an environment variable, and would then write nothing.
         self._stream = rerun.RecordingStream("shearloop", default_enabled=True)
-        self._copy = _Copy(folder / "pipe", out)
-        self._stream.save(folder / "pipe")
+        pipe = folder / "pipe"
+        os.mkfifo(pipe)
+        # Opened before its writer, and read from once that has opened it.
+        reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+        try:
+            self._stream.save(pipe)
+        except BaseException:
+            os.close(reading)
+            raise
+        os.set_blocking(reading, True)
+        self._copy = _Copy(reading, out)
         self._copy.start()
         self._waiting: dict[str, tuple[list[int], list[Any]]] = {}
         self._models: dict[str, str] = {}
@@ -112,12 +119,15 @@ class _RerunFile:
 
     def close(self) -> None:
         """Write what waits, and the layout of the viewer; raises OSError where the disk does not take it."""
-        for entity in self._waiting:
-            self._send(entity)
-        self._stream.send_blueprint(self._layout())
-        self._stream.flush()
-        self._stream.disconnect()
-        self._copy.end()
+        try:
+            for entity in self._waiting:
+                self._send(entity)
+            self._stream.send_blueprint(self._layout())
+            self._stream.flush()
+        finally:
+            # The copy ends with the pipe's writer.
+            self._stream.disconnect()
+            self._copy.end()
 
     def _add(self, entity: str, value: Any, t_ns: int) -> None:
         times, values = self._waiting.setdefault(entity, ([], []))

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from shearloop.daemon.clock import Clock
 from shearloop.daemon.control import gripper_task
 from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
@@ -33,7 +34,7 @@ class Felt(list[GripperStatus]):
 def task_of(rig: Rig, felt: Felt | None = None, *, measures_diameters: bool = True) -> GripperTask:
     silent = SimpleNamespace(publish=lambda _: None)
     diameters = FingertipDiameters("combined")
-    return GripperTask(rig.driver, silent, Felt() if felt is None else felt, diameters, measures_diameters)
+    return GripperTask(rig.driver, silent, Felt() if felt is None else felt, diameters, Clock(), measures_diameters)
 
 
 @asynccontextmanager

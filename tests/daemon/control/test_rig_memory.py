@@ -147,7 +147,18 @@ async def test_the_wrench_keeps_its_zero_with_the_grip(tmp_path):
     assert free.wrench_zero == (0.0,) * 6
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"version": 0, "stop": []}', '{"version": 1, "stop": 3}', "\x00"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        *("", "[]", "{}", '{"version": 0, "stop": []}', '{"version": 1, "stop": 3}', "\x00"),
+        *('{"version": 1, "wrench_zero": [1, 2, 3, 4, 5]}', '{"version": 1, "wrench_zero": [0, 0, 0, 0, 0, NaN]}'),
+        *(
+            '{"version": 1, "load_zero": "much"}',
+            '{"version": 1, "origin_rad": Infinity}',
+            '{"version": 1, "other": 1}',
+        ),
+    ],
+)
 def test_a_state_that_cannot_be_read_counts_as_a_stop(content, tmp_path):
     path = tmp_path / "robot.json"
     path.write_text(content)

@@ -271,7 +271,7 @@ def test_the_first_motion_is_told_before_a_start(steps, said):
     assert said in first_motion(ExperimentFile.model_validate({"name": "test", "steps": steps}))
 
 
-def test_a_source_within_whose_noise_the_limit_lies_neither_supervises_nor_drives():
+def test_a_noisy_source_supervises_beyond_its_noise_and_drives_nothing_gentle():
     """A CB3 estimates its wrench from the joints' currents."""
     noisy = wrench_source(125.0, noise_nm=5.0)
     loop = ControlLoop(CONFIG, {"right": EIT, WRENCH: noisy}, ("robot", "gripper"))
@@ -281,7 +281,10 @@ def test_a_source_within_whose_noise_the_limit_lies_neither_supervises_nor_drive
         loop.on_torque(TorqueSample(WRENCH, torque_nm, "", rig.t_ns, rig.t_ns))
         rig.step()
     assert phase(rig) is ExperimentPhase.RUNNING
-    stop(rig)
+    loop.on_torque(TorqueSample(WRENCH, 5.5, "", rig.t_ns, rig.t_ns))
+    rig.step()
+    assert loop.status.decision.faults[0].code is FaultCode.TORQUE_LIMIT
+    assert phase(rig) is ExperimentPhase.STOPPED
     loop.acknowledge()
     steps = [{"do": "wait", "wait_s": 1}]
     driven = ExperimentFile.model_validate({"name": "one", "torque_source": WRENCH, "steps": steps})

@@ -190,6 +190,9 @@ class FakeArm:
                 self.end_program()
         return ""
 
+    def forget_load(self) -> None:
+        self.calls.append("forget_load")
+
     def upload(self, *, held: bool = False) -> None:
         self.calls.append("upload, held" if held else "upload")
         if self.stale_command:

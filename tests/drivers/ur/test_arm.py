@@ -223,6 +223,18 @@ def test_a_program_that_is_sent_again_keeps_the_wrench_from_before_the_first(arm
     one.script_readiness.waiting = False
     assert one.arm_watchdog()
     assert one.read().wrench == load
+    # A program that never answers, and another tool: the load of before is over.
+    Receiver.made.sample = dataclasses.replace(received(5.0), wrench=SIX)
+    one.upload(held=True)
+    one.forget_load()
+    Receiver.made.sample = dataclasses.replace(received(6.0), wrench=(0.0, 0.0, 0.0, 0.0, 0.0, 0.5))
+    before = one.read().wrench
+    one.upload(held=True)
+    Receiver.made.sample = dataclasses.replace(received(7.0), wrench=SIX)
+    one.script_readiness.waiting = False
+    assert one.arm_watchdog()
+    assert one.read().wrench == before
+    one.wrench_zero = (-1.0, 0.0, -3.0, 0.0, 0.0, -1.5)
     # Another program, later, begins with the load of its own time.
     Receiver.made.sample = dataclasses.replace(received(9.0), wrench=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     one.upload(held=True)

@@ -7,7 +7,9 @@ from collections.abc import Callable
 import pytest
 
 from shearloop.drivers.ur.client import LAST_WORDS_BYTES, UrRobot, WorkerConnection
-from shearloop.drivers.ur.messages import RobotLostError, Stop
+from shearloop.drivers.ur.messages import Held, RobotLostError, Stop
+from tests import running as tasks
+from tests.drivers.ur.handler_bench import HandlerBench
 from tests.drivers.ur.robots import ROOT, running, settings_for
 
 
@@ -119,3 +121,29 @@ async def test_worker_lost_during_shutdown_is_not_restarted(play, monkeypatch):
     with pytest.raises(asyncio.CancelledError):
         await run
     assert len(listened) == 1
+
+
+async def test_a_worker_is_told_what_is_held_at_its_start_and_at_each_change(play, monkeypatch):
+    play("exec cat")
+    told: list[Held] = []
+    send = WorkerConnection.send
+
+    def note(connection: WorkerConnection, message: object, number: int = 0) -> None:
+        if isinstance(message, Held):
+            told.append(message)
+        send(connection, message, number)
+
+    monkeypatch.setattr(WorkerConnection, "send", note)
+    zero, holds = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5), [True]
+    robot = UrRobot(settings_for("127.0.0.254"))
+    robot.restore_wrench_zero(zero)
+    robot.holds = lambda: holds[0]
+    bench = HandlerBench()
+    async with tasks.running(robot.run()):
+        while not told:  # noqa: ASYNC110 - the worker's start is no event
+            await asyncio.sleep(0)
+        for now in (True, False, False, True):
+            holds[0] = now
+            robot.handle_message(0, bench.state)
+            await asyncio.sleep(0)
+    assert told == [Held(held=True, wrench_zero=zero), Held(held=False), Held(held=True)]

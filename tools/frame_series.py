@@ -1,13 +1,12 @@
 """Recordings as series of frames, with the tool of each and a check for copies."""
 
-import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.arrays import BoolArray, IntArray
 from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT_NOTE, SIDES
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
@@ -170,8 +169,10 @@ def check_paths_differ(paths: Sequence[Path]) -> None:
 
 
 def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:
-    """Raise UserError for named recordings of the same frames, also where some of them are missing in one."""
-    refuse_copies((name, one.channels) for name, one in series)
+    """Raise UserError for named recordings that share most of their frames.
+
+    A copy is no second measurement: intervals fitted to it are too narrow, and figures count frames twice.
+    """
     known: list[tuple[str, IntArray]] = []
     for name, one in series:
         digests = frame_digests(one.channels)
@@ -179,24 +180,7 @@ def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:
             shared = int(np.isin(digests, of_other).any(axis=1).sum())
             if shared > _MOST_SHARED * min(len(digests), len(of_other)):
                 raise UserError(
-                    f"{shared} of {counted(len(digests), 'frame')} of {name} are in {other} too; leave copies out: "
-                    "they add nothing"
+                    f"{shared} of {counted(len(digests), 'frame')} of {name} are in {other} too; give one of the two: "
+                    "a frame that counts twice makes intervals too narrow"
                 )
         known.append((name, digests))
-
-
-def refuse_copies(measurements: Iterable[tuple[str, FloatArray]]) -> None:
-    """Raise UserError for named measurements of the same values.
-
-    A copy is no second measurement: intervals fitted to it are too narrow, and figures count frames twice.
-    """
-    known: dict[bytes, str] = {}
-    copies = []
-    for name, frames in measurements:
-        first = known.setdefault(hashlib.sha256(np.ascontiguousarray(frames).data).digest(), name)
-        if first is not name:
-            copies.append((name, first))
-    if copies:
-        others = counted(len(copies) - 1, "more is such a copy", "more are such copies")
-        more = f", and {others}" if len(copies) > 1 else ""
-        raise UserError("{} equals {}{}; leave copies out: they add nothing".format(*copies[0], more))

@@ -1,5 +1,6 @@
 """Folders of slices as series: |frame − idle frame| at torque peaks, one measurement each."""
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
 from shearloop.estimation.values import check_finite_values
-from shearloop.tools.frame_series import check_paths_differ, part_of, refuse_copies
+from shearloop.tools.frame_series import check_paths_differ, part_of
 from shearloop.tools.recordings.matlab_import import (
     DIAMETER_FOLDER,
     TORQUE_FOLDER,
@@ -19,6 +20,7 @@ from shearloop.tools.recordings.matlab_import import (
     read_diameter_slices,
     read_torque_slices,
 )
+from shearloop.words import counted
 
 # Slices do not name their side.
 SLICE_SIDE = "right"
@@ -84,8 +86,21 @@ def read_parts(folders: Sequence[Path], time_range: tuple[float, float]) -> tupl
 
 
 def check_no_copies(named: Sequence[tuple[Path, SliceSeries]]) -> None:
-    """Raise UserError for two slices that are the same frame."""
-    refuse_copies(each for folder, one in named for each in _measurements(folder, one))
+    """Raise UserError for two slices that are the same frame.
+
+    A copy is no second measurement: intervals fitted to it are too narrow, and figures count frames twice.
+    """
+    known: dict[bytes, str] = {}
+    copies = []
+    for name, frame in (each for folder, one in named for each in _measurements(folder, one)):
+        first = known.setdefault(hashlib.sha256(np.ascontiguousarray(frame).data).digest(), name)
+        if first is not name:
+            copies.append((name, first))
+    if copies:
+        name, first = copies[0]
+        others = counted(len(copies) - 1, "more is such a copy", "more are such copies")
+        more = f", and {others}" if len(copies) > 1 else ""
+        raise UserError(f"{name} equals {first}{more}; leave one of the two out")
 
 
 def _measurements(folder: Path, series: SliceSeries) -> Iterator[tuple[str, FloatArray]]:

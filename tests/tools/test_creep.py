@@ -148,6 +148,6 @@ def test_a_recording_without_held_twists_is_refused(monkeypatch, mistake):
 
 def test_twists_that_are_given_twice_are_refused(monkeypatch, mistake):
     played(monkeypatch, track())
-    refusals = {"held.mcap": "is given twice; name it once", "copy.mcap": "equals held.mcap"}
+    refusals = {"held.mcap": "held.mcap is given twice; name it once", "copy.mcap": "of copy.mcap are in held.mcap too"}
     for copy, refusal in refusals.items():
-        assert f"{copy} {refusal}" in mistake("calibrate", "creep", "held.mcap", copy, "--calibration", "right.cal")
+        assert refusal in mistake("calibrate", "creep", "held.mcap", copy, "--calibration", "right.cal")

@@ -14,9 +14,9 @@ def test_a_copy_that_lacks_frames_is_a_copy():
     lost[[3, 60]] = False
     n = len(whole.t_s)
     for named, said in (
-        ([("a", whole), ("b", kept(whole, lost))], f"{n - 2} of {n - 2} frames of b are in a too; leave copies out"),
-        ([("b", kept(whole, lost)), ("a", whole)], f"{n - 2} of {n} frames of a are in b too; leave copies out"),
-        ([("a", whole), ("b", whole)], "b equals a; leave copies out"),
+        ([("a", whole), ("b", kept(whole, lost))], f"{n - 2} of {n - 2} frames of b are in a too; give one of the two"),
+        ([("b", kept(whole, lost)), ("a", whole)], f"{n - 2} of {n} frames of a are in b too; give one of the two"),
+        ([("a", whole), ("b", whole)], f"{n} of {n} frames of b are in a too"),
     ):
         with pytest.raises(UserError, match=said):
             check_no_copies(named)

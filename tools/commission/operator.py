@@ -10,6 +10,8 @@ from shearloop.errors import UserError
 # The word that allows one motion or one action of the operator.
 WORD: Final = "move"
 DONE: Final = "done"
+# Answers that end the commissioning at once, an empty line among them.
+_NO: Final = ("", "no")
 # Wrong answers until the commissioning ends.
 _MOST_TRIES: Final = 3
 
@@ -68,17 +70,25 @@ class Operator:
 
     def allow(self, motion: str) -> None:
         """Show a motion with its speed and travel, and return once the word was typed; raises DeclinedError."""
-        if (
-            self.ask(f"MOTION: {motion}. Keep clear, one hand at the emergency stop. Type `{WORD}` to allow it:")
-            != WORD
-        ):
-            raise DeclinedError(f"not allowed: {motion}. What is measured so far is kept; run it again to continue")
+        question = f"MOTION: {motion}. Keep clear, one hand at the emergency stop. Type `{WORD}` to allow it:"
+        self._confirm(question, WORD, f"not allowed: {motion}")
 
     def act(self, action: str, played: Played = NOTHING_TO_DO) -> None:
         """Have the operator do something; raises DeclinedError where it is not done."""
-        if self.ask(f"{self._with_hint(f'{action}.', played)} Type `{DONE}`:") != DONE:
-            raise DeclinedError(f"not done: {action}. What is measured so far is kept; run it again to continue")
+        question = f"{self._with_hint(f'{action}.', played)} Type `{DONE}`:"
+        self._confirm(question, DONE, f"not done: {action}")
         self._do(played)
+
+    def _confirm(self, question: str, word: str, declined: str) -> None:
+        """Return once the word was typed. A word that is misspelt is asked for again; raises DeclinedError."""
+        for _ in range(_MOST_TRIES):
+            answer = self.ask(question)
+            if answer == word:
+                return
+            if answer in _NO:
+                break
+            self.say(f"{answer!r} is not `{word}`, so that nothing was done. `no` ends the commissioning here.")
+        raise DeclinedError(f"{declined}. What is measured so far is kept; run it again to continue")
 
     def _with_hint(self, question: str, played: Played | None) -> str:
         """Return the question with what the emulated devices do, if there are any, before its last character."""

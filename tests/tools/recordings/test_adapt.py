@@ -85,7 +85,7 @@ def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder,
     assert "calibration of slices" in mistake("adapt", of_slices, recording, *out)
     copy = tmp_path / "another name.mcap"
     copy.write_bytes(Path(recording).read_bytes())
-    assert "leave copies out: they add nothing" in mistake("adapt", calibration, recording, copy, *out)
+    assert "give one of the two: a frame that counts twice" in mistake("adapt", calibration, recording, copy, *out)
     before = calibration.read_bytes()
     said = mistake("adapt", calibration, recording, "--time-range", "0:0.38", "--out", calibration)
     assert "1.cal is CAL itself, which the next grip needs: it was not changed" in said

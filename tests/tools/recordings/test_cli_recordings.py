@@ -258,16 +258,16 @@ def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, t
     copy.mkdir()
     (copy / "Data_Slice_3.mat").write_bytes((torque / "Data_Slice_7.mat").read_bytes())
     refusal = refused(torque, copy)
-    assert f"{copy}: Data_Slice_3.mat equals {torque}: Data_Slice_7.mat; leave copies out" in refusal
+    assert f"{copy}: Data_Slice_3.mat equals {torque}: Data_Slice_7.mat; leave one of the two out" in refusal
     for number in (5, 6):
         (cylinders / f"20mm_Data_{number}.mat").write_bytes((cylinders / "20mm_Data_2.mat").read_bytes())
     refusal = refused(cylinders)
     assert "slice 5 of 20 mm equals" in refusal
-    assert "slice 2 of 20 mm, and 1 more is such a copy; leave copies out" in refusal
+    assert "slice 2 of 20 mm, and 1 more is such a copy; leave one of the two out" in refusal
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
     ran("recording", "import", "mat", mat_folder(), "--out", first)
     second.write_bytes(first.read_bytes())
-    assert f"{second} equals {first}; leave copies out" in refused(first, second)
+    assert f"frames of {second} are in {first} too; give one of the two" in refused(first, second)
 
 
 def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folder, tmp_path, ran, mistake):

@@ -126,7 +126,22 @@ def run(args: argparse.Namespace) -> int:
     sentences += _invalid_lines(tracks)
     if against := found.no_better_than_clock(tracks, args.loaded_nm):
         sentences.append(against)
-    return print_result({**by_load, **figures}, sentences, as_json=args.json)
+    print_result({**by_load, **figures}, sentences, as_json=args.json)
+    return _status(tracks)
+
+
+def _status(tracks: "Sequence[EstimateTrack]") -> int:
+    """Return the exit status; 1, with the reason, where no frame was judged."""
+    from shearloop.tools.evaluate import judged_frames
+
+    if any(judged_frames(track).any() for track in tracks):
+        return 0
+    print(
+        "Nothing was judged: no frame has both an estimate and a known torque or diameter. Give recordings with a load "
+        "cell, of the fingertip and the grip that were calibrated.",
+        file=sys.stderr,
+    )
+    return 1
 
 
 def _refuse_recipe(args: argparse.Namespace) -> None:

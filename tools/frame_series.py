@@ -21,7 +21,7 @@ Series = TypeVar("Series", bound=FrameSeries)
 _LARGEST_APART = 0.75
 # Share of the time with another grip that does not count as another tool: the fingers met something or gripped again.
 _MOMENTARY = 0.05
-# Share of a recording's frames that another one may hold too: emulated rigs begin with the same idle frames.
+# Share of a recording's frames that another may hold too: emulated rigs of one seed begin with the same idle frames.
 _MOST_SHARED = 0.5
 
 

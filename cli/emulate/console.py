@@ -4,6 +4,7 @@ import argparse
 import asyncio
 import contextlib
 import json
+import secrets
 import sys
 import time
 from collections.abc import Callable, Coroutine
@@ -70,7 +71,9 @@ async def _print_port(name: str, appearances: "asyncio.Queue[str]") -> None:
 
 def add_seed_and_speed(parser: argparse._ActionsContainer, pace: str) -> None:
     """Add `--seed` and `--speed`, which multiplies `pace`."""
-    parser.add_argument("--seed", type=int, default=0, help="of all noise and garbage (default: %(default)s)")
+    # The frames of two rigs differ, as those of real ones do: one recording can judge what another one has fitted.
+    text = "of all noise and garbage (default: another one at each start)"
+    parser.add_argument("--seed", type=int, default=secrets.randbits(31), help=text)
     add_option(parser, "--speed", positive(), "N", f"times {pace} (default: 1)", default=1.0)
 
 

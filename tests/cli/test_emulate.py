@@ -1,5 +1,6 @@
 """Emulated devices as processes of their own: what they play, what faults they have, what the real drivers read."""
 
+import argparse
 import asyncio
 import os
 import signal
@@ -12,6 +13,7 @@ from scipy.io import loadmat
 
 from shearloop.bank.bank_file import BankDefinition, write_bank
 from shearloop.bank.channels import PAPER_TABLE
+from shearloop.cli.emulate import console
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
@@ -86,6 +88,16 @@ async def test_faults_are_switched_on_by_standard_input(tmp_path):
     places = [sent.index(frame.raw.tolist()) for frame in frames]
     assert places[:4] == [2, 3, 4, 5]
     assert places == sorted({*places})
+
+
+def test_two_rigs_have_different_noise_unless_their_seed_is_given():
+    def seed(*arguments: str) -> int:
+        parser = argparse.ArgumentParser()
+        console.add_seed_and_speed(parser, "pace")
+        return parser.parse_args(arguments).seed
+
+    assert seed() != seed()
+    assert seed("--seed", "3") == 3
 
 
 async def test_twists_are_synthesised_from_a_bank(tmp_path):

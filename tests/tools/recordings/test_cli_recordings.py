@@ -198,6 +198,13 @@ def test_a_frame_of_two_reasons_counts_once():
     ]
 
 
+def test_a_judgement_of_nothing_is_no_success(slices_folder, tmp_path, ran):
+    calibration = tmp_path / "a.cal"
+    ran("calibrate", slices_folder / "torque_slices", "--out", calibration)
+    said = ran("evaluate", calibration, slices_folder / "diameter_slices", status=1).err
+    assert "Nothing was judged: no frame has both an estimate and a known torque or diameter." in said
+
+
 def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, tmp_path, ran):
     calibration, slices = tmp_path / "a.cal", str(slices_folder / "torque_slices")
     assert main(["calibrate", slices, "--out", str(calibration)]) == 0

@@ -4,7 +4,7 @@ import argparse
 import json
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -16,8 +16,8 @@ from shearloop.cli import run as run_command
 from shearloop.cli.emulator_processes import SHEARLOOP, running
 from shearloop.cli.free_ports import is_free
 from shearloop.cli.options import PORT, add_option, path_of
+from shearloop.cli.other_daemon import refuse_second_daemon
 from shearloop.cli.view import PAGE_PORT
-from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.process import interrupt_status
 from shearloop.drivers.defaults import RTDE_PORT
 from shearloop.errors import UserError, missing
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
 
 HOST = "127.0.0.1"
-# A daemon on a busy computer answers within it.
-STATUS_S = 2.0
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -95,17 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
 def check_ports(config: "DaemonConfig", robot: str | None) -> None:
     """Raise UserError if another daemon, or another emulated rig, has the addresses of this configuration."""
-    reply = None
-    with suppress(TimeoutError):
-        reply = send_to_stop_socket(config.commands, {"command": "status"}, STATUS_S)
-    if reply is not None:
-        running = reply.get("daemon", {})
-        shown = "" if is_free(HOST, PAGE_PORT) else f", its page is http://{HOST}:{PAGE_PORT}/"
-        raise UserError(
-            f"a daemon runs already at {config.commands}: process {running.get('process')} ({running.get('rig')}) in "
-            f"{running.get('folder')}{shown}; `shearloop command stop --connect {config.commands}` stops its "
-            "experiment, and a second time ends it"
-        )
+    refuse_second_daemon(config.commands, "" if is_free(HOST, PAGE_PORT) else f"http://{HOST}:{PAGE_PORT}/")
     ours = [urlsplit(address) for address in (config.publish, config.commands) if address.startswith("tcp://")]
     places = [(str(one.hostname), one.port) for one in ours if one.port]
     places += [(robot, RTDE_PORT)] if robot is not None and config.emulators else []

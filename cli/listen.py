@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from difflib import get_close_matches
 
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, positive
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
@@ -37,7 +38,8 @@ def run(args: argparse.Namespace) -> int:
     known = {*TOPICS, *(topic.partition(".")[0] for topic in TOPICS)}
     for topic in args.topics:
         if topic not in known:
-            raise UserError(f"there is no topic {topic!r}; the topics are {', '.join(TOPICS)}")
+            near = "".join(f"; did you mean {name}?" for name in get_close_matches(topic, TOPICS, 1)) or "."
+            raise UserError(f"there is no topic {topic!r}{near} The topics are {', '.join(TOPICS)}")
     write = message_json if args.json else message_line
 
     def print_hint() -> None:

@@ -104,6 +104,7 @@ def _run_config(
 
     from shearloop.cli import EXIT_OK, EXIT_STOPPED, EXIT_UNFINISHED
     from shearloop.cli.emulator_processes import EmulatedDevices
+    from shearloop.cli.other_daemon import refuse_second_daemon
     from shearloop.cli.terminal import StatusLine, print_estimate
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.messaging.refusals import Refusals
@@ -117,8 +118,9 @@ def _run_config(
     if config.robot is not None:
         # Without permission the loop still detects late commands and holds the wrist.
         raise_priority()
+    refuse_second_daemon(config.commands)
     if config.emulators:
-        # A second daemon is refused before its emulators find their ports taken.
+        # A daemon that does not answer is found before the emulators find their ports taken.
         StopSocket(config.commands, {}, Refusals()).close()
     label = f"{EMULATED} " if config.emulated else ""
     with ExitStack() as stack:

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import closing
 from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn
@@ -30,8 +29,6 @@ from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
-from shearloop.daemon.messaging.refusals import Refusals
-from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.rig import LOOP_KEYS
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.sessions import COMBINED
@@ -162,8 +159,8 @@ def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, m
     ("arguments", "part"),
     [
         (["check", "no-such.yaml"], "no-such.yaml"),
-        (["listen", "eit.torque"], "there is no topic 'eit.torque'; the topics are eit.frame, eit.estimate"),
-        (["listen", "eit.estimat"], "there is no topic 'eit.estimat'; the topics are eit.frame, eit.estimate"),
+        (["listen", "gel"], "there is no topic 'gel'. The topics are eit.frame, eit.estimate"),
+        (["listen", "eit.estimat"], "there is no topic 'eit.estimat'; did you mean eit.estimate? The topics are eit."),
         (["evaluate", "rec.mcap", "my.cal"], "rec.mcap is a recording, not a calibration; the calibration comes first"),
         (["adapt", "rec.mcap.partial", "my.cal", "--out", "new.cal"], "rec.mcap.partial is a recording, not a cal"),
         (["listen", "--count", "0"], "--count 0"),
@@ -523,13 +520,6 @@ def test_the_status_gives_the_cause_then_the_step():
     }
     lines = _lines("status", {"tasks": {}, "loop": loop})
     assert lines[:2] == ["stopped: it slipped.", "step 2 of 3 grip"]
-
-
-def test_a_second_daemon_is_refused_before_its_emulators_start(config, tmp_path, monkeypatch, mistake):
-    monkeypatch.setattr("shearloop.cli.emulator_processes.subprocess.Popen", Mock(side_effect=AssertionError))
-    path = str(config(emulators=[{"device": "hx711", "arguments": ["--link", "load"]}]))
-    with closing(StopSocket(f"ipc://{tmp_path}/commands", {}, Refusals())):
-        assert "is another daemon running? Stop it, or choose another port" in mistake("run", path)
 
 
 def test_the_summary_of_a_run_that_ends_with_its_experiment_comes_last(config, monkeypatch, capsys):

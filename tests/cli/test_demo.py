@@ -17,15 +17,8 @@ from shearloop.errors import UserError
 CONFIG = DaemonConfig(load_cell={"device": {"path": "load"}})
 
 
-def test_another_daemon_is_named_before_anything_is_built(monkeypatch):
-    running = {"process": 4711, "folder": "/home/ann/demo", "rig": "demo"}
-    monkeypatch.setattr(demo, "send_to_stop_socket", lambda *_: {"ok": True, "tasks": {}, "daemon": running})
-    with pytest.raises(UserError, match=r"process 4711 \(demo\) in /home/ann/demo.*`shearloop command stop --connect"):
-        demo.check_ports(CONFIG, None)
-
-
 def test_a_taken_port_is_named_before_anything_is_built(monkeypatch):
-    monkeypatch.setattr(demo, "send_to_stop_socket", lambda *_: None)
+    monkeypatch.setattr(demo, "refuse_second_daemon", lambda *_: None)
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

@@ -1,0 +1,45 @@
+"""A second daemon at the addresses of one that runs: it is named before anything is built, started or bound."""
+
+from contextlib import closing
+from unittest.mock import Mock
+
+import pytest
+
+from shearloop.cli import demo, other_daemon
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.daemon.messaging.stop_socket import StopSocket
+from shearloop.errors import UserError
+
+RUNNING = {"process": 4711, "folder": "/home/ann/demo", "rig": "demo"}
+NAMED = r"process 4711 \(demo\) in /home/ann/demo"
+
+
+@pytest.fixture(autouse=True)
+def no_emulator(monkeypatch):
+    """Fail a test that starts an emulator."""
+    monkeypatch.setattr("shearloop.cli.emulator_processes.subprocess.Popen", Mock(side_effect=AssertionError))
+
+
+def answering(monkeypatch, reply):
+    monkeypatch.setattr(other_daemon, "send_to_stop_socket", lambda *_: reply)
+
+
+def test_a_second_demo_is_refused_by_name(monkeypatch):
+    answering(monkeypatch, {"ok": True, "tasks": {}, "daemon": RUNNING})
+    with pytest.raises(UserError, match=rf"{NAMED}.*`shearloop command stop --connect"):
+        demo.check_ports(DaemonConfig(load_cell={"device": {"path": "load"}}), None)
+
+
+@pytest.mark.parametrize("emulators", [[], [{"device": "hx711", "arguments": ["--link", "load"]}]])
+def test_a_second_run_is_refused_by_name(config, monkeypatch, mistake, emulators):
+    answering(monkeypatch, {"ok": True, "tasks": {}, "daemon": RUNNING})
+    said = mistake("run", str(config(emulators=emulators)))
+    assert "process 4711 (demo) in /home/ann/demo; `shearloop command stop --connect" in said
+
+
+def test_a_daemon_that_does_not_answer_is_refused_before_emulators_start(config, tmp_path, monkeypatch, mistake):
+    monkeypatch.setattr(other_daemon, "STATUS_S", 0.01)
+    path = str(config(emulators=[{"device": "hx711", "arguments": ["--link", "load"]}]))
+    with closing(StopSocket(f"ipc://{tmp_path}/commands", {}, Refusals())):
+        assert "is another daemon running? Stop it, or choose another port" in mistake("run", path)

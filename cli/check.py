@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     """Load everything that `run` loads, without opening a device."""
     from shearloop.yaml_files import read_yaml
 
-    content = read_yaml(args.config, UserError)
+    content = read_yaml(args.config, UserError, "file")
     is_experiment = isinstance(content, dict) and "steps" in content
     if args.rig is not None and not is_experiment:
         raise UserError(

@@ -8,6 +8,7 @@ import copy
 import re
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from shearloop.files import read_file, replace_file
 from shearloop.mistakes import Model, as_model, mistake_lines, place_of, shown
 
+_SUFFIXES = (".yaml", ".yml")
 # Of Linux.
 _LONGEST_NAME, _LONGEST_PATH = 255, 4096
 # Bounds on what a file may cost: its bytes, and its values with every alias written out.
@@ -103,7 +105,7 @@ class Document:
         try:
             data = read_file(path, MOST_BYTES)
         except OSError as error:
-            raise raises(f"{path}: the {what} cannot be read: {error.strerror}{cure}") from error
+            raise raises(f"{path}: the {what} cannot be read: {error.strerror}{_meant(path)}{cure}") from error
         return cls.parse(path, data, raises, what)
 
     @classmethod
@@ -203,6 +205,17 @@ class Document:
             key, line = place_of(location, self.content, self._root, missing=True)
             found.append((line, f"{self.path}:{line}: {key}: {sentence}"))
         return [text for _, text in sorted(found)]
+
+
+def _meant(path: Path) -> str:
+    """Return which YAML file was probably meant by the path of a folder, or of no file; empty where none is near."""
+    folder = path if path.is_dir() else path.parent
+    try:
+        names = sorted(one.name for one in folder.iterdir() if one.suffix in _SUFFIXES)
+    except OSError:
+        return ""
+    near = names if folder is path else get_close_matches(path.name, names, 1)
+    return f"; did you mean {folder / near[0]}?" if near else ""
 
 
 def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Any:

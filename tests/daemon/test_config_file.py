@@ -226,6 +226,14 @@ def test_a_file_without_keys_is_refused_without_its_content(tmp_path):
     assert "pass" not in refused(tmp_path, "host:5432:lab:ada:pass\n")
 
 
+@pytest.mark.parametrize(("given", "meant"), [("", "lab.yaml"), ("lab.yml", "lab.yaml"), ("ur.yam", "ur.yaml")])
+def test_a_file_that_was_probably_meant_is_named(given, meant, tmp_path):
+    for name in ("lab.yaml", "ur.yaml", "lab.cal"):
+        (tmp_path / name).touch()
+    with pytest.raises(UserError, match=rf"; did you mean {tmp_path / meant}\?$"):
+        load_yaml_model(tmp_path / given, Outer)
+
+
 def test_files_that_cannot_be_read_are_named(tmp_path):
     with pytest.raises(UserError, match=r"none\.yaml: the configuration cannot be read: No such file"):
         load_yaml_model(tmp_path / "none.yaml", Outer)

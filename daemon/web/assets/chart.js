@@ -72,6 +72,8 @@ export class TimeChart {
     const axis = { stroke: colours.ink, grid: { stroke: colours.grid, width: 1 }, ticks: { stroke: colours.ink, width: 1 }, font: "13px system-ui, DejaVu Sans, sans-serif" };
     return {
       ...this.size(),
+      // Above, right, below, left: half of the last time reaches beyond the axis.
+      padding: [null, 30, null, null],
       series,
       bands,
       legend: { show: false },

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     # Only a rig with a robot loads them.
     from shearloop.daemon.configured_experiment import ConfiguredExperiment
     from shearloop.daemon.rig import Rig
+    from shearloop.daemon.robot_files import RobotFiles
     from shearloop.drivers.ur.settings import UrSettings
 
 # The end waits this long for the report of an experiment that it has stopped; a dead loop reports none.
@@ -75,7 +76,7 @@ class Daemon:
             clients = config.curve.clients if config.curve is not None and config.network_addresses else None
             authenticator = ClientAuthenticator(context, clients, refusals)
             opened.callback(authenticator.close)
-            settings = _take_robot(config, opened)
+            robot = _take_robot(config, opened)
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
             self.publisher.add_listener(self._summary)
             self.recorder: Recorder | None = None
@@ -86,8 +87,8 @@ class Daemon:
             self.health = HealthReporter(self.publisher, self.supervisor, clock, config.emulated, config.name)
             self.rig: Rig | None = None
             self._experiment: ConfiguredExperiment | None = None
-            if settings is not None:
-                self._build_rig(config, settings, clock)
+            if robot is not None:
+                self._build_rig(config, *robot, clock)
             else:
                 self.sensors = build_sensors(config, self.publisher, clock, self.recorder, open_sessions(config))
             self.commands = Commands(
@@ -114,14 +115,14 @@ class Daemon:
             if isinstance(part, Reporter):
                 self.health.reporters[name] = part
 
-    def _build_rig(self, config: DaemonConfig, settings: "UrSettings", clock: Clock) -> None:
+    def _build_rig(self, config: DaemonConfig, settings: "UrSettings", files: "RobotFiles", clock: Clock) -> None:
         """Build robot, gripper and control loop, and the sensors that drive it."""
         # Only a rig with a robot loads their modules.
         from shearloop.daemon.configured_experiment import ConfiguredExperiment
         from shearloop.daemon.rig import build_rig
 
         self.sensors, self.rig = build_rig(
-            config, settings, open_sessions(config), self.publisher, clock, self.recorder, self.supervisor
+            config, settings, files, open_sessions(config), self.publisher, clock, self.recorder, self.supervisor
         )
         if self.rig.commissioning is not None:
             self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
@@ -209,20 +210,23 @@ class Daemon:
         return self._experiment is None or self._experiment.finished
 
 
-def _take_robot(config: DaemonConfig, opened: contextlib.ExitStack) -> "UrSettings | None":
-    """Return the settings of the configured robot, None without one; no other daemon drives it while this one is open.
+def _take_robot(config: DaemonConfig, opened: contextlib.ExitStack) -> "tuple[UrSettings, RobotFiles] | None":
+    """Return the settings and the files of the configured robot, None without one.
 
-    Raises DriverError for settings that cannot be used, and UserError for a robot that another daemon drives.
+    No other daemon drives it while this one is open. Raises DriverError for settings that cannot be used, and UserError
+    for a robot that another daemon drives.
     """
     if config.robot is None:
         return None
     from shearloop.daemon.rig import open_settings
-    from shearloop.daemon.rig_memory import lock_robot
+    from shearloop.daemon.robot_files import RobotFiles, lock_robot
 
     settings = open_settings(config)
-    if settings is not None:
-        opened.enter_context(lock_robot(settings.host, config.commands))
-    return settings
+    if settings is None:
+        return None
+    files = RobotFiles.of(settings.host)
+    opened.enter_context(lock_robot(files, config.commands))
+    return settings, files
 
 
 async def run_daemon(

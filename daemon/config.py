@@ -33,7 +33,7 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
     URCAP_PORT,
 )
-from shearloop.drivers.hosts import is_loopback_host, why_no_host
+from shearloop.drivers.hosts import is_loopback_host, one_spelling, why_no_host
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
@@ -381,9 +381,11 @@ class DaemonConfig(ConfigModel):
                 case SerialDevice(serial_number=str(number)):
                     found.setdefault(f"the port with the serial number {number}", []).append(key)
                 case SerialDevice(path=Path() as path):
-                    found.setdefault(f"the port {os.path.normpath(path)}", []).append(key)
+                    # A name in /dev/serial/by-id is a link to the port.
+                    port_path = os.path.realpath(path) if path.is_symlink() else os.path.normpath(path)
+                    found.setdefault(f"the port {port_path}", []).append(key)
                 case InstrumentSocket(host=host, port=port):
-                    found.setdefault(f"{host}:{port}", []).append(key)
+                    found.setdefault(f"{one_spelling(host)}:{port}", []).append(key)
         return found
 
     @property

@@ -22,7 +22,8 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
-from shearloop.daemon.rig_memory import RigMemory, memory_path
+from shearloop.daemon.rig_memory import RigMemory
+from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.sensing.sessions import COMBINED, torque_sources
 from shearloop.daemon.sensors import Sensors, Sessions, build_sensors
 from shearloop.daemon.supervisor import Supervisor, Task
@@ -217,13 +218,14 @@ class Rig:
 def build_rig(
     config: DaemonConfig,
     settings: UrSettings,
+    files: RobotFiles,
     sessions: Sessions,
     publisher: Publisher,
     clock: Clock,
     recorder: Recorder | None,
     supervisor: Supervisor,
 ) -> tuple[Sensors, Rig]:
-    """Return robot, gripper and control loop, and all sensors, which drive it; `settings` are the robot's."""
+    """Return robot, gripper and control loop, and all sensors, which drive it; `settings` and `files` are the robot's."""
     sources = torque_sources(config, sessions.fingertips, sessions.combined)
     commissioning = commissioning_of(config, settings)
     check_experiment(config, sources, commissioning)
@@ -245,7 +247,7 @@ def build_rig(
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
     # Devices that this process emulates end with it, and with them every grip and stop.
     ends_with_us = config.autostart or (config.emulated and bool(config.emulators))
-    memory = None if ends_with_us else RigMemory(memory_path(settings.host), loop, sensors.load_cell, robot)
+    memory = None if ends_with_us else RigMemory(files, loop, sensors.load_cell, robot)
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
     if memory is not None:
         tasks["memory"] = memory

@@ -4,12 +4,8 @@ There is a file for each robot.
 """
 
 import asyncio
-import contextlib
-import fcntl
 import json
-import os
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,16 +15,18 @@ from pydantic import ConfigDict
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import Six
-from shearloop.errors import UserError
 from shearloop.files import replace_file
 from shearloop.mistakes import validated
 
 VERSION = 1
 # The file is written at this interval, and at the start of each experiment.
 FOLLOWS_S = 0.1
+# A name that had no address at the start is looked up again at this interval.
+LOOK_UP_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,23 +69,28 @@ class Remembered:
 
 @dataclass(slots=True)
 class RigMemory:
-    """Keeps a rig's state in a file, which is replaced as a whole; the task follows loop, load cell and robot."""
+    """Keeps a rig's state in a file, which is replaced as a whole; the task follows loop, load cell and robot.
 
-    path: Path
+    A robot of several addresses has a file for each, with the same content.
+    """
+
+    files: RobotFiles
     loop: ControlLoop
     load_cell: LoadCell | None = None
     robot: UrRobot | None = None
     error: str = ""
     # The experiment that is about to begin.
     starting: str = ""
-    _written: Remembered = field(default_factory=Remembered)
+    # None: the files have to be written, whatever the state.
+    _written: Remembered | None = None
     _writing: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
         """Restore what the last daemon of this robot has left."""
-        remembered = read_memory(self.path)
+        remembered = read_memories(self.files)
         remembered.restore(self.loop)
-        self._written = remembered
+        if len(self.files.states) == 1 and not any(path.exists() for path in self.files.other_states):
+            self._written = remembered
         cell, zero = self.load_cell, remembered.load_zero
         if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:
             structlog.get_logger().info("the load cell keeps the zero of the present grip")
@@ -98,8 +101,12 @@ class RigMemory:
 
     async def run(self) -> None:
         """Write every change until cancelled."""
+        looked_up_s = asyncio.get_running_loop().time()
         while True:
             await self.save_present()
+            if not self.files.known and asyncio.get_running_loop().time() > looked_up_s + LOOK_UP_S:
+                await asyncio.to_thread(self.files.note_addresses)
+                looked_up_s = asyncio.get_running_loop().time()
             await asyncio.sleep(FOLLOWS_S)
 
     async def begins(self, experiment: str) -> str | None:
@@ -125,12 +132,12 @@ class RigMemory:
             if state == self._written and not self.error:
                 return
             try:
-                await asyncio.to_thread(write_memory, self.path, state)
+                await asyncio.to_thread(write_memories, self.files, state)
             except OSError as error:
                 if not self.error:
                     structlog.get_logger().warning("the rig's state cannot be kept", reason=str(error))
                 self.error = (
-                    f"the rig's state cannot be kept in {self.path} ({error.strerror}), and a stop would be forgotten "
+                    f"the rig's state cannot be kept in {self.files.states[0]} ({error.strerror}), and a stop would be forgotten "
                     "with this process: make room, or make the folder writable"
                 )
             else:
@@ -139,47 +146,6 @@ class RigMemory:
     def diagnostics(self) -> Mapping[str, str]:
         """Return the memory's part of `health`."""
         return {"error": self.error} if self.error else {}
-
-
-def memory_path(host: str) -> Path:
-    """Return the file of the robot at this address: in systemd's state folder, or in the user's."""
-    # systemd separates several folders with colons; ours is one.
-    folder = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-    if not folder:
-        state = os.environ.get("XDG_STATE_HOME", "")
-        folder = str((Path(state) if os.path.isabs(state) else Path.home() / ".local" / "state") / "shearloop")
-    return Path(folder) / f"robot-{re.sub(r'[^A-Za-z0-9.-]', '_', host)}.json"
-
-
-@contextlib.contextmanager
-def lock_robot(host: str, commands: str = "") -> Iterator[None]:
-    """Keep other daemons of this user away from a robot; raises UserError if one of them has it.
-
-    `commands` is the command address of this process, if it has one, which the sentence to another one names.
-    Two daemons would share the robot's memory, and neither would know of the other's stops and grips. The lock ends
-    with the process, however that ends. Where the file cannot be made, no experiment starts, and nothing is locked.
-    """
-    path = memory_path(host).with_suffix(".lock")
-    with contextlib.ExitStack() as opened:
-        with contextlib.suppress(OSError):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            file = opened.enter_context(path.open("a+", encoding="utf-8"))
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                file.seek(0)
-                process, _, address = file.read().partition(" ")
-                stop = (
-                    f"with `shearloop command stop --connect {address}`" if address else "with Ctrl-C in its terminal"
-                )
-                raise UserError(
-                    f"the robot at {host} is driven by another program of this computer (process {process}): "
-                    f"stop that one first, {stop}, or name another robot in the configuration"
-                ) from None
-            file.truncate(0)
-            file.write(f"{os.getpid()} {commands}".rstrip())
-            file.flush()
-        yield
 
 
 def read_memory(path: Path) -> Remembered:
@@ -194,6 +160,39 @@ def read_memory(path: Path) -> Remembered:
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         unreadable = f"what it left in {path} cannot be read: {error}"
         return Remembered(stop=((FaultCode.DAEMON_ENDED.name, unreadable),))
+
+
+def read_memories(files: RobotFiles) -> Remembered:
+    """Return the state in the files of one robot: of its stops none is missed, and of its grips the latest counts.
+
+    Where nobody knows which robot a name means, the state under its address is not found: this counts as a stop.
+    """
+    found = [(_written_ns(path), read_memory(path)) for path in (*files.states, *files.other_states)]
+    newest_first = [state for _, state in sorted(found, key=lambda one: one[0], reverse=True)]
+    stops = [fault for state in newest_first for fault in state.stop]
+    if not files.known:
+        unknown = (
+            f"what it left is kept under the robot's address, and the name {files.host!r} has none at present: see that "
+            "the name is right and the network is up"
+        )
+        stops.append((FaultCode.DAEMON_ENDED.name, unknown))
+    running = next((state.running for state in newest_first if state.running), "")
+    return replace(newest_first[0], running=running, stop=tuple(dict.fromkeys(stops)))
+
+
+def _written_ns(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def write_memories(files: RobotFiles, state: Remembered) -> None:
+    """Replace the files of one robot, and remove those under its other spellings; raises OSError."""
+    for path in files.states:
+        write_memory(path, state)
+    for path in files.other_states:
+        path.unlink(missing_ok=True)
 
 
 def write_memory(path: Path, state: Remembered) -> None:

@@ -84,6 +84,17 @@ def second_config(rig_config: Path) -> Path:
     return path
 
 
+def spelt_otherwise(config: Path) -> Path:
+    """Write another spelling of the robot's address into a configuration."""
+    content = yaml.safe_load(config.read_text())
+    settings = config.with_name("spelt-otherwise.yaml")
+    robot = yaml.safe_load(config.with_name(content["robot"]).read_text())
+    first, _, others = robot["host"].partition(".")
+    settings.write_text(yaml.safe_dump({**robot, "host": f"{int(first):#x}.{others}"}))
+    config.write_text(yaml.safe_dump({**content, "robot": settings.name}))
+    return config
+
+
 class Watcher:
     """Collects what the daemon publishes, and waits for what a test is after."""
 
@@ -323,7 +334,7 @@ async def standing(rig: asyncio.subprocess.Process) -> dict[str, Any]:
 async def test_after_a_kill_with_a_gripped_tool_nothing_moves_and_start_waits_for_unlock(rig_config, tiny_bank):
     content = {**yaml.safe_load(rig_config.read_text()), "experiment": "experiment.yaml"}
     rig_config.write_text(yaml.safe_dump(content))
-    second = second_config(rig_config)
+    second = spelt_otherwise(second_config(rig_config))
     async with emulated_rig(rig_config.parent, tiny_bank) as rig:
         async with twisting_process(rig_config, rig) as killed:
             async with shearloop("run", str(second)) as refused:

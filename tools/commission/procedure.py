@@ -9,7 +9,7 @@ from typing import Final
 from shearloop.daemon.commissioning import Report, StageResult, identity_of
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.rig import gripper_calibration, open_settings
-from shearloop.daemon.rig_memory import lock_robot
+from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.errors import UserError
 from shearloop.tools.commission import boards, gripper, identity, motion, rtde, stops, tool, wrench
@@ -57,7 +57,7 @@ def commission(
     _open_files(config)
     with ExitStack() as opened:
         # A daemon would drive the robot at the same time.
-        opened.enter_context(lock_robot(settings.host))
+        opened.enter_context(lock_robot(RobotFiles.of(settings.host)))
         devices = rig or ConnectedRig(config, settings)
         controller = devices.controller()
         report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)

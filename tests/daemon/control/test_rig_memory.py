@@ -10,7 +10,8 @@ import pytest
 
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
-from shearloop.daemon.rig_memory import Remembered, RigMemory, lock_robot, memory_path, read_memory, write_memory
+from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memory, write_memory
+from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.errors import UserError
@@ -18,6 +19,8 @@ from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS
 
 WAIT = {"do": "wait", "wait_s": 60}
+# Its file is in the state folder of each test.
+FILES = RobotFiles("192.168.1.10", ("192.168.1.10",))
 
 
 def refusal(rig: Rig) -> str:
@@ -25,11 +28,11 @@ def refusal(rig: Rig) -> str:
     return rig.control_loop.start(file, rig.t_ns) or ""
 
 
-def after_restart(before: Rig, path: Path) -> Rig:
+def after_restart(before: Rig) -> Rig:
     """Return the rig with the loop of a new process, which finds what the old one has written."""
-    write_memory(path, Remembered.of(before.control_loop))
+    write_memory(FILES.states[0], Remembered.of(before.control_loop))
     after = Rig(new_loop())
-    RigMemory(path, after.control_loop)
+    RigMemory(FILES, after.control_loop)
     after.wrist_rad, after.force_n, after.width_mm = before.wrist_rad, before.force_n, before.width_mm
     after.run(0.6)
     return after
@@ -38,7 +41,7 @@ def after_restart(before: Rig, path: Path) -> Rig:
 def test_after_a_crash_nothing_moves_and_the_state_tells_of_the_tool(tmp_path):
     rig = started(Rig(new_loop()), GRIP, WAIT)
     rig.run(2)
-    after = after_restart(rig, tmp_path / "robot.json")
+    after = after_restart(rig)
     after.run(2)
     assert after.begun == []
     assert after.speed == 0.0
@@ -60,10 +63,10 @@ def test_a_stop_is_remembered_until_it_is_acknowledged(kind, tmp_path):
     else:
         rig.control_loop.on_fault(FaultCode.PROTECTIVE_STOP, "it met something")
     rig.run(0.1)
-    after = after_restart(rig, path)
+    after = after_restart(rig)
     assert (FaultCode.OPERATOR_STOP if kind == "operator" else FaultCode.PROTECTIVE_STOP).value.kind in refusal(after)
     after.control_loop.acknowledge()
-    again = after_restart(after, path)
+    again = after_restart(after)
     assert refusal(again) == ""
 
 
@@ -74,7 +77,7 @@ def test_the_force_of_a_grip_is_remembered_while_the_fingers_close(tmp_path):
     rig.step()
     # The process is killed, and the fingers close all the same.
     rig.force_n = 60.0
-    after = after_restart(rig, tmp_path / "robot.json")
+    after = after_restart(rig)
     assert "with at most 60 N" in after.control_loop.release_question()
 
 
@@ -92,7 +95,7 @@ def test_the_angle_of_a_grip_is_remembered_and_forgotten_with_the_grip(tmp_path)
     rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 0.1})
     rig.run(5)
     gripped_rad = rig.wrist_rad
-    after = after_restart(rig, tmp_path / "robot.json")
+    after = after_restart(rig)
     assert after.control_loop.grip == (pytest.approx(gripped_rad), 60.0)
     after.force_n = 0.0
     after.run(0.1)
@@ -107,25 +110,25 @@ async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_on
     path = tmp_path / "robot.json"
     rig = started(Rig(new_loop()), GRIP, WAIT)
     cell = load_cell()
-    memory = RigMemory(path, rig.control_loop, cell)
+    memory = RigMemory(FILES, rig.control_loop, cell)
     cell.tare(8321.5)
     rig.run(2)
     await memory.save_present()
 
     after, calibrated_anew = load_cell(), load_cell(scale_n_per_count=0.002)
-    again = RigMemory(path, new_loop(), after)
-    RigMemory(path, new_loop(), calibrated_anew)
+    again = RigMemory(FILES, new_loop(), after)
+    RigMemory(FILES, new_loop(), calibrated_anew)
     assert after.calibration.tare_counts == 8321.5
     assert calibrated_anew.calibration.tare_counts == 8000.0
     # Until the gripper answers, nobody knows of another zero.
     await again.save_present()
-    assert read_memory(path).load_zero == 8321.5
+    assert read_memory(FILES.states[0]).load_zero == 8321.5
 
     rig.force_n = 0.0
     stop(rig)
     rig.run(0.6)
     await memory.save_present()
-    RigMemory(path, new_loop(), free := load_cell())
+    RigMemory(FILES, new_loop(), free := load_cell())
     assert free.calibration.tare_counts == 8000.0
 
 
@@ -133,17 +136,17 @@ async def test_the_wrench_keeps_its_zero_with_the_grip(tmp_path):
     path, zero = tmp_path / "robot.json", (0.0, 1.0, 0.0, 0.0, 0.0, -0.11)
     rig = started(Rig(new_loop()), GRIP, WAIT)
     before, after, free = UrRobot(SETTINGS), UrRobot(SETTINGS), UrRobot(SETTINGS)
-    memory = RigMemory(path, rig.control_loop, robot=before)
+    memory = RigMemory(FILES, rig.control_loop, robot=before)
     before.restore_wrench_zero(zero)
     rig.run(2)
     await memory.save_present()
-    RigMemory(path, new_loop(), robot=after)
+    RigMemory(FILES, new_loop(), robot=after)
     assert after.wrench_zero == zero
     rig.force_n = 0.0
     stop(rig)
     rig.run(0.6)
     await memory.save_present()
-    RigMemory(path, new_loop(), robot=free)
+    RigMemory(FILES, new_loop(), robot=free)
     assert free.wrench_zero == (0.0,) * 6
 
 
@@ -173,18 +176,18 @@ def test_a_fault_of_another_version_is_a_stop_all_the_same():
     assert loop.safety.stop_faults == (Fault(FaultCode.DAEMON_ENDED, "it was hot"),)
 
 
-async def test_nothing_starts_where_a_stop_could_not_be_remembered(tmp_path):
+async def test_nothing_starts_where_a_stop_could_not_be_remembered(tmp_path, monkeypatch):
+    memory = RigMemory(FILES, new_loop())
     (tmp_path / "file").write_text("")
-    memory = RigMemory(tmp_path / "robot.json", new_loop())
-    memory.path = tmp_path / "file" / "robot.json"
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     assert "cannot be kept" in (await memory.begins("test") or "")
-    memory.path = tmp_path / "robot.json"
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert await memory.begins("test") is None
-    assert json.loads(memory.path.read_text())["running"] == "test"
+    assert json.loads(FILES.states[0].read_text())["running"] == "test"
 
 
 async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it(tmp_path, monkeypatch):
-    memory = RigMemory(tmp_path / "robot.json", new_loop())
+    memory = RigMemory(FILES, new_loop())
     assert await memory.begins("test") is None
     saved: list[Remembered] = []
     twice = asyncio.Event()
@@ -202,30 +205,4 @@ async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it
     await twice.wait()
     following.cancel()
     await asyncio.gather(following, return_exceptions=True)
-    assert read_memory(memory.path).running == "test"
-
-
-def test_the_file_is_in_systemds_state_folder_or_the_users(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    assert memory_path("192.168.1.10") == tmp_path / "shearloop" / "robot-192.168.1.10.json"
-    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/shearloop:/var/lib/other")
-    assert memory_path("a/../b") == Path("/var/lib/shearloop/robot-a_.._b.json")
-
-
-def test_one_daemon_at_a_time_drives_a_robot():
-    with lock_robot("192.168.1.10", "tcp://127.0.0.1:27762"):
-        taken = rf"driven by another program of this computer \(process {os.getpid()}\): "
-        taken += "stop that one first, with `shearloop command stop --connect tcp://127.0.0.1:27762`"
-        with pytest.raises(UserError, match=taken), lock_robot("192.168.1.10"):
-            pytest.fail("it has the robot as well")
-        with lock_robot("192.168.1.11"):
-            pass
-    with lock_robot("192.168.1.10"):
-        pass
-
-
-def test_a_robot_whose_lock_cannot_be_written_can_be_watched(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    with lock_robot("192.168.1.10"):
-        assert read_memory(memory_path("192.168.1.10")).stop
+    assert read_memory(FILES.states[0]).running == "test"

@@ -14,7 +14,7 @@ from shearloop.cli import main
 from shearloop.cli.init import packaged_files
 from shearloop.daemon.commissioning import Line, Report, RigIdentity, StageResult
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.rig_memory import lock_robot
+from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.script import UPPER
@@ -122,7 +122,7 @@ def test_a_report_of_another_rig_is_not_continued(tmp_path, changed):
 @pytest.mark.usefixtures("ur_rtde")
 def test_a_robot_that_a_daemon_drives_is_not_commissioned(tmp_path, mistake):
     path = write_rig(tmp_path, "127.0.0.9")
-    with lock_robot("127.0.0.9"):
+    with lock_robot(RobotFiles.of("127.0.0.9")):
         assert "driven by another program" in mistake("commission", path, "--out", tmp_path / "report.yaml")
 
 

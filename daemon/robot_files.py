@@ -1,0 +1,149 @@
+"""The files of one robot, however its address is spelt: its state, and the lock that keeps other daemons away."""
+
+import contextlib
+import fcntl
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from shearloop.drivers.hosts import addresses_of, is_address, one_spelling
+from shearloop.errors import UserError
+from shearloop.files import replace_file
+
+# The addresses that a name had when it was last looked up.
+ADDRESSES_SUFFIX = ".addresses"
+SUFFIXES = (".json", ".lock", ADDRESSES_SUFFIX)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotFiles:
+    """One robot's keys in the folder of states: its addresses, or its name where no address is known.
+
+    `others` are other spellings that have files, such as its name: their state is of this robot as well.
+    """
+
+    host: str
+    keys: tuple[str, ...]
+    others: tuple[str, ...] = ()
+    # Whether it is known which robot the name means; it need not be an address of the present look-up.
+    known: bool = True
+
+    @classmethod
+    def of(cls, host: str) -> "RobotFiles":
+        """Look up the robot at a name or address, and the other names that have files here; takes at most 2 s."""
+        name, stored = one_spelling(host), _stored_spellings()
+        addresses = addresses_of((name, *stored))
+        own = addresses[name] or _last_addresses(name)
+        keys = tuple(sorted(own)) or (name,)
+        same = {
+            spelling
+            for spelling, found in addresses.items()
+            if one_spelling(spelling) == name or own & (found or _last_addresses(spelling))
+        }
+        others = tuple(sorted({host, name, *same} - set(keys)))
+        files = cls(host, keys, others, known=bool(own))
+        if own and not is_address(name):
+            files.note_addresses()
+        return files
+
+    @property
+    def states(self) -> tuple[Path, ...]:
+        """The files of its state, which are written."""
+        return tuple(memory_path(key) for key in self.keys)
+
+    @property
+    def other_states(self) -> tuple[Path, ...]:
+        """Files of its state under other spellings, which are read once and then removed."""
+        return tuple(memory_path(other) for other in self.others)
+
+    @property
+    def locks(self) -> tuple[Path, ...]:
+        """The files of its lock; the order is the same for all daemons."""
+        return tuple(_file(spelling, ".lock") for spelling in sorted({*self.keys, *self.others}))
+
+    def note_addresses(self) -> None:
+        """Keep the addresses of its name for a start without a network."""
+        name = one_spelling(self.host)
+        found = addresses_of((name,))[name] if not self.known else frozenset(self.keys)
+        # A folder that cannot be written keeps experiments from their start, and says so.
+        with contextlib.suppress(OSError):
+            path = _file(name, ADDRESSES_SUFFIX)
+            if found and found != _last_addresses(name):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with replace_file(path) as file:
+                    file.write("\n".join(sorted(found)).encode())
+
+
+def state_folder() -> Path:
+    """Return systemd's state folder, or the user's."""
+    # systemd separates several folders with colons; ours is one.
+    folder = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if folder:
+        return Path(folder)
+    state = os.environ.get("XDG_STATE_HOME", "")
+    return (Path(state) if os.path.isabs(state) else Path.home() / ".local" / "state") / "shearloop"
+
+
+def memory_path(spelling: str) -> Path:
+    """Return the file of a robot's state under one spelling of its address."""
+    return _file(spelling, ".json")
+
+
+def _file(spelling: str, suffix: str) -> Path:
+    return state_folder() / f"robot-{re.sub(r'[^A-Za-z0-9.-]', '_', spelling)}{suffix}"
+
+
+def _stored_spellings() -> tuple[str, ...]:
+    """Return the spellings that have files; an address of IPv6 is read back from its file's name."""
+    found = set()
+    with contextlib.suppress(OSError):
+        for path in state_folder().glob("robot-*"):
+            for suffix in SUFFIXES:
+                if path.name.endswith(suffix):
+                    spelling = path.name.removeprefix("robot-").removesuffix(suffix)
+                    numbered = spelling.replace("_", ":")
+                    found.add(numbered if is_address(numbered) else spelling)
+    return tuple(sorted(found))
+
+
+def _last_addresses(name: str) -> frozenset[str]:
+    """Return the addresses that a name had when it was last looked up; none where it never was."""
+    try:
+        return frozenset(_file(name, ADDRESSES_SUFFIX).read_text(encoding="utf-8").split())
+    except (OSError, UnicodeError):
+        return frozenset()
+
+
+@contextlib.contextmanager
+def lock_robot(files: RobotFiles, commands: str = "") -> Iterator[None]:
+    """Keep other daemons of this user away from a robot; raises UserError if one of them has it.
+
+    `commands` is the command address of this process, if it has one, which the sentence to another one names.
+    Two daemons would share the robot's memory, and neither would know of the other's stops and grips. The lock ends
+    with the process, however that ends. Where the file cannot be made, no experiment starts, and nothing is locked.
+    """
+    with contextlib.ExitStack() as opened:
+        for path in files.locks:
+            _lock(path, files.host, commands, opened)
+        yield
+
+
+def _lock(path: Path, host: str, commands: str, opened: contextlib.ExitStack) -> None:
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = opened.enter_context(path.open("a+", encoding="utf-8"))
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            process, _, address = file.read().partition(" ")
+            stop = f"with `shearloop command stop --connect {address}`" if address else "with Ctrl-C in its terminal"
+            raise UserError(
+                f"the robot at {host} is driven by another program of this computer (process {process}): "
+                f"stop that one first, {stop}, or name another robot in the configuration"
+            ) from None
+        file.truncate(0)
+        file.write(f"{os.getpid()} {commands}".rstrip())
+        file.flush()

@@ -225,7 +225,10 @@ def build_rig(
     recorder: Recorder | None,
     supervisor: Supervisor,
 ) -> tuple[Sensors, Rig]:
-    """Return robot, gripper and control loop, and all sensors, which drive it; `settings` and `files` are the robot's."""
+    """Return robot, gripper and control loop, and all sensors, which drive it.
+
+    `settings` and `files` are the robot's.
+    """
     sources = torque_sources(config, sessions.fingertips, sessions.combined)
     commissioning = commissioning_of(config, settings)
     check_experiment(config, sources, commissioning)

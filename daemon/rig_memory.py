@@ -5,7 +5,7 @@ There is a file for each robot.
 
 import asyncio
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -137,8 +137,8 @@ class RigMemory:
                 if not self.error:
                     structlog.get_logger().warning("the rig's state cannot be kept", reason=str(error))
                 self.error = (
-                    f"the rig's state cannot be kept in {self.files.states[0]} ({error.strerror}), and a stop would be forgotten "
-                    "with this process: make room, or make the folder writable"
+                    f"the rig's state cannot be kept in {self.files.states[0]} ({error.strerror}), and a stop would be "
+                    "forgotten with this process: make room, or make the folder writable"
                 )
             else:
                 self.error, self._written = "", state
@@ -172,8 +172,8 @@ def read_memories(files: RobotFiles) -> Remembered:
     stops = [fault for state in newest_first for fault in state.stop]
     if not files.known:
         unknown = (
-            f"what it left is kept under the robot's address, and the name {files.host!r} has none at present: see that "
-            "the name is right and the network is up"
+            f"what it left is kept under the robot's address, and the name {files.host!r} has none at present: see "
+            "that the name is right and the network is up"
         )
         stops.append((FaultCode.DAEMON_ENDED.name, unknown))
     running = next((state.running for state in newest_first if state.running), "")

@@ -36,7 +36,7 @@ def names(monkeypatch) -> dict[str, list[str]]:
 
 SAME = [
     *(("localhost", "127.0.0.1"), ("LocalHost", "localhost"), ("localhost.", "127.0.0.1"), ("::1", "127.0.0.1")),
-    *(("0:0:0:0:0:0:0:1", "localhost"), ("0x7f.1", "127.0.0.1"), ("0.0.0.0", "127.0.0.1")),
+    *(("0:0:0:0:0:0:0:1", "localhost"), ("0x7f.1", "127.0.0.1"), ("::", "127.0.0.1")),
     *(("::ffff:127.5.6.7", "127.5.6.7"), ("0x7f050607", "127.5.6.7")),
     *(("ur.lab", "192.168.1.10"), ("UR.lab.", "192.168.1.10"), ("ur.lab", "::ffff:192.168.1.10")),
     *(("2001:DB8::1", "2001:db8:0:0:0:0:0:1"), ("fe80::1%eth0", "FE80::1%eth0")),
@@ -98,7 +98,7 @@ def test_a_name_that_has_moved_is_the_robot_at_its_present_address(names):
         pass
 
 
-async def test_a_name_that_was_never_found_waits_for_the_operator_until_it_was(names, monkeypatch):
+async def test_a_name_that_was_never_found_waits_for_the_operator_until_it_was(names):
     names.clear()
     memory = RigMemory(RobotFiles.of("ur.lab"), loop := new_loop())
     assert "the name 'ur.lab' has none at present" in loop.safety.stop_faults[0].sentence

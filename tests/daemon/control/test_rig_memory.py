@@ -2,8 +2,6 @@
 
 import asyncio
 import json
-import os
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +12,6 @@ from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memory, writ
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.errors import UserError
 from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS
 
@@ -38,7 +35,7 @@ def after_restart(before: Rig) -> Rig:
     return after
 
 
-def test_after_a_crash_nothing_moves_and_the_state_tells_of_the_tool(tmp_path):
+def test_after_a_crash_nothing_moves_and_the_state_tells_of_the_tool():
     rig = started(Rig(new_loop()), GRIP, WAIT)
     rig.run(2)
     after = after_restart(rig)
@@ -54,8 +51,7 @@ def test_after_a_crash_nothing_moves_and_the_state_tells_of_the_tool(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["operator", "fault"])
-def test_a_stop_is_remembered_until_it_is_acknowledged(kind, tmp_path):
-    path = tmp_path / "robot.json"
+def test_a_stop_is_remembered_until_it_is_acknowledged(kind):
     rig = started(Rig(new_loop()), GRIP, WAIT)
     rig.run(2)
     if kind == "operator":
@@ -70,7 +66,7 @@ def test_a_stop_is_remembered_until_it_is_acknowledged(kind, tmp_path):
     assert refusal(again) == ""
 
 
-def test_the_force_of_a_grip_is_remembered_while_the_fingers_close(tmp_path):
+def test_the_force_of_a_grip_is_remembered_while_the_fingers_close():
     rig = started(Rig(new_loop()), {"do": "release"}, GRIP, WAIT)
     while rig.control_loop.experiment.step_number < 2:
         rig.step()
@@ -91,7 +87,7 @@ def test_a_stop_that_released_does_not_release_again_in_the_next_process():
     assert rig.control_loop.status.decision.response is Response.STOP_AND_KEEP_GRIP
 
 
-def test_the_angle_of_a_grip_is_remembered_and_forgotten_with_the_grip(tmp_path):
+def test_the_angle_of_a_grip_is_remembered_and_forgotten_with_the_grip():
     rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 0.1})
     rig.run(5)
     gripped_rad = rig.wrist_rad
@@ -106,8 +102,7 @@ def load_cell(scale_n_per_count: float = 0.001) -> LoadCell:
     return LoadCell(SimpleNamespace(), LoadCalibration(tare_counts=8000.0, scale_n_per_count=scale_n_per_count))
 
 
-async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_one(tmp_path):
-    path = tmp_path / "robot.json"
+async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_one():
     rig = started(Rig(new_loop()), GRIP, WAIT)
     cell = load_cell()
     memory = RigMemory(FILES, rig.control_loop, cell)
@@ -132,8 +127,8 @@ async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_on
     assert free.calibration.tare_counts == 8000.0
 
 
-async def test_the_wrench_keeps_its_zero_with_the_grip(tmp_path):
-    path, zero = tmp_path / "robot.json", (0.0, 1.0, 0.0, 0.0, 0.0, -0.11)
+async def test_the_wrench_keeps_its_zero_with_the_grip():
+    zero = (0.0, 1.0, 0.0, 0.0, 0.0, -0.11)
     rig = started(Rig(new_loop()), GRIP, WAIT)
     before, after, free = UrRobot(SETTINGS), UrRobot(SETTINGS), UrRobot(SETTINGS)
     memory = RigMemory(FILES, rig.control_loop, robot=before)
@@ -186,7 +181,7 @@ async def test_nothing_starts_where_a_stop_could_not_be_remembered(tmp_path, mon
     assert json.loads(FILES.states[0].read_text())["running"] == "test"
 
 
-async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it(tmp_path, monkeypatch):
+async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it(monkeypatch):
     memory = RigMemory(FILES, new_loop())
     assert await memory.begins("test") is None
     saved: list[Remembered] = []

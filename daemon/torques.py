@@ -46,6 +46,7 @@ class TorqueSource:
     fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
     the first torque; 0 for a source that measures without a grip. `has_gain`: an `adapt` step can correct its gain.
     `noise_nm`: the torque is known to this; such a source supervises beyond it only, and drives nothing gentler.
+    `only_sign`: of the only torques that it measures, 0 for both; a torque of the other sign may read as 0.
     """
 
     name: str
@@ -57,10 +58,15 @@ class TorqueSource:
     warm_up_s: float = 0.0
     has_gain: bool = False
     noise_nm: float = 0.0
+    only_sign: int = 0
 
     def fresh_s(self, config: LoopConfig) -> float:
         """Return how long after its arrival a torque is fresh."""
         return max(STALE_AFTER_PERIODS * self.period_s, config.stale_after_s)
+
+    def as_read_nm(self, torque_nm: float) -> float:
+        """Return what the source reads of another one's torque: 0 where it has the sign that it does not measure."""
+        return 0.0 if torque_nm * self.only_sign < 0 else torque_nm
 
 
 class SensorListener(Protocol):

@@ -19,6 +19,7 @@ from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.gain import GainCorrection, ToolLaw
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import UNKNOWN_FRAMES, LearnedFrames
+from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import INLINE, Measured
 
@@ -32,6 +33,10 @@ _UNKNOWN_STRENGTH = (
     "every grip is about as strong as in the calibration, because the file does not hold that strength (calibrate "
     "again to have it checked)"
 )
+_ONE_SIGN = {
+    sign: f"no torque is {other}, because its recordings have {own} torques alone"
+    for sign, own, other in ((1, "positive", "negative"), (-1, "negative", "positive"))
+}
 # Tools differ if their diameters differ by a larger share.
 LARGEST_TOOL_SHARE = 0.15
 
@@ -124,6 +129,15 @@ class Calibration:
         return self.torque is not None
 
     @property
+    def only_sign(self) -> int:
+        """The sign of the only torques that it measures: its load cell was pushed from one side; 0 for both signs.
+
+        A tool that is twisted the other way may read as 0.
+        """
+        point = self.torque.regressor.point if self.torque is not None else None
+        return round(point.sign) if isinstance(point, CensoredRidge) else 0
+
+    @property
     def outputs(self) -> dict[Quantity, OutputModel]:
         """The model of each quantity that the estimator gives."""
         models: dict[Quantity, OutputModel | None] = {"torque": self.torque, "diameter": self.diameter}
@@ -135,6 +149,8 @@ class Calibration:
         texts = [_ASSUMPTION_TEXTS[one] for one in self.assumptions]
         if any(one.strength is None for one in self.validators):
             texts.append(_UNKNOWN_STRENGTH)
+        if self.only_sign:
+            texts.append(_ONE_SIGN[self.only_sign])
         return " and ".join(texts)
 
     def save(self, path: str | Path) -> None:

@@ -141,6 +141,12 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
     sentences = [f"Estimator {calibration.estimator.name}, {outputs} from {result.frames} frames of the {sides} side."]
     if regressor is not None and regressor.misses_loads:
         sentences.append(_misses_loads(regressor, calibration))
+    if calibration.only_sign:
+        own, other = ("positive", "negative") if calibration.only_sign > 0 else ("negative", "positive")
+        sentences.append(
+            f"It measures {own} torques alone, because the recordings have no others: a tool with a {other} torque may "
+            "read as 0. Record twists both ways if a tool is turned both ways."
+        )
     known = [f"{abs(one.delay_s):.2f} s {'before' if one.delay_s < 0 else 'after'}" for one in timing.delays if one]
     if known:
         probably = "probably " if timing.uncertainty_s else ""

@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, Hold, StepCommand, TrackTorque
-from shearloop.daemon.control.experiment_check import too_noisy
+from shearloop.daemon.control.experiment_check import not_measured, too_noisy
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ApproachStep,
@@ -315,6 +315,8 @@ class ControlLoop:
         driving = self._sources[file.torque_source]
         if driving.noise_nm >= file.tightest_nm:
             return too_noisy(driving.name, driving.noise_nm, file.tightest_nm)
+        for place, unmeasured in not_measured(file, driving):
+            return f"step {place + 1}: {unmeasured}"
         watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
         faults = detect_faults(self.inputs, watched, self.config, t_ns)
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]

@@ -118,6 +118,26 @@ def too_noisy(source: str, noise_nm: float, limit_nm: float) -> str:
     )
 
 
+def not_measured(file: ExperimentFile, driving: TorqueSource) -> Iterator[tuple[int, str]]:
+    """Yield the number, from 0, of each step that twists a held tool the way that the driving source reads as 0."""
+    other = direction_of(-driving.only_sign)
+    for number, step in enumerate(file.steps):
+        turned: set[Direction | None] = set()
+        match step:
+            case HoldTorqueStep(signed_torque_nm=torque_nm):
+                turned = {direction_of(torque_nm)}
+            case TightenStep(direction=direction):
+                turned = {direction}
+            case TwistStep(absolute=False, angles_rad=angles_rad):
+                turned = {direction_of(angle_rad) for angle_rad in angles_rad}
+        if other is not None and other in turned:
+            yield (
+                number,
+                f"{step.do} turns {other}, and {driving.name} measures no torque of this direction: its calibration "
+                "has the other one alone; calibrate on twists both ways, or let another source drive",
+            )
+
+
 def check_steps(file: ExperimentFile) -> list[Mistake]:
     """Return each step that exceeds its limits or its timeout, and each step that the steps before it make wrong.
 
@@ -257,6 +277,8 @@ def experiment_mistakes(
             noise_nm, limit_nm = robot.settings.facts.estimated_nm, file.tightest_nm
             if noise_nm >= limit_nm:
                 mistakes.append((("torque_source",), too_noisy(WRENCH, noise_nm, limit_nm)))
+    if file.torque_source in sources:
+        mistakes += [(("steps", number), why) for number, why in not_measured(file, sources[file.torque_source])]
     if config.gripper is None:
         cure = "add a `gripper` section to the configuration, or take the step out"
         mistakes += [

@@ -157,7 +157,7 @@ def _disagreement(
     if end == first:
         return []
     other_nm = sum(torques_nm[first:end]) / (end - first)
-    apart_nm = abs(latest.torque_nm - other_nm)
+    apart_nm = abs(fast.as_read_nm(latest.torque_nm) - slow.as_read_nm(other_nm))
     allowed_nm = config.disagreement_nm + slow.noise_nm + fast.noise_nm
     if apart_nm <= allowed_nm:
         return []

@@ -137,6 +137,7 @@ def _torque_source(session: Session, name: str, period_s: float) -> TorqueSource
         # The first torque after a grip needs the lagged frames too, and none is of a frame that saw the fingers move.
         warm_up_s=_WARM_UP_SHARE * max(calibration.estimator.motion.n_needed, 2) * period_s,
         has_gain=calibration.measures_torque,
+        only_sign=calibration.only_sign,
     )
 
 

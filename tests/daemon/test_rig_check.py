@@ -12,7 +12,9 @@ import yaml
 
 from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.experiment_files import check_experiment
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.ur.settings import ForceBound, TorqueBound, read_settings
 from shearloop.errors import UserError
@@ -151,6 +153,26 @@ def test_an_adaptation_that_nothing_is_known_for_is_refused(tmp_path, steps, sai
     cell = {"load_cell": {"device": {"path": "load"}}}
     fine = {"steps": [IDENTIFY, ADAPT, IDENTIFY, {"do": "hold_torque", "torque_nm": 0.1}]}
     assert check_experiment(config(tmp_path, fine, **cell), {**sources, **LOAD}) is not None
+
+
+ONE_WAY = [
+    {"do": "hold_torque", "torque_nm": -0.1},
+    {"do": "hold_torque", "torque_nm": 0.1, "direction": "clockwise"},
+    {"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": 0.3, "direction": "clockwise"},
+    {"do": "twist", "angles_rad": [0.1, -0.1]},
+]
+
+
+@pytest.mark.parametrize("step", ONE_WAY)
+def test_a_torque_that_the_driving_calibration_reads_as_none_is_refused(tmp_path, step):
+    steps, both_ways = [IDENTIFY, step], TorqueSource(name="right", period_s=0.5)
+    experiment = config(tmp_path, {"torque_source": "right", "steps": steps})
+    one_sided = replace(both_ways, only_sign=1)
+    with pytest.raises(UserError, match=rf"steps\[1\]: {step['do']} turns clockwise, and right measures no torque of"):
+        check_experiment(experiment, {"right": one_sided})
+    file = check_experiment(experiment, {"right": both_ways})
+    loop = ControlLoop(LoopConfig(), {"right": one_sided}, ("robot",))
+    assert f"step 2: {step['do']} turns clockwise" in loop.start(file, 0), "a running daemon refuses it too"
 
 
 def test_every_mistake_of_an_experiment_is_told_on_a_line_of_its_own(tmp_path):

@@ -152,9 +152,10 @@ def test_a_file_of_version_0_3_0_loads_without_what_it_does_not_hold(saved, moti
 
 def test_assumptions_are_kept(motion_calibration, recorded, tmp_path):
     assert motion_calibration.assumptions == ()
-    assert motion_calibration.assumption_text == ""
+    one_way = "no torque is negative, because its recordings have positive torques alone"
+    assert (motion_calibration.only_sign, motion_calibration.assumption_text) == (1, one_way)
     timed = fit("motion_regression", [recorded], "an emulated rig", timing=TRUSTED)
-    assert timed.assumption_text == "the load cell's delay is as given (--load-cell-delay-s)"
+    assert timed.assumption_text == f"the load cell's delay is as given (--load-cell-delay-s) and {one_way}"
     path = tmp_path / "new.cal"
     timed.save(path)
     assert Calibration.load(path).assumptions == timed.assumptions

@@ -126,7 +126,7 @@ def test_a_file_without_the_strength_loads_and_says_that_it_is_not_checked(motio
     assert estimate.valid
     assert "every grip is about as strong as in the calibration" in loaded.assumption_text
     motion_calibration.save(tmp_path / "new.cal")
-    assert Calibration.load(tmp_path / "new.cal").assumption_text == ""
+    assert "strong" not in Calibration.load(tmp_path / "new.cal").assumption_text
 
 
 def test_the_check_changes_no_estimate_of_the_calibrated_grip(motion_calibration, recorded):

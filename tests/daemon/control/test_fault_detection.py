@@ -80,6 +80,16 @@ def test_what_measures_no_torque_is_watched_for_silence_alone():
     assert "the last torque of left came 2.0 s ago" in silent[FaultCode.ESTIMATE_STALE]
 
 
+@pytest.mark.parametrize(("measured_nm", "disagree"), [(-0.2, False), (0.2, True)])
+def test_a_torque_that_a_one_sided_calibration_reads_as_none_is_no_disagreement(measured_nm, disagree):
+    one_sided = replace(EIT, only_sign=1)
+    for driving, other in ((one_sided, LOAD), (LOAD, one_sided)):
+        events = found(torque(one_sided, 0.0), torque(LOAD, measured_nm), driving=driving, supervising=(other,))
+        assert (FaultCode.TORQUES_DISAGREE in events) is disagree
+    events = found(torque(one_sided, 0.2), torque(LOAD, -0.1), driving=one_sided, supervising=(LOAD,))
+    assert FaultCode.TORQUES_DISAGREE in events, "it reads a torque where there is one of the other sign"
+
+
 def test_the_wrench_is_watched_with_the_state_that_it_comes_with():
     assert found(torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, None)) == {}
 

@@ -278,7 +278,8 @@ class UrSettings(_Checked):
             if inner <= noise:
                 raise ValueError(
                     f"limits.{key}: inner ({inner:g} {unit}) is within the noise of the wrench of {facts.name}, "
-                    f"± {noise:g} {unit}, so that it would stop the arm at random: give more"
+                    f"± {noise:g} {unit}, so that it would stop the arm at random: give more; "
+                    "commissioning measures how much, five standard deviations and the bias"
                 )
 
     @property

@@ -1,7 +1,7 @@
 """The questions of a commissioning to the person at the robot."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -67,6 +67,15 @@ class Operator:
                     return value
             self.say(f"{answer!r} is no number from {low:g} to {high:g}.")
         raise UserError(f"no number from {low:g} to {high:g} was given: {question}")
+
+    def choose(self, question: str, choices: Sequence[str], played: Played | None = None) -> str:
+        """Return the chosen word; raises UserError after some other answers."""
+        for _ in range(_MOST_TRIES):
+            answer = self.ask(f"{question} {' or '.join(choices)}?", played).lower()
+            if answer in choices:
+                return answer
+            self.say(f"{answer!r} is not {' or '.join(f'`{one}`' for one in choices)}.")
+        raise UserError(f"neither {' nor '.join(choices)} was given: {question}")
 
     def allow(self, motion: str) -> None:
         """Show a motion with its speed and travel, and return once the word was typed; raises DeclinedError."""

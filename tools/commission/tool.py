@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from shearloop.daemon.commissioning import Line, Supplied
+from shearloop.daemon.control.experiment_schema import SIGNS
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.ur.messages import tool_axis
 from shearloop.errors import UserError
@@ -161,29 +162,37 @@ def _signs(context: Context, sensors: Sensors) -> list[Line]:
     before = _hold_and_feel(context, sensors)
     _turn(context, TURN_RAD)
     after = _hold_and_feel(context, sensors)
-    said = context.operator.ask(
-        "Which way did the gripper turn, for an eye that faces it: clockwise or counterclockwise?",
+    said = context.operator.choose(
+        "Which way did the gripper turn, for an eye that faces it:",
+        tuple(SIGNS),
         Played(
             f"wrist 3 turned from {before.wrist_rad:.3f} to {after.wrist_rad:.3f} rad; where the angle grows, that eye "
             "sees it turn counterclockwise"
         ),
     )
     _turn(context, 0.0)
-    return judge_signs(before, after, said, emulated=context.config.emulated)
+    return judge_signs(before, after, said, context.settings.facts.estimated_nm, emulated=context.config.emulated)
 
 
-def judge_signs(before: Held, after: Held, said: str, *, emulated: bool = False) -> list[Line]:
+def judge_signs(
+    before: Held, after: Held, said: str, wrench_noise_nm: float = 0.0, *, emulated: bool = False
+) -> list[Line]:
     """Return the lines on a positive turn: command, wrist, load cell, wrench and estimates are positive.
 
-    A calibration on recordings of real fingertips may refuse `emulated` frames.
+    A wrench that is known to `wrench_noise_nm` only shows the sign of a larger torque alone. A calibration on
+    recordings of real fingertips may refuse `emulated` frames.
     """
     lines: list[Line] = []
     found = {
-        "command": "positive" if said.lower() == "counterclockwise" else f"negative: the operator said {said!r}",
+        "command": "positive" if said == "counterclockwise" else f"negative: the operator said {said!r}",
         "wrist": _sign(after.wrist_rad - before.wrist_rad),
         "load cell": _sign(after.load_nm - before.load_nm),
-        "wrench": _sign(after.wrench_nm - before.wrench_nm),
     }
+    if abs(after.load_nm - before.load_nm) >= wrench_noise_nm:
+        found["wrench"] = _sign(after.wrench_nm - before.wrench_nm)
+    else:
+        noise = f"not measured: the robot estimates its wrench to {wrench_noise_nm:g} N·m, and the twist is smaller"
+        lines.append(Line(what="sign of the wrench", value=noise))
     for name, after_nm in after.tactile_nm.items():
         before_nm = before.tactile_nm[name]
         if after_nm is None or before_nm is None:

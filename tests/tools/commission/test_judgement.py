@@ -226,6 +226,16 @@ def held(stiffness: float, left_nm: float = 0.0) -> list[Held]:
 @pytest.mark.parametrize(
     ("turned", "lines"), [(held(0.8), []), (held(0.7), ["stiffness"]), (held(0.8, left_nm=0.02), ["slip in the grip"])]
 )
+def test_a_wrench_that_is_known_to_more_than_the_twist_shows_no_sign():
+    before = Held(0.0, 0.0, 0.0)
+    lines = judge_signs(before, Held(0.08, 0.05, -3.0), "counterclockwise", 5.0)
+    assert failed(lines) == []
+    assert [line.value for line in lines if line.what == "sign of the wrench"] == [
+        "not measured: the robot estimates its wrench to 5 N·m, and the twist is smaller"
+    ]
+    assert failed(judge_signs(before, Held(0.08, 6.0, -6.0), "counterclockwise", 5.0)) == ["sign of the wrench"]
+
+
 def test_a_wrong_spring_and_a_slipping_grip_fail_their_lines(turned, lines):
     assert failed(judge_twists(turned, 0.8)) == lines
 

@@ -2,6 +2,7 @@
 
 import pytest
 
+from shearloop.errors import UserError
 from shearloop.tools.commission.operator import DONE, WORD, DeclinedError, Operator, Played
 
 QUESTIONS = {WORD: Operator.allow, DONE: Operator.act}
@@ -43,3 +44,12 @@ def test_emulated_hands_do_nothing_before_the_word():
 
     Operator(answer, lambda _: None, done.append).act("Hang the mass", Played("it is hung for you", ("hang 1",)))
     assert done == ["hang 1"]
+
+
+def test_a_choice_is_asked_for_again_until_it_is_one_of_the_words():
+    operator, said = answering(["counterclokwise", "", "Clockwise "])
+    assert operator.choose("Which way:", ("clockwise", "counterclockwise")) == "clockwise"
+    assert len(said) == 2
+    operator, _ = answering(["3", "yes", "no"])
+    with pytest.raises(UserError, match="neither clockwise nor counterclockwise was given"):
+        operator.choose("Which way:", ("clockwise", "counterclockwise"))

@@ -73,11 +73,19 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
     },
 }
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
-# Spellings that scripts use, and the words that stand for them.
-OTHER_SPELLINGS = {"replay": ("recording", "replay"), "import": ("recording", "import")}
+# Spellings that scripts and people in a hurry use, and the words that stand for them.
+OTHER_SPELLINGS = {
+    "replay": ("recording", "replay"),
+    "import": ("recording", "import"),
+    "stop": ("command", "stop"),
+    "pause": ("command", "pause"),
+    "status": ("command", "status"),
+}
 
 # Commands that move the rig: no abbreviation or mistyped word selects one.
 MOVING = frozenset({"start", "resume", "unlock", "release", "commission"})
+# Commands of the daemon that are named, and not carried out, without the word `command`.
+_OF_COMMAND = (MOVING - COMMANDS.keys()) | {"tare"}
 EXIT_OK, EXIT_USAGE = 0, 2
 # Exit statuses of `run` with `stop_when_done`: a fault, or a person, stopped the experiment.
 EXIT_UNFINISHED, EXIT_STOPPED = 3, 4
@@ -135,6 +143,8 @@ class Parser(argparse.ArgumentParser):
         if action.choices is None or value in action.choices:
             return
         known = list(map(str, action.choices))
+        if value in _OF_COMMAND and "command" in known:
+            self._refuse(f"there is no {value!r}; it is `shearloop command {value}`")
         of = f" of {action.option_strings[-1]}" if action.option_strings else ""
         # A mistyped word must not become a motion.
         near = get_close_matches(str(value), [one for one in known if one not in MOVING], 1)

@@ -286,7 +286,13 @@ def test_a_played_file_needs_an_emulator(option, config, mistake):
 
 
 @pytest.mark.parametrize(
-    ("old", "new"), [("replay no.mcap", "recording replay"), ("import mat no.mat --out a.mcap", "recording import")]
+    ("old", "new"),
+    [
+        ("replay no.mcap", "recording replay"),
+        ("import mat no.mat --out a.mcap", "recording import"),
+        ("stop --connect ipc://none --timeout 0.1", "command stop"),
+        ("status --connect ipc://none --timeout 0.1", "command status"),
+    ],
 )
 def test_other_spellings_work_and_answer_with_the_command(old, new, ran, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -294,6 +300,12 @@ def test_other_spellings_work_and_answer_with_the_command(old, new, ran, tmp_pat
     assert first == f"`shearloop {old.split()[0]}` is `shearloop {new}`"
     assert rest == ran(*new.split(), *old.split()[1:], status=2).err
     assert set(OTHER_SPELLINGS).isdisjoint(COMMANDS)
+
+
+@pytest.mark.parametrize("word", ["release", "resume", "start", "tare", "unlock"])
+def test_what_may_move_the_rig_is_named_and_not_carried_out_without_the_word_command(word, mistake, monkeypatch):
+    monkeypatch.setattr("shearloop.cli.command.run", Mock(side_effect=AssertionError))
+    assert f"there is no '{word}'; it is `shearloop command {word}`" in mistake(word)
 
 
 def test_the_overview_has_every_command_in_one_group(capsys):

@@ -217,15 +217,6 @@ def test_emulated_frames_that_a_calibration_refuses_fail_nothing():
     assert [line.value for line in lines if "right" in line.what] == ["not measured: no estimate in the grip"]
 
 
-def held(stiffness: float, left_nm: float = 0.0) -> list[Held]:
-    angles = [0.0, *(0.08 * (-1) ** number for number in range(10)), 0.0]
-    found = [Held(angle, stiffness * angle, 0.0) for angle in angles]
-    return [*found[:-1], dataclasses.replace(found[-1], load_nm=left_nm)]
-
-
-@pytest.mark.parametrize(
-    ("turned", "lines"), [(held(0.8), []), (held(0.7), ["stiffness"]), (held(0.8, left_nm=0.02), ["slip in the grip"])]
-)
 def test_a_wrench_that_is_known_to_more_than_the_twist_shows_no_sign():
     before = Held(0.0, 0.0, 0.0)
     lines = judge_signs(before, Held(0.08, 0.05, -3.0), "counterclockwise", 5.0)
@@ -236,6 +227,15 @@ def test_a_wrench_that_is_known_to_more_than_the_twist_shows_no_sign():
     assert failed(judge_signs(before, Held(0.08, 6.0, -6.0), "counterclockwise", 5.0)) == ["sign of the wrench"]
 
 
+def held(stiffness: float, left_nm: float = 0.0) -> list[Held]:
+    angles = [0.0, *(0.08 * (-1) ** number for number in range(10)), 0.0]
+    found = [Held(angle, stiffness * angle, 0.0) for angle in angles]
+    return [*found[:-1], dataclasses.replace(found[-1], load_nm=left_nm)]
+
+
+@pytest.mark.parametrize(
+    ("turned", "lines"), [(held(0.8), []), (held(0.7), ["stiffness"]), (held(0.8, left_nm=0.02), ["slip in the grip"])]
+)
 def test_a_wrong_spring_and_a_slipping_grip_fail_their_lines(turned, lines):
     assert failed(judge_twists(turned, 0.8)) == lines
 

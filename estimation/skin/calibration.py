@@ -192,7 +192,10 @@ def read_table(path: Path) -> CalibrationTable:
         # Spreadsheets begin a file with a mark of its encoding.
         with open_file(path) as raw, io.TextIOWrapper(raw, newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, restkey="a value without a column")
-            if any(";" in name for name in reader.fieldnames or ()):
+            names = reader.fieldnames or ()
+            for name in {name for name in names if names.count(name) > 1}:
+                raise CalibrationError(f"{path}: {names.count(name)} columns are called {name!r}; keep the right one.")
+            if any(";" in name for name in names):
                 raise CalibrationError(
                     f"{path}: semicolons separate the columns; write commas, and points in the numbers."
                 )

@@ -135,6 +135,13 @@ def test_no_reading_of_an_intact_signal_is_left_out(seed, kind):
         assert measure_level(samples(signals[kind]), 0.0).n == 30
 
 
+@pytest.mark.parametrize(("masses_g", "meant"), [([0.1], "Did you mean 100, 0.1 kg in g?"), ([100.0, 2e5], "200000 g")])
+def test_masses_in_another_unit_are_refused(masses_g, meant):
+    with pytest.raises(DeviceCalibrationError, match="give masses of 1 to 20000 g") as refused:
+        check_masses(masses_g)
+    assert meant in str(refused.value)
+
+
 @pytest.mark.parametrize("masses_g", [[], [0.0], [-5.0], [float("nan")], [float("inf")], [100.0, 100.0]])
 def test_masses_that_no_line_goes_through_are_refused(masses_g):
     with pytest.raises(DeviceCalibrationError, match="mass"):

@@ -52,10 +52,14 @@ _SHORTEST_FRAME_S = 0.05
 _MOST_LATE = 0.1
 # A cable damages fewer values than this fraction: the two recorded cases are one load value in a hundred.
 _MOST_DAMAGED = 0.1
+# Damaged values are single ones. So many in a row are a twist, in another unit.
+_MOST_IN_A_ROW = 4
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 # Among this many frames on either side, at least one should have been read without delay.
 _NEIGHBOURS = 12
+# Of one period: so much higher are the stamps after a frame that is missing. One that is late does not count.
+_LEAST_MISSING = 0.8
 # The load cell's board sends a line every 91.6 ms.
 LOAD_PERIOD_S = 0.0916
 _CYLINDER = re.compile(r"(\d+(?:\.\d+)?)mm[_.]")
@@ -293,10 +297,13 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
     if load is None:
         load = Stream(np.zeros(0), np.zeros((0, 1)))
     elif any(_is_one_loop(load.unix_s, stream.unix_s) for stream in streams.values()):
+        for stream in streams.values():
+            _check_whole(stream.unix_s)
         load, streams, sure = _loop_times(load, streams, remarks)
     load = _valid_load(load, remarks)
     arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in one.unix_s] for side, one in streams.items()}
     middles = {side: frame_middles(one) for side, one in arrivals.items()}
+    remarks += [_missing(side, one) for side, one in arrivals.items() if pauses(one)]
     delay = measured_delay([_series_of_side(side, one, middles[side], load) for side, one in streams.items()])
     if delay is not None and delay.late_s:
         load = replace(load, unix_s=load.unix_s - delay.late_s)
@@ -361,8 +368,10 @@ def _check_volts(path: Path, lines: FloatArray) -> None:
 
 def _check_torques(path: Path, torques: FloatArray) -> None:
     """Raise UserError where more torques (n,) in N·m are too large than a cable damages: they have another unit."""
-    beyond = int(np.count_nonzero(np.abs(torques) > LARGEST_TORQUE_NM))
-    if beyond > max(2, _MOST_DAMAGED * len(torques)):
+    is_beyond = np.abs(torques) > LARGEST_TORQUE_NM
+    beyond = int(np.count_nonzero(is_beyond))
+    in_a_row = max((len(list(run)) for large, run in itertools.groupby(is_beyond) if large), default=0)
+    if beyond > max(2, _MOST_DAMAGED * len(torques)) or in_a_row > _MOST_IN_A_ROW:
         raise UserError(
             f"{path}: {beyond} of {counted(len(torques), 'load value')} are beyond {LARGEST_TORQUE_NM:g} N·m, so they "
             "have another unit; write them in N·m"
@@ -373,14 +382,70 @@ def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:
     """Return the middle of each frame's acquisition from its arrival, in nanoseconds.
 
     A frame is read when it is complete or later. The board's clock is therefore the line below the stamps
-    (`drivers.eit_kit`). The earliest stamp among the neighbours gives its height, so that it follows a
-    board that paused.
+    (`drivers.eit_kit`), one between each two pauses. The earliest stamp among the neighbours gives its height.
     """
-    numbered = list(enumerate(arrivals_ns))
-    period = slope_below(numbered) if len(numbered) > 1 else 1e9 * FRAME_PERIOD_S
-    height = np.array([float(arrival - arrivals_ns[0]) - n * period for n, arrival in numbered])
-    lowest = minimum_filter1d(height, 2 * _NEIGHBOURS + 1, mode="nearest")
-    return [arrivals_ns[0] + round(low + (n - 0.5) * period) for n, low in enumerate(lowest)]
+    edges = [0, *pauses(arrivals_ns), len(arrivals_ns)]
+    parts = [range(first, end) for first, end in itertools.pairwise(edges)]
+    longest = [(n, arrivals_ns[n]) for n in max(parts, key=len)]
+    period = slope_below(longest) if len(longest) > 1 else 1e9 * FRAME_PERIOD_S
+    middles: list[int] = []
+    for part in parts:
+        height = np.array([float(arrivals_ns[n] - arrivals_ns[0]) - n * period for n in part])
+        lowest = minimum_filter1d(height, 2 * _NEIGHBOURS + 1, mode="nearest")
+        middles += [arrivals_ns[0] + round(low + (n - 0.5) * period) for n, low in zip(part, lowest, strict=True)]
+    return middles
+
+
+def pauses(arrivals_ns: Sequence[int]) -> list[int]:
+    """Return the numbers of the frames before which frames are missing, because the board or its program paused.
+
+    A late reading raises a stamp above the board's clock for a while, and lets the next ones come at once. After
+    missing frames all stamps stay higher.
+    """
+    n, t_ns = len(arrivals_ns), np.array(arrivals_ns, dtype=np.int64)
+    if n <= 2 * _NEIGHBOURS:
+        return []
+    # Over a longer span late readings matter less, and over a shorter one fewer spans hold a pause.
+    span = min(2 * _NEIGHBOURS, n // 8)
+    period_ns = float(np.median(t_ns[span:] - t_ns[:-span])) / span
+    height, least_ns = t_ns - t_ns[0] - period_ns * np.arange(n), _LEAST_MISSING * period_ns
+    found: list[int] = []
+    parts = [(0, n)]
+    while parts:
+        first, end = parts.pop()
+        risen = [at for at in range(first + 1, end) if _rise(height[first:end], at - first) >= least_ns]
+        if risen:
+            # The neighbours of a pause rise too. It is where the stamps are the furthest apart.
+            at = max(risen, key=lambda one: t_ns[one] - t_ns[one - 1])
+            found.append(at)
+            parts += [(first, at), (at, end)]
+    return sorted(found)
+
+
+def _rise(height: FloatArray, at: int) -> float:
+    """Return how much higher the lowest of the next (n,) heights is than the lowest of those before."""
+    return float(height[at : at + _NEIGHBOURS].min() - height[max(0, at - _NEIGHBOURS) : at].min())
+
+
+def _check_whole(stamps_s: FloatArray) -> None:
+    """Raise UserError for a loop that paused: how many load values its buffer has lost meanwhile is unknown."""
+    found = pauses([round(float(one) * 1e9) for one in stamps_s])
+    if found:
+        at = found[0]
+        raise UserError(
+            f"frames are missing between the rows {at} and {at + 1}, for {stamps_s[at] - stamps_s[at - 1]:.1f} s, and "
+            "the load cell's times follow from whole streams alone: import the rows before and after as two recordings"
+        )
+
+
+def _missing(side: str, arrivals_ns: Sequence[int]) -> str:
+    """Return the remark on the frames of a side that are missing."""
+    found = pauses(arrivals_ns)
+    longest_s = max(arrivals_ns[at] - arrivals_ns[at - 1] for at in found) / 1e9
+    return (
+        f"Frames of the {side} side are missing in {counted(len(found), 'place')}, for up to {longest_s:.1f} s: the "
+        "board or its program paused."
+    )
 
 
 def _loop_clock(stamps_s: FloatArray) -> tuple[float, float] | None:

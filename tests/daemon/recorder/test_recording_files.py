@@ -25,6 +25,7 @@ from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.reader import read_messages
 from shearloop.tools.recordings.replay import RecordedRun
 from shearloop.tools.recordings.tables import RecordedTopics, arrays
+from shearloop.words import counted
 from tests.fixtures.recordings import START_DATENUM
 
 LINES = PAPER_TABLE.line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
@@ -330,6 +331,25 @@ def test_late_frames_get_the_middle_of_their_acquisition(mat_folder, tmp_path):
     np.testing.assert_allclose(frames.t_mid_ns / 1e9, expected, rtol=0, atol=0.01)
 
 
+@pytest.mark.parametrize("missing", [[30], range(25, 40), [20, 24, 41]])
+def test_frames_on_either_side_of_missing_ones_keep_their_times(missing, mat_folder, tmp_path):
+    imported = import_mat([mat_folder(missing=missing, late=[(23, 0.3), (45, 0.4)])], tmp_path / "a.mcap")
+    frames = read_recording(tmp_path / "a.mcap").sides["right"]
+    whole_s = (START_DATENUM - 719529) * 86400 + PERIOD_S * (np.arange(60) + 0.5)
+    expected = np.delete(whole_s, missing)
+    np.testing.assert_allclose(frames.t_mid_ns / 1e9, expected, rtol=0, atol=0.01)
+    places = 1 + np.count_nonzero(np.diff(missing) > 1)
+    assert f"Frames of the right side are missing in {counted(int(places), 'place')}, for up to" in " ".join(
+        imported.remarks
+    )
+
+
+def test_a_loop_that_paused_is_refused(mat_folder, tmp_path):
+    folder = mat_folder(one_loop=True, missing=range(25, 40))
+    with pytest.raises(UserError, match=r"missing between the rows 25 and 26, for 8\.7 s"):
+        import_mat([folder], tmp_path / "a.mcap")
+
+
 def test_a_load_read_once_per_frame_gets_its_own_period(mat_folder, tmp_path):
     imported = import_mat([mat_folder(one_loop=True)], tmp_path / "a.mcap")
     assert "read once per frame" in imported.remarks[0]
@@ -376,6 +396,12 @@ def test_torques_of_another_unit_are_refused(mat_folder, tmp_path):
     ):
         import_mat([folder], tmp_path / "a.mcap")
     assert not list(tmp_path.glob("a.mcap*"))
+
+
+def test_a_twist_in_another_unit_is_no_damage(mat_folder, tmp_path):
+    """Most values of a recording without a load are small in any unit."""
+    with pytest.raises(UserError, match=r"5 of 355 load values are beyond 20 N·m, so they have another unit"):
+        import_mat([mat_folder(glitches=range(100, 105))], tmp_path / "a.mcap")
 
 
 @pytest.mark.parametrize("factor", [1000, -1])

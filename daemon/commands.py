@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
+from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
 from shearloop.daemon.sensors import Sensors
 from shearloop.daemon.supervisor import HealthReporter
 from shearloop.errors import UserError
@@ -24,8 +25,8 @@ EXPERIMENTS = "experiments"
 # The arguments of each command that acts, with their types.
 ARGUMENTS: Mapping[str, Mapping[str, type]] = {
     "tare": {"source": str, "confirmed": bool},
-    "start": {"experiment": str, "ask": bool, "confirmed": bool},
-    "release": {"confirmed": bool, "ask": bool},
+    "start": {"experiment": str, "ask": bool, "digest": str},
+    "release": {"confirmed": bool, "ask": bool, "digest": str},
 }
 STOP_DELAY_S = 0.05
 
@@ -109,9 +110,10 @@ class Commands:
         try:
             if request.get("ask"):
                 _refuse_if(rig.runner.start_refusal())
-                question, plan = await rig.start_question(Path(path))
-                return {"question": question, "plan": plan}
-            _refuse_if(await rig.start(Path(path)))
+                return {**(await rig.start_question(Path(path))).facts}
+            _refuse_if(await rig.start(Path(path), request.get("digest")))
+        except QuestionChangedError as error:
+            raise CommandRefusedError(str(error), **error.question.facts) from error
         except InvalidExperimentError as error:
             raise CommandRefusedError(str(error), invalid=True) from error
         except UserError as error:
@@ -135,11 +137,16 @@ class Commands:
     async def _release(self, request: Request) -> Reply:
         rig = required_rig(self.rig)
         _refuse_if(rig.runner.release_refusal())
-        question = rig.control_loop.release_question()
+        sentence = rig.control_loop.release_question()
+        text = f"Release? {sentence[0].upper()}{sentence[1:]}."
+        question = Question(text, digest_of(*rig.control_loop.release_stakes()))
         if request.get("ask"):
-            return {"question": f"Release? {question[0].upper()}{question[1:]}."}
+            return {**question.facts}
         if not request.get("confirmed"):
-            raise CommandRefusedError(f"{question}; confirm it with `shearloop command release --yes`")
+            raise CommandRefusedError(f"{sentence}; confirm it with `shearloop command release --yes`")
+        if request.get("digest", question.digest) != question.digest:
+            changed = f"what the gripper says has changed since the question: {sentence}; answer it again"
+            raise CommandRefusedError(changed, **question.facts)
         _refuse_if(await rig.runner.release())
         return {}
 

@@ -17,10 +17,11 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_runner import ControlLoopRunner, wrench_source
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.state_publisher import loop_state
-from shearloop.daemon.experiment_files import ExperimentFiles, check_experiment
+from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment, check_experiment
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
+from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
 from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.rig_memory import RigMemory
 from shearloop.daemon.robot_files import RobotFiles
@@ -181,13 +182,20 @@ class Rig:
     memory: RigMemory | None = None
     commissioning: Commissioning | None = None
 
-    async def start(self, path: Path) -> str | None:
-        """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
+    async def start(self, path: Path, digest: str | None = None) -> str | None:
+        """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file.
+
+        `digest` is of the question that a person has confirmed, if one was asked; raises QuestionChangedError where the
+        file has another content.
+        """
         # While something moves, no file is read.
         if (reason := self.runner.start_refusal()) is not None:
             return reason
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
+        if digest is not None and digest != (question := self._question_of(experiment)).digest:
+            changed = f"{path}: the file has changed since its plan was shown; look at the plan again"
+            raise QuestionChangedError(changed, question)
         try:
             if self.memory is not None and (reason := await self.memory.begins(experiment.file.name)) is not None:
                 return reason
@@ -200,14 +208,19 @@ class Rig:
             self.recorder.record_experiment(experiment.file.name, attached, experiment.file.tool_mm)
         return reason
 
-    async def start_question(self, path: Path) -> tuple[str, list[str]]:
+    async def start_question(self, path: Path) -> Question:
         """Return the question before a start, with the first motion, and the plan; raises UserError as `start` does."""
-        file = (await self.experiments.read(path)).file
+        return self._question_of(await self.experiments.read(path))
+
+    def _question_of(self, experiment: ReadExperiment) -> Question:
+        file = experiment.file
         motion = first_motion(file)
         robot = self.experiments.robot
         limits = robot.settings.limits if robot is not None else None
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)
-        return f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.", list(plan.sentences())
+        text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.", tuple(plan.sentences())
+        # The plan depends on the rig's limits, too.
+        return Question(text, digest_of(experiment.data, text, *sentences), sentences)
 
     def state(self) -> Mapping[str, Any]:
         """Return what `status` shows of the control loop."""

@@ -258,6 +258,12 @@ class ControlLoop:
         renewed = "; after its fault the fingers open and close once" if gripper is not None and gripper.fault else ""
         return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
 
+    def release_stakes(self) -> tuple[str, ...]:
+        """Return what a confirmation of `release_question` depends on; a width that wavers is not part of it."""
+        gripper = self.inputs.gripper
+        held = "held" if self.held is not None else "nothing held"
+        return held, "renewed" if gripper is not None and gripper.fault else "as it is"
+
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
         if (running := self.running) is not None:

@@ -40,7 +40,7 @@ Handler: TypeAlias = Callable[[Request], Awaitable[Reply]]
 class CommandRefusedError(Exception):
     """A command is refused; the message is the reason that the operator reads, and `facts` are for his program."""
 
-    def __init__(self, reason: str, **facts: bool) -> None:
+    def __init__(self, reason: str, **facts: Any) -> None:
         super().__init__(reason)
         self.facts = facts
 

@@ -49,8 +49,12 @@ LAST_MESSAGES_S = 0.1
 PROGRAM = "the live page"
 # Commands that move something, or change what moves it.
 NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock", "release")
-# Those that the page asks about first, with the daemon's question.
+# Those that the page asks about first, with the daemon's question. The confirmation gives back the question's digest.
 ASKED = ("start", "release")
+# What a request may say of each command; a word that is not known must not pass for a confirmation.
+WORDS = {"start": ("experiment", "digest"), "release": ("digest",)}
+# The parts of a question, which a refusal has as well where another one is to be answered.
+QUESTION = ("question", "plan", "digest")
 # Those that take long.
 SLOW = ("unlock", "release")
 # Wrong tokens that are compared at once, and then per second.
@@ -330,12 +334,16 @@ class _Page:
         refusal = self._tokens.refusal(name, request.headers.get("Authorization"), time.monotonic_ns())
         if refusal is not None:
             return self._refuse(*refusal)
-        # The first press asks, the second one confirms.
-        arguments: dict[str, bool | str] = {}
-        if name in ASKED:
-            arguments["confirmed" if "confirmed" in request.query else "ask"] = True
-        if name == "start" and request.query.get("experiment"):
-            arguments["experiment"] = request.query["experiment"]
+        words = WORDS.get(name, ())
+        if unknown := [word for word in request.query if word not in words]:
+            has = f"there are {', '.join(words)}" if words else "there are none"
+            return self._refuse(400, f"`{name}` has no word {unknown[0][:40]!r} here; {has}")
+        arguments: dict[str, bool | str] = {word: text for word, text in request.query.items() if text}
+        # The first press asks, the second one confirms what was asked.
+        if name in ASKED and "digest" not in arguments:
+            arguments["ask"] = True
+        elif name == "release":
+            arguments["confirmed"] = True
         return await self._reply(name, self._bridge.command(name, **arguments))
 
     async def _reply(self, name: str, requested: Awaitable[dict[str, Any]]) -> web.Response:
@@ -344,7 +352,7 @@ class _Page:
         except UserError as error:
             return self._refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
-        keys = ("ok", "reason", "stopped", "taring", "experiment", "question", "plan", "experiments", "configured")
+        keys = ("ok", "reason", "stopped", "taring", "experiment", *QUESTION, "experiments", "configured")
         content = {key: reply[key] for key in keys if key in reply}
         return web.json_response(content, status=200 if reply.get("ok") else 409)
 

@@ -13,8 +13,10 @@ import yaml
 
 from shearloop.cli import command, main
 from shearloop.daemon import experiment_files
+from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles
+from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.rig import Rig
 from shearloop.errors import UserError
 from tests.fixtures.daemons import deadline
@@ -183,13 +185,36 @@ class Runner:
 
 
 def rig(folder: Path, runner: Runner) -> Rig:
-    return Rig(SimpleNamespace(), runner, {}, ExperimentFiles((folder,)), None)
+    return Rig(SimpleNamespace(warm_up_s=0.0, runs=1), runner, {}, ExperimentFiles((folder,)), None)
 
 
 async def test_no_file_is_read_while_none_can_start(folder, monkeypatch):
     monkeypatch.setattr(experiment_files, "read_file", lambda *_: pytest.fail("it is read"))
     path = write(folder / "one.yaml", VALID)
     assert await rig(folder, Runner("the experiment 'two' is still running")).start(path) is not None
+
+
+async def test_what_a_person_confirmed_is_what_starts(folder):
+    """The file is replaced between the question and its answer, by another or by what the question showed."""
+    runner, path = Runner(), write(folder / "one.yaml", VALID)
+    subject = rig(folder, runner)
+    start = Commands(subject, None, None, None, asyncio.Event()).handlers()["start"]
+    asked = await start({"experiment": str(path), "ask": True})
+    assert asked["question"].startswith("Start 'one'?")
+    before = path.read_bytes()
+    # The same name and the same sentences: only the bytes differ.
+    for other in (before + b"# faster\n", write(path, {**VALID, "name": "two"}).read_bytes()):
+        path.write_bytes(other)
+        with pytest.raises(CommandRefusedError, match="the file has changed since its plan was shown") as refused:
+            await start({"experiment": str(path), "digest": asked["digest"]})
+        assert refused.value.facts == await start({"experiment": str(path), "ask": True})
+    assert runner.started == []
+    await start({"experiment": str(path), "digest": refused.value.facts["digest"]})
+    path.write_bytes(before)
+    await start({"experiment": str(path), "digest": asked["digest"]})
+    # Who asks nothing names the file as it is.
+    await start({"experiment": str(path)})
+    assert [name for name, _ in runner.started] == ["two", "one", "one"]
 
 
 async def test_a_stop_while_the_file_is_read_counts_for_the_start(folder, slow_drive):

@@ -21,6 +21,8 @@ from shearloop.tools.commission.rig import Rig
 # With fewer stops of each layer a report raises no speed.
 STOPS_NEEDED: Final = 5
 _STOPS_WITHIN_S: Final = 5.0
+# A joint that has moved by more between a question and its answer makes another pose.
+_SAME_POSE_RAD: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +92,22 @@ class Context:
         return self._mover
 
     def confirm(self) -> Seen:
-        """Have the operator confirm the pose about which motions are allowed, once; return a sample of it."""
-        if self._confirmed is None:
+        """Have the operator confirm the pose about which motions are allowed, once; return a sample of it.
+
+        An arm that was moved between the question and the answer stands in a pose that nobody has confirmed: the
+        question comes again.
+        """
+        while self._confirmed is None:
             here = self.observer.latest()
             self.operator.act(
                 f"Wrist 3 stands at {here.wrist_rad:.3f} rad. Check that the arm stands free, that the tool may turn "
                 "by 0.1 rad either way and move 20 mm along its axis, and that no cable wraps about the wrist"
             )
-            self._confirmed = here
+            pairs = zip(here.outputs.q_rad, self.observer.latest().outputs.q_rad, strict=True)
+            if all(abs(now_rad - asked_rad) <= _SAME_POSE_RAD for asked_rad, now_rad in pairs):
+                self._confirmed = here
+            else:
+                self.operator.say("The arm has moved since the question; the pose is asked for again.")
         return self._confirmed
 
     @property

@@ -96,9 +96,10 @@ export class Controls {
     else this.tell(`STOP NOT CONFIRMED: ${reply.reason}. Use the emergency stop of the robot.`, "bad", true);
   }
 
-  // The daemon's question, which `confirm` answers; an empty one is taken away.
-  ask_about(name, question = "", plan = []) {
+  // The daemon's question, which `confirm` answers with its digest; an empty one is taken away.
+  ask_about(name, question = "", plan = [], digest = "") {
     this.asked = name;
+    this.digest = digest;
     put(byId("question-text"), question);
     put(byId("plan"), plan.join("\n"));
     show(byId("plan"), plan.length > 0);
@@ -107,24 +108,24 @@ export class Controls {
   }
 
   confirm() {
-    const name = this.asked;
+    const { asked: name, digest } = this;
     this.ask_about("");
-    if (name && !this.reasons[name]) this.command(name, true, this.picked);
+    if (name && !this.reasons[name]) this.command(name, digest, this.picked);
   }
 
-  // The confirmation starts the experiment of the question, even if another one is picked meanwhile.
-  async command(name, confirmed = false, picked = byId("experiment").value) {
+  // The confirmation starts the experiment of the question, even if another one is picked meanwhile. The digest says
+  // which content was shown: the daemon refuses another one, with its own question.
+  async command(name, digest = "", picked = byId("experiment").value) {
     this.ask_about("");
     this.picked = picked;
-    const words = [confirmed ? "confirmed" : "", name === "start" && picked ? `experiment=${encodeURIComponent(picked)}` : ""];
-    const query = `?${words.filter(Boolean).join("&")}`;
+    const words = new URLSearchParams();
+    if (digest) words.set("digest", digest);
+    if (name === "start" && picked) words.set("experiment", picked);
     this.tell(`${name} …`);
-    const reply = await this.ask(`commands/${name}${query}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
-    if (reply.ok && reply.question) {
-      this.tell("");
-      this.ask_about(name, reply.question, reply.plan);
-    } else if (reply.ok) this.tell(`${name}: done`);
-    else this.tell(`${name} was refused: ${reply.reason}`, "bad");
+    const reply = await this.ask(`commands/${name}?${words}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
+    if (!reply.ok) this.tell(`${name} was refused: ${reply.reason}`, "bad");
+    else this.tell(reply.question ? "" : `${name}: done`);
+    if (reply.question) this.ask_about(name, reply.question, reply.plan, reply.digest);
     // Ask again after a wrong token.
     if (reply.status === 403) this.keep("");
   }

@@ -17,6 +17,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile, first_mot
 from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.torques import WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
@@ -56,6 +57,26 @@ async def test_a_tool_is_released_after_any_stop_and_without_an_experiment(befal
         await cell.cycles(10)
         assert "its fingers hold something 30.0 mm wide, with an unknown force" in cell.control_loop.release_question()
         assert await released(cell) is None
+        assert cell.gripper.asked == ["open"]
+
+
+async def test_a_release_whose_question_has_changed_opens_nothing():
+    """The gripper closes on a tool between the question and its answer."""
+    async with with_gripper() as cell:
+        cell.holding = False
+        await cell.cycles(5)
+        rig = SimpleNamespace(runner=cell.runner, control_loop=cell.control_loop)
+        release = Commands(rig, None, None, None, asyncio.Event()).handlers()["release"]
+        asked = await release({"ask": True})
+        assert "it does not say that it holds something" in asked["question"]
+        cell.holding = True
+        await cell.cycles(5)
+        with pytest.raises(CommandRefusedError, match=r"changed since the question: .* hold something") as refused:
+            await release({"confirmed": True, "digest": asked["digest"]})
+        assert cell.gripper.asked == []
+        answered = asyncio.create_task(release({"confirmed": True, "digest": refused.value.facts["digest"]}))
+        await cell.cycles(10)
+        assert await answered == {}
         assert cell.gripper.asked == ["open"]
 
 

@@ -56,10 +56,13 @@ class FakeDaemon(Killable):
         self._folder = folder
         self.forget()
 
-    def say(self, *, refusal: str = "", **changed: Mapping[str, Any] | None) -> None:
-        """Say all messages from now on, with changes to some; None takes one out. Refuse commands where told so."""
+    def say(self, *, refusal: str = "", digest: str = "a", **changed: Mapping[str, Any] | None) -> None:
+        """Say all messages from now on, with changes to some; None takes one out. Refuse commands where told so.
+
+        `digest` is of the questions.
+        """
         new = self._folder / "changed.new"
-        new.write_text(json.dumps({"messages": changed, "refusal": refusal}))
+        new.write_text(json.dumps({"messages": changed, "refusal": refusal, "digest": digest}))
         new.rename(self._folder / "changed")
 
     @property

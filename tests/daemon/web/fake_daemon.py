@@ -106,18 +106,21 @@ def pump(folder: Path) -> None:
 
 
 async def serve(folder: Path) -> None:
-    """Accept every command, or refuse it with the sentence that stands in the file."""
+    """Accept every command, or refuse it with the sentence that stands in the file, or for another digest."""
 
     def handler(name: str) -> Callable[[Mapping[str, Any]], Any]:
         async def handle(request: Mapping[str, Any]) -> dict[str, Any]:
+            told = json.loads((folder / "changed").read_text())
+            plan = {"plan": PLAN} if name == "start" else {}
+            question = {"question": f"Really {name}? The first motion is told.", "digest": told["digest"], **plan}
             if request.get("ask"):
-                plan = {"plan": PLAN} if name == "start" else {}
-                return {"question": f"Really {name}? The first motion is told.", **plan}
+                return question
+            if name in ("start", "release") and request.get("digest") != told["digest"]:
+                raise CommandRefusedError("the file has changed", **question)
             with (folder / "asked").open("a") as asked:
                 asked.write(" ".join(filter(None, (name, Path(request.get("experiment", "")).stem))) + "\n")
-            refusal = json.loads((folder / "changed").read_text())["refusal"]
-            if refusal:
-                raise CommandRefusedError(refusal)
+            if told["refusal"]:
+                raise CommandRefusedError(told["refusal"])
             return {"stopped": "hold 0.10 N·m"} if name == "stop" else {}
 
         return handle

@@ -148,6 +148,23 @@ def test_the_picked_experiment_shows_its_plan_and_is_the_one_that_starts(browsed
     assert not page.is_visible("#plan")
 
 
+@pytest.mark.parametrize("name", ["start", "release"])
+def test_what_has_changed_since_the_question_is_asked_again(name, browsed):
+    page = browsed.open(token=True)
+    browsed.daemon.say(loop={"phase": "idle"})
+    page.wait_for_selector("#experiment:visible")
+    page.click(f"[data-command={name}]:enabled")
+    browsed.until("#question-text", f"Really {name}?")
+    browsed.daemon.say(loop={"phase": "idle"}, digest="b")
+    page.click("#confirm")
+    browsed.until("#answer", f"{name} was refused: the file has changed")
+    browsed.until("#question-text", f"Really {name}?")
+    assert browsed.daemon.asked == [], "nothing has moved"
+    page.click("#confirm")
+    browsed.until("#answer", f"{name}: done")
+    assert len(browsed.daemon.asked) == 1
+
+
 def test_a_refusal_goes_after_some_seconds(browsed):
     page = browsed.open(token=True)
     browsed.daemon.say(loop={"phase": "running"}, refusal="no experiment is running")

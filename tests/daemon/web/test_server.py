@@ -134,6 +134,35 @@ async def test_motion_needs_the_token_and_stop_does_not(tmp_path):
         assert page.asked == ["stop", "start", "pause"]
 
 
+async def test_a_confirmation_is_the_digest_of_a_question(tmp_path):
+    requests: list[Mapping[str, Any]] = []
+
+    async def hear(request: Mapping[str, Any]) -> dict[str, Any]:
+        requests.append({key: value for key, value in request.items() if key not in ("command", "by")})
+        if request.get("digest") == "old":
+            raise CommandRefusedError("the file has changed", question="Start?", digest="new", plan=["one"])
+        return {}
+
+    async with served(tmp_path, start=hear, release=hear, unlock=hear) as page:
+        for words in ("confirmed", "confirmed=false", "digest=a&confirmed=0"):
+            for name in ("start", "release", "unlock"):
+                status, reply = await post(page, f"/commands/{name}?{words}", **BEARER)
+                assert (status, reply["ok"]) == (400, False), words
+        assert requests == []
+        for path in ("start?experiment=a+b.yaml&digest=", "start?digest=d&experiment=x", "release", "release?digest=d"):
+            assert (await post(page, f"/commands/{path}", **BEARER))[0] == 200
+        assert requests == [
+            {"experiment": "a b.yaml", "ask": True},
+            {"digest": "d", "experiment": "x"},
+            {"ask": True},
+            {"digest": "d", "confirmed": True},
+        ]
+        assert await post(page, "/commands/start?digest=old", **BEARER) == (
+            409,
+            {"ok": False, "reason": "the file has changed", "question": "Start?", "plan": ["one"], "digest": "new"},
+        )
+
+
 async def test_wrong_tokens_are_soon_refused_unread_and_seldom_logged(tmp_path, log):
     async with served(tmp_path) as page:
         statuses = [(await post(page, "/commands/start", Authorization="Bearer wrong"))[0] for _ in range(200)]

@@ -1,8 +1,12 @@
 """The questions to the person at the robot: a word allows, another one never does."""
 
+from contextlib import ExitStack, nullcontext
+from types import SimpleNamespace
+
 import pytest
 
 from shearloop.errors import UserError
+from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.operator import DONE, WORD, DeclinedError, Operator, Played
 
 QUESTIONS = {WORD: Operator.allow, DONE: Operator.act}
@@ -53,3 +57,26 @@ def test_a_choice_is_asked_for_again_until_it_is_one_of_the_words():
     operator, _ = answering(["3", "yes", "no"])
     with pytest.raises(UserError, match="neither clockwise nor counterclockwise was given"):
         operator.choose("Which way:", ("clockwise", "counterclockwise"))
+
+
+def test_a_pose_that_changes_while_it_is_asked_for_is_asked_for_again():
+    """Who types the word has looked at one pose, and the motions are about that one."""
+    stands_rad = [0.3]
+    jogs_to = [0.5, 0.5]
+    asked: list[str] = []
+
+    def answer(question: str) -> str:
+        asked.append(question)
+        stands_rad[0] = jogs_to.pop(0)
+        return DONE
+
+    def latest() -> SimpleNamespace:
+        return SimpleNamespace(wrist_rad=stands_rad[0], outputs=SimpleNamespace(q_rad=(0.0, stands_rad[0])))
+
+    rig = SimpleNamespace(observer=lambda _: nullcontext(SimpleNamespace(latest=latest)))
+    operator, controller = Operator(answer, lambda _: None), SimpleNamespace(registers=None)
+    context = Context(None, None, rig, controller, operator, None, Counts(), ExitStack())
+    assert context.pose_rad == 0.5
+    assert ["stands at 0.300" in asked[0], "stands at 0.500" in asked[1]] == [True, True]
+    assert context.pose_rad == 0.5
+    assert len(asked) == 2, "a confirmed pose is asked for once"

@@ -14,6 +14,7 @@ import structlog
 from pydantic import ConfigDict
 
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCell
@@ -39,9 +40,11 @@ class Remembered:
     running: str = ""
     # Code and detail of each fault of the stop that waits for the operator.
     stop: tuple[tuple[str, str], ...] = ()
-    # The wrist's angle at the grip, and the largest force of the fingers.
+    # The grip, as `Grip` has it.
     origin_rad: float | None = None
     force_n: float | None = None
+    width_mm: float | None = None
+    requested_counts: int | None = None
     # The load cell's zero in this grip, in the board's unit, and the torque of one unit, which names its calibration:
     # with a tool in the fingers nobody can take another zero.
     load_zero: float | None = None
@@ -54,9 +57,9 @@ class Remembered:
         """Return the present state of a control loop."""
         running = loop.running.file.name if loop.running is not None else ""
         stop = tuple((fault.code.name, fault.detail) for fault in loop.safety.stop_faults)
-        return cls(running, stop, *loop.grip)
+        return cls(running, stop, **asdict(loop.grip))
 
-    def restore(self, loop: ControlLoop) -> None:
+    def restore(self, loop: ControlLoop, on_judged: OnJudged = lambda _: None) -> None:
         """Give the stored state to a new control loop; a restored stop keeps the grip, even if it had opened it."""
         for name, detail in self.stop:
             known = name in FaultCode.__members__
@@ -64,7 +67,9 @@ class Remembered:
         if self.running:
             ended = f"it was killed, it crashed or the power failed while {self.running!r} was under way"
             loop.safety.stop(Fault(FaultCode.DAEMON_ENDED, ended))
-        loop.restore_grip(self.origin_rad, self.force_n)
+        grip = Grip(self.origin_rad, self.force_n, self.width_mm, self.requested_counts)
+        if grip != NO_GRIP or self.load_zero is not None or self.wrench_zero is not None:
+            loop.restore_grip(grip, on_judged)
 
 
 @dataclass(slots=True)
@@ -83,21 +88,48 @@ class RigMemory:
     starting: str = ""
     # None: the files have to be written, whatever the state.
     _written: Remembered | None = None
+    # The load cell's zero by its calibration, and whether the wrench has the zero of the grip before.
+    _calibrated_zero: float | None = None
+    _wrench_restored: bool = False
     _writing: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
         """Restore what the last daemon of this robot has left."""
         remembered = read_memories(self.files)
-        remembered.restore(self.loop)
+        remembered.restore(self.loop, self._on_judged)
         if len(self.files.states) == 1 and not any(path.exists() for path in self.files.other_states):
             self._written = remembered
+        # Until the gripper answers, its grip counts as the one before.
         cell, zero = self.load_cell, remembered.load_zero
         if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:
-            structlog.get_logger().info("the load cell keeps the zero of the present grip")
+            self._calibrated_zero = cell.calibration.tare_counts
             cell.tare(zero)
         if self.robot is not None and remembered.wrench_zero is not None:
-            structlog.get_logger().info("the wrench keeps the zero of the present grip")
+            self._wrench_restored = True
             self.robot.restore_wrench_zero(remembered.wrench_zero)
+
+    def _on_judged(self, why_another: str) -> None:
+        """Keep the zeros of the grip before, or take them back where the gripper does not have that grip any more."""
+        zeros = [
+            name
+            for name, restored in (("load cell", self._calibrated_zero is not None), ("wrench", self._wrench_restored))
+            if restored
+        ]
+        log = structlog.get_logger()
+        if not why_another:
+            if zeros:
+                log.info("the zeros of the present grip are kept", of=zeros)
+            return
+        log.warning(
+            "the gripper does not have the grip of the last daemon, whose angle, force and zeros are not used",
+            reason=why_another,
+            zeros=zeros,
+            cure="look what it holds; `shearloop command release --yes` opens it, and then `shearloop command tare`",
+        )
+        if self.load_cell is not None and self._calibrated_zero is not None:
+            self.load_cell.tare(self._calibrated_zero)
+        if self.robot is not None and self._wrench_restored:
+            self.robot.forget_wrench_zero()
 
     async def run(self) -> None:
         """Write every change until cancelled."""

@@ -22,6 +22,7 @@ from shearloop.daemon.control.experiment_schema import (
     first_motion_before_grip,
 )
 from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
+from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
 from shearloop.daemon.control.torque_controller import WristCommand
@@ -63,12 +64,11 @@ class LoopStatus:
 class _GrippedTool:
     """What the loop knows of the tool between the fingers."""
 
-    # The wrist's angle at the grip.
-    origin_rad: float | None = None
+    grip: Grip = NO_GRIP
+    # Why the object is of another grip than the last one that was known.
+    another: str = ""
     # When the latest grip, release or tare ended, until each torque has been measured since, or should have been.
     unmeasured_since_ns: int | None = None
-    # The largest force of the fingers at the grip.
-    force_n: float | None = None
     # Whether a tool should be between the fingers.
     expected: bool = False
     # A stop has opened the gripper, or why it did not open, until the operator acknowledges it.
@@ -120,6 +120,8 @@ class ControlLoop:
         self._gripped = _GrippedTool()
         # The causes of the latest stop, once it is acknowledged, until the next start.
         self._acknowledged = ""
+        # Awaits the gripper's first state that shows whether a grip of an earlier process is the present one.
+        self._on_judged: OnJudged | None = None
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
 
@@ -155,9 +157,22 @@ class ControlLoop:
         known = self.inputs.gripper
         if known is None or gripper.t_ns >= known.t_ns:
             self.inputs.gripper = gripper
-            if self.running is None and not (gripper.holding or gripper.moving or gripper.uncertain):
-                # Nothing is between the fingers: the next grip has an angle of its own.
-                self._gripped.origin_rad = self._gripped.force_n = None
+            if self.running is None:
+                self._judge_grip(gripper)
+            if self._on_judged is None:
+                self._gripped.grip = self._gripped.grip.followed(gripper)
+
+    def _judge_grip(self, gripper: GripperStatus) -> None:
+        """Forget a grip that the gripper does not have at present: the next one has an angle of its own."""
+        gripped, judged = self._gripped, self._on_judged
+        why = gripped.grip.why_another(gripper)
+        if judged is not None and not gripper.moving:
+            self._on_judged = None
+            judged(why)
+        if why and (gripped.grip.known or judged is not None):
+            gripped.grip, gripped.another = NO_GRIP, why
+        if not (gripper.holding or gripper.moving):
+            gripped.another = ""
 
     def on_link(self, device: str, sentence: str, *, up: bool) -> None:
         """Take the return or the loss of a device, with a sentence."""
@@ -193,8 +208,8 @@ class ControlLoop:
         gripped.unmeasured_since_ns = arm.t_ns if arm is not None else None
         if isinstance(action, GripStep):
             gripper = self.inputs.gripper
-            gripped.origin_rad = arm.wrist_rad if arm is not None else None
-            gripped.force_n = action.force_n
+            origin_rad = arm.wrist_rad if arm is not None else None
+            gripped.grip = replace(gripped.grip, origin_rad=origin_rad, force_n=action.force_n)
             # An unexpected object is watched as well.
             gripped.expected = action.expect_object or (gripper is not None and gripper.holding)
 
@@ -202,21 +217,21 @@ class ControlLoop:
         """Take the end of the release after a stop, and why the gripper did not open, if it did not."""
         self._gripped.release_error = error
         if error is None:
-            self._gripped.origin_rad = self._gripped.force_n = None
+            self._gripped.grip = NO_GRIP
 
     @property
-    def grip(self) -> tuple[float | None, float | None]:
-        """The wrist's angle in rad at the present grip, and its largest force in N; None for an unknown value."""
-        return self._gripped.origin_rad, self._gripped.force_n
+    def grip(self) -> Grip:
+        """What is known of the present grip."""
+        return self._gripped.grip
 
-    def restore_grip(self, origin_rad: float | None, force_n: float | None) -> None:
-        """Take the angle and the force of a grip that a process before this one has closed."""
-        self._gripped.origin_rad, self._gripped.force_n = origin_rad, force_n
+    def restore_grip(self, grip: Grip, on_judged: OnJudged) -> None:
+        """Take the grip that a process before this one has closed, until the gripper shows whether it still has it."""
+        self._gripped.grip, self._on_judged = grip, on_judged
 
     @property
     def held(self) -> str | None:
         """The object between the fingers, with its width and the force of the grip, or None."""
-        gripper, force_n = self.inputs.gripper, self._gripped.force_n
+        gripper, force_n = self.inputs.gripper, self._gripped.grip.force_n
         if "gripper" not in self._watched.required or gripper is None or not gripper.holding:
             return None
         force = f"with at most {force_n:g} N" if force_n is not None else "with an unknown force"
@@ -225,7 +240,7 @@ class ControlLoop:
     @property
     def may_still_hold(self) -> str | None:
         """The object between the fingers, or why a tool that was gripped may still be there; None without one."""
-        if self.held is not None or self._gripped.force_n is None:
+        if self.held is not None or self._gripped.grip.force_n is None:
             return self.held
         return self._why_uncertain()
 
@@ -235,7 +250,7 @@ class ControlLoop:
             return False
         gripper = self.inputs.gripper
         if gripper is None:
-            return self._gripped.force_n is not None
+            return self._gripped.grip.force_n is not None
         return gripper.holding or gripper.moving or gripper.uncertain
 
     def release_refusal(self) -> str | None:
@@ -340,6 +355,10 @@ class ControlLoop:
         speeds = Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
         self.experiment, self._watched = Experiment(file, t_ns, speeds), watched
         self.wrist = self._wrists[file.torque_source]
+        if self._on_judged is not None:
+            # No state of the gripper has shown it, and the experiment may grip anew.
+            self._on_judged("an experiment began while its fingers moved")
+            self._on_judged = None
         # What the last experiment knew of the tool may be wrong by now.
         self.wrist.reset()
         # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
@@ -349,8 +368,8 @@ class ControlLoop:
         # The angle since the grip belongs to the grip: a tool that is still held keeps it.
         still_held = gripper is not None and gripper.holding
         self._gripped = _GrippedTool(
-            origin_rad=before.origin_rad if still_held else None,
-            force_n=before.force_n if still_held else None,
+            grip=before.grip if still_held else NO_GRIP,
+            another=before.another,
             unmeasured_since_ns=t_ns,
             expected=expected,
             release_error=before.release_error,
@@ -397,7 +416,7 @@ class ControlLoop:
         if self.experiment is not None:
             watched = replace(watched, limits=self.experiment.limits)
         if running is not None:
-            command, controller = running.command, self.wrist.controller
+            command, controller, origin_rad = running.command, self.wrist.controller, gripped.grip.origin_rad
             grasp = Grasp.HELD if gripped.expected else Grasp.NONE
             grasp = Grasp.CHANGING if isinstance(command.action, GripStep) else grasp
             needed = grasp is Grasp.HELD and _turns(command) and not self._awaited_torques(running, t_ns)
@@ -405,7 +424,7 @@ class ControlLoop:
                 watched,
                 grasp=grasp,
                 torque_needed=needed and running.phase is ExperimentPhase.RUNNING,
-                twisted_rad=0.0 if arm is None or gripped.origin_rad is None else arm.wrist_rad - gripped.origin_rad,
+                twisted_rad=0.0 if arm is None or origin_rad is None else arm.wrist_rad - origin_rad,
                 expected_nm=controller.torque_nm if controller is not None else None,
                 overdue=running.overdue,
             )
@@ -418,6 +437,8 @@ class ControlLoop:
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
             if self.safety.stopped and self.held is not None:
                 found.append(Fault(FaultCode.TOOL_GRIPPED, self.held))
+            if gripped.another:
+                found.append(Fault(FaultCode.GRIP_UNKNOWN, gripped.another))
             if arm is not None and arm.enabled_by_start:
                 found = [fault for fault in found if fault.code is not FaultCode.ROBOT_BLOCKED]
             return self._ended(self.safety.report(found))
@@ -442,7 +463,8 @@ class ControlLoop:
     def _run_step(self, experiment: Experiment, decision: SafetyDecision, wrist_rad: float, t_ns: int) -> ControlOutput:
         """Let the experiment choose its command, and the wrist's controller a speed."""
         wrist, gripped, held = self.wrist, self._gripped, decision.response is Response.HOLD
-        origin_rad = gripped.origin_rad = wrist_rad if gripped.origin_rad is None else gripped.origin_rad
+        origin_rad = wrist_rad if gripped.grip.origin_rad is None else gripped.grip.origin_rad
+        gripped.grip = replace(gripped.grip, origin_rad=origin_rad)
         latest = self.inputs.torques.get(experiment.file.torque_source)
         torque_nm = latest.torque_nm if latest is not None and not held else None
         stands = held or self._awaited_torques(experiment, t_ns) is not None
@@ -466,7 +488,8 @@ class ControlLoop:
             return self._ended(self.safety.report(decision.faults))
         if isinstance(action, GripStep):
             # A process that dies while the fingers close leaves this force behind.
-            gripped.force_n = max(gripped.force_n or 0.0, action.force_n)
+            force_n = max(gripped.grip.force_n or 0.0, action.force_n)
+            gripped.grip, gripped.another = Grip(origin_rad, force_n), ""
         if isinstance(action, IdentifyStep):
             wrist.begin_identification(action, limit_nm)
             action = None

@@ -165,4 +165,5 @@ def status_of(state: GripperState) -> GripperStatus:
         # The gripper detects objects only on its way to a target (gGTO) and there. A reset or a loss of power leaves
         # the fingers where they are, possibly on a tool.
         uncertain=state.object is ObjectStatus.UNKNOWN,
+        requested_counts=state.requested_counts,
     )

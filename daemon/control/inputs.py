@@ -31,7 +31,7 @@ class GripperStatus:
     """State of the gripper, as far as the loop needs it.
 
     `uncertain`: the gripper cannot say whether it holds an object, because it is inactive, lost its power, or was
-    stopped on its way.
+    stopped on its way. `requested_counts`: the position that it was last asked for, by anybody.
     """
 
     t_ns: int
@@ -40,6 +40,7 @@ class GripperStatus:
     moving: bool
     fault: str = ""
     uncertain: bool = False
+    requested_counts: int | None = None
 
 
 @dataclass(slots=True)

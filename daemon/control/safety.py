@@ -206,6 +206,12 @@ class FaultCode(Enum):
         "the gripper still holds something: {detail}.",
         "Secure it. Then `shearloop command release --yes` opens the gripper, and the object drops.",
     )
+    GRIP_UNKNOWN = Rule(
+        Response.NOTE,
+        "the gripper holds something else than in the last grip that is known: {detail}.",
+        "Angle, force and zeros of that grip are not used. Look what it holds; `shearloop command release --yes` opens "
+        "the gripper, and the object drops.",
+    )
     DAEMON_ENDED = Rule(
         _KEEP, "the daemon ended: {detail}.", "Look at the rig, then `shearloop command unlock` allows the next start."
     )

@@ -421,6 +421,7 @@ class RobotiqGripper:
             activation=readout.sta,
             current_ma=None if readout.current is None else readout.current * messages.MA_PER_COUNT,
             fault=messages.fault_of(readout.flt),
+            requested_counts=readout.pre,
         )
         self._seq += 1
         return state

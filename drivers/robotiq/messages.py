@@ -131,7 +131,7 @@ class GripperState:
     """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were requested).
 
     width_mm ± width_std_mm is the width between the fingertips. `object` is MOVING until the gripper has taken up the
-    last command.
+    last command. `requested_counts` is the position that it was last asked for, by anybody.
     """
 
     t_ns: int
@@ -142,6 +142,7 @@ class GripperState:
     activation: ActivationStatus
     current_ma: float | None
     fault: GripperFault
+    requested_counts: int | None = None
 
     @property
     def moves(self) -> bool:

@@ -86,6 +86,7 @@ class UrRobot:
         self.holds: Callable[[], bool] = lambda: False
         self._told_held = False
         self._wrench_zero: Six = (0.0,) * 6
+        self._restored_zero: Six = (0.0,) * 6
         self._connection: WorkerConnection | None = None
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
@@ -100,7 +101,16 @@ class UrRobot:
 
     def restore_wrench_zero(self, zero: Six) -> None:
         """Take the zero of a process before this one, before the worker starts."""
-        self._wrench_zero = zero
+        self._wrench_zero = self._restored_zero = zero
+
+    def forget_wrench_zero(self) -> None:
+        """Take the restored zero back, as if there had been none: what is held is not what it was measured with."""
+        pairs = zip(self._wrench_zero, self._restored_zero, strict=True)
+        zero = cast(Six, tuple(now - restored for now, restored in pairs))
+        self._wrench_zero, self._restored_zero = zero, (0.0,) * 6
+        if self._connection is not None:
+            self._told_held = self.holds()
+            self._connection.send(messages.Held(self._told_held, zero))
 
     def diagnostics(self) -> Diagnostics:
         """Return the robot's values for `health`; counts are since the process began."""

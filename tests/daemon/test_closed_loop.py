@@ -19,6 +19,9 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.run_summary import RunSummary
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.messages import GripperCommand
+from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.errors import UserError
 from tests.emulator_process import own_address
 from tests.fixtures.daemons import ask, robot_at, running_daemon, shearloop
@@ -352,6 +355,33 @@ async def test_after_a_kill_with_a_gripped_tool_nothing_moves_and_start_waits_fo
             assert "while 'test' was under way" in (await command("start"))["reason"]
             assert (await command("unlock"))["ok"]
             await nothing_moves(watcher, rig, still)
+
+
+async def exchange_tool(rig: asyncio.subprocess.Process, width_mm: float) -> None:
+    """Open the gripper, put another object between its fingers, and close them, as the pendant does."""
+    hand = RobotiqGripper(SocketClient(HOST), WidthCalibration.nominal())
+    await hand.connect()
+    await hand.finish(await hand.move(GripperCommand(140.0)))
+    rig.stdin.write(f"gripper object {width_mm}\n".encode())
+    state = await hand.finish(await hand.move(GripperCommand(0.0)))
+    assert state.diameter_mm == pytest.approx(width_mm, abs=1.0)
+    await hand.close()
+
+
+async def test_a_tool_that_is_exchanged_while_no_daemon_runs_has_no_force_and_no_angle(rig_config, tiny_bank):
+    content = {**yaml.safe_load(rig_config.read_text()), "experiment": "experiment.yaml"}
+    rig_config.write_text(yaml.safe_dump(content))
+    async with emulated_rig(rig_config.parent, tiny_bank) as rig:
+        async with twisting_process(rig_config, rig) as killed:
+            killed.kill()
+            await killed.wait()
+        await standing(rig)
+        await exchange_tool(rig, 40.0)
+        async with running_daemon(rig_config) as daemon:
+            watcher = Watcher(daemon)
+            state = await watcher.until("loop.state", lambda state: FaultCode.GRIP_UNKNOWN.text in state["faults"])
+            assert "mm wide, with an unknown force" in state["reasons"]
+            assert daemon.rig.control_loop.grip.origin_rad is None
 
 
 async def test_a_daemon_of_another_user_that_gets_the_arm_after_a_kill_moves_nothing(

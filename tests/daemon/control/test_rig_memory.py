@@ -2,18 +2,32 @@
 
 import asyncio
 import json
+from collections.abc import Iterator, MutableMapping
+from dataclasses import asdict, replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from structlog.testing import capture_logs
 
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.grip import FOLLOWED_MM, SAME_WIDTH_MM, Grip
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memory, write_memory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
-from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, started, stop
+from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS
+
+
+@pytest.fixture
+def logged() -> Iterator[list[MutableMapping[str, Any]]]:
+    """The lines of the log."""
+    with capture_logs() as lines:
+        yield lines
+
 
 WAIT = {"do": "wait", "wait_s": 60}
 # Its file is in the state folder of each test.
@@ -92,14 +106,142 @@ def test_the_angle_of_a_grip_is_remembered_and_forgotten_with_the_grip():
     rig.run(5)
     gripped_rad = rig.wrist_rad
     after = after_restart(rig)
-    assert after.control_loop.grip == (pytest.approx(gripped_rad), 60.0)
+    assert after.control_loop.grip == Grip(pytest.approx(gripped_rad), 60.0, 30.0)
     after.force_n = 0.0
     after.run(0.1)
-    assert after.control_loop.grip == (None, None)
+    assert not after.control_loop.grip.known
 
 
 def load_cell(scale_n_per_count: float = 0.001) -> LoadCell:
     return LoadCell(SimpleNamespace(), LoadCalibration(tare_counts=8000.0, scale_n_per_count=scale_n_per_count))
+
+
+class Restarted:
+    """A rig whose daemon ended with a tool of 30 mm gripped at 60 N, and began again; the gripper is not heard yet."""
+
+    WRENCH_ZERO = (0.0, 1.0, 0.0, 0.0, 0.0, -0.11)
+
+    def __init__(self, before: Rig) -> None:
+        grip = before.control_loop.grip
+        state = Remembered(load_zero=8321.5, load_nm_per_count=load_cell().calibration.nm_per_count)
+        write_memory(FILES.states[0], replace(state, **asdict(grip), wrench_zero=self.WRENCH_ZERO))
+        self.rig = after = Rig(new_loop())
+        self.cell, self.robot = load_cell(), UrRobot(SETTINGS)
+        self.memory = RigMemory(FILES, after.control_loop, self.cell, self.robot)
+        after.wrist_rad, after.force_n, after.width_mm = before.wrist_rad, before.force_n, before.width_mm
+        after.hand = before.hand
+
+    @property
+    def zeros(self) -> tuple[float, float]:
+        """Of the load cell in counts, and of the wrench about the wrist in N·m."""
+        return self.cell.calibration.tare_counts, self.robot.wrench_zero[5]
+
+    @property
+    def told(self) -> str:
+        return " ".join(self.rig.control_loop.status.decision.reasons)
+
+
+KEPT, TAKEN_BACK = (8321.5, -0.11), (8000.0, 0.0)
+
+
+@pytest.fixture
+def restarted() -> Restarted:
+    before = Rig(new_loop())
+    before.hand = replace(before.hand, requested_counts=183)
+    started(before, GRIP, {"do": "wait", "wait_s": 0.1})
+    before.run(5)
+    return Restarted(before)
+
+
+def exchange(rig: Rig, how: str) -> None:
+    """Change what the gripper has, as the pendant does while no daemon runs."""
+    match how:
+        case "another width":
+            rig.width_mm = 40.1
+        case "another request":
+            rig.hand = replace(rig.hand, requested_counts=255)
+        case "nothing held":
+            rig.force_n = 0.0
+        case "activated again":
+            rig.force_n, rig.width_mm = 0.0, 140.0
+            rig.hand = replace(rig.hand, uncertain=True, requested_counts=0)
+
+
+@pytest.mark.parametrize("how", ["another width", "another request", "nothing held", "activated again"])
+def test_a_grip_that_changed_while_no_daemon_ran_is_one_that_nobody_knows(how, restarted, logged):
+    rig = restarted.rig
+    exchange(rig, how)
+    assert restarted.zeros == KEPT, "until the gripper answers, nobody knows of another grip"
+    rig.run(0.1)
+    assert not rig.control_loop.grip.known
+    assert restarted.zeros == TAKEN_BACK
+    (warning,) = (line for line in logged if line["log_level"] == "warning")
+    assert "does not have the grip of the last daemon" in warning["event"]
+    if rig.force_n:
+        assert "with an unknown force" in rig.control_loop.release_question()
+        assert FaultCode.GRIP_UNKNOWN.value.kind in restarted.told
+    else:
+        assert FaultCode.GRIP_UNKNOWN.value.kind not in restarted.told
+
+
+def test_a_twist_of_a_tool_that_was_exchanged_begins_where_the_wrist_is(restarted):
+    rig = restarted.rig
+    rig.wrist_rad += 0.2
+    exchange(rig, "another width")
+    rig.run(0.1)
+    started(rig, {"do": "twist", "angles_rad": [0.1], "hold_s": 0.1, "return_to_start": False})
+    was_rad = rig.wrist_rad
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE
+    assert rig.wrist_rad == pytest.approx(was_rad + 0.1, abs=0.01)
+
+
+def test_a_wrist_that_was_turned_by_hand_keeps_the_angle_of_its_grip(restarted):
+    rig, gripped_rad = restarted.rig, restarted.rig.control_loop.grip.origin_rad
+    rig.wrist_rad += 0.2
+    rig.run(0.1)
+    assert rig.control_loop.grip.origin_rad == gripped_rad
+    assert restarted.zeros == KEPT
+
+
+def test_fingers_that_move_at_the_restart_are_judged_once_they_stand(restarted):
+    rig = restarted.rig
+    exchange(rig, "another request")
+    rig.force_n = 0.0
+    rig.hand = replace(rig.hand, moving=True)
+    rig.run(0.1)
+    assert restarted.zeros == KEPT
+    rig.force_n = 60.0
+    rig.hand = replace(rig.hand, moving=False)
+    rig.run(0.1)
+    assert restarted.zeros == TAKEN_BACK
+
+
+def test_a_soft_tool_that_gives_way_slowly_is_the_same(restarted):
+    rig = restarted.rig
+    rig.width_mm -= SAME_WIDTH_MM - 0.1
+    rig.run(0.1)
+    assert (restarted.zeros, rig.control_loop.grip.force_n) == (KEPT, 60.0)
+    for _ in range(10):
+        rig.width_mm -= FOLLOWED_MM + 0.1
+        rig.run(0.1)
+    assert rig.control_loop.grip.force_n == 60.0
+    assert rig.control_loop.grip.width_mm == rig.width_mm
+
+
+def test_a_tool_that_was_exchanged_while_the_gripper_was_away_is_another_one(restarted):
+    rig = restarted.rig
+    rig.run(0.1)
+    rig.silent.add("hand")
+    rig.run(1)
+    exchange(rig, "another width")
+    rig.silent.clear()
+    rig.run(0.1)
+    assert not rig.control_loop.grip.known
+    assert FaultCode.GRIP_UNKNOWN.value.kind in restarted.told
+    rig.force_n = 0.0
+    rig.run(0.1)
+    assert FaultCode.GRIP_UNKNOWN.value.kind not in restarted.told
 
 
 async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_one():

@@ -3,6 +3,7 @@
 import asyncio
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -123,17 +124,23 @@ async def test_worker_lost_during_shutdown_is_not_restarted(play, monkeypatch):
     assert len(listened) == 1
 
 
-async def test_a_worker_is_told_what_is_held_at_its_start_and_at_each_change(play, monkeypatch):
-    play("exec cat")
-    told: list[Held] = []
+@pytest.fixture
+def told(monkeypatch) -> list[Held]:
+    """What a worker is told of what is held."""
+    messages: list[Held] = []
     send = WorkerConnection.send
 
     def note(connection: WorkerConnection, message: object, number: int = 0) -> None:
         if isinstance(message, Held):
-            told.append(message)
+            messages.append(message)
         send(connection, message, number)
 
     monkeypatch.setattr(WorkerConnection, "send", note)
+    return messages
+
+
+async def test_a_worker_is_told_what_is_held_at_its_start_and_at_each_change(play, told):
+    play("exec cat")
     zero, holds = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5), [True]
     robot = UrRobot(settings_for("127.0.0.254"))
     robot.restore_wrench_zero(zero)
@@ -147,3 +154,18 @@ async def test_a_worker_is_told_what_is_held_at_its_start_and_at_each_change(pla
             robot.handle_message(0, bench.state)
             await asyncio.sleep(0)
     assert told == [Held(held=True, wrench_zero=zero), Held(held=False), Held(held=True)]
+
+
+async def test_a_restored_zero_that_is_taken_back_leaves_what_the_program_has_added(play, told):
+    play("exec cat")
+    robot = UrRobot(settings_for("127.0.0.254"))
+    robot.restore_wrench_zero((0.0, 0.0, 0.0, 0.0, 0.0, 0.5))
+    robot.holds = lambda: True
+    async with tasks.running(robot.run()):
+        while not told:  # noqa: ASYNC110 - the worker's start is no event
+            await asyncio.sleep(0)
+        # The start of its program made it another one.
+        robot.handle_message(0, replace(HandlerBench().state, wrench_zero=(0.0, 0.0, 0.0, 0.0, 0.0, 0.75)))
+        robot.forget_wrench_zero()
+    assert robot.wrench_zero == (0.0, 0.0, 0.0, 0.0, 0.0, 0.25)
+    assert told[-1] == Held(held=True, wrench_zero=robot.wrench_zero)

@@ -20,7 +20,7 @@ from benchmarks.common import parser_of, table_head, table_row, write_figures
 from benchmarks.estimator_accuracy import FINGERTIPS, STREAMS
 from shearloop.bank.arrays import BoolArray
 from shearloop.bank.errors import BankError
-from shearloop.estimation import Calibration, FrameSeries, Session, TactileFrame, fit, measure_timing
+from shearloop.estimation import Calibration, FrameSeries, Session, fit, measure_timing
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import DEFAULT
 from shearloop.estimation.load_delay import TRUSTED
@@ -119,8 +119,8 @@ def strengths(calibration: Calibration, series: FrameSeries, valid: BoolArray) -
     """Return each fingertip's strength over the `valid` frames (n,), one of them at least."""
     session = Session(calibration)
     ratios: list[list[float]] = []
-    for t_s, channels, counts in zip(series.t_s.tolist(), series.channels, valid.tolist(), strict=True):
-        session.estimate(TactileFrame.of(t_s, channels))
+    for frame, counts in zip(series.frames(), valid.tolist(), strict=True):
+        session.estimate(frame)
         if counts:
             ratios.append([session.grip_strengths[side] for side in calibration.sides])
     return [Strength(*map(float, (np.median(one), min(one), max(one)))) for one in zip(*ratios, strict=True)]

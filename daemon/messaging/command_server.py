@@ -16,6 +16,7 @@ import zmq.asyncio
 
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.keys import KeyPair
+from shearloop.daemon.messaging.late_requests import LateRequests
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 
@@ -25,6 +26,8 @@ LARGEST_REQUEST_BYTES = 4096
 MAX_WAITING = 16
 MAX_CONCURRENT = 16
 STOP, STATUS = "stop", "status"
+# The event loop is asked at this interval whether it runs.
+ALIVE_S = 0.2
 
 # A person, a script and a polling page stay far below these limits. A client in an endless loop does not.
 CLIENT_BURST, CLIENT_PER_S = 20.0, 10.0
@@ -75,8 +78,13 @@ class RequestExecutor:
         self._limit = RateLimit()
         self._running = 0
 
-    def check(self, client: bytes, frames: list[bytes], t_ns: int) -> tuple[str, Request] | Reply:
-        """Return the name and content of a valid request, or the refusal; t_ns is the monotonic time."""
+    def check(
+        self, client: bytes, frames: list[bytes], t_ns: int, why_late: str | None = None
+    ) -> tuple[str, Request] | Reply:
+        """Return the name and content of a valid request, or the refusal; t_ns is the monotonic time.
+
+        `why_late` says that it may be too old to be carried out: `stop` and `status` are never too old.
+        """
         request, problem = {}, ""
         try:
             (frame,) = frames
@@ -94,6 +102,8 @@ class RequestExecutor:
         if not isinstance(name, str) or name not in self._handlers:
             known, shown = ", ".join(sorted(self._handlers)), repr(name)[:40]
             return self._refuse("unknown command", f"there is no command {shown}; the commands are {known}")
+        if why_late is not None and name != STATUS:
+            return self._refuse("late request", why_late)
         if self._running >= MAX_CONCURRENT:
             return self._refuse("too many at once", "too many commands at once; wait")
         return name, request
@@ -123,6 +133,18 @@ class RequestExecutor:
         return {"ok": False, "reason": reason}
 
 
+def _now_ns() -> int:
+    # Unlike the monotonic clock it goes on while the computer is suspended.
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+async def _stay_alive(late: LateRequests) -> None:
+    """Note that the event loop runs, until cancelled."""
+    while True:
+        late.alive(_now_ns())
+        await asyncio.sleep(ALIVE_S)
+
+
 class CommandServer:
     """Receives requests, passes them to handlers and sends the replies."""
 
@@ -145,14 +167,17 @@ class CommandServer:
 
     async def run(self) -> None:
         """Serve requests until cancelled; a slow command such as `unlock` does not delay a `stop`."""
+        late = LateRequests(_now_ns())
         async with asyncio.TaskGroup() as group:
+            group.create_task(_stay_alive(late))
             while True:
                 parts = await self._socket.recv_multipart()
+                why_late = late.why_late(_now_ns())
                 # Receiving a message that has already arrived does not yield to other tasks.
                 await asyncio.sleep(0)
                 # A DEALER sends two frames, a REQ three. Other counts are answered like a DEALER's.
                 route = parts[:2] if len(parts) == 3 and not parts[1] else parts[:1]
-                checked = self._requests.check(parts[0], parts[len(route) :], time.monotonic_ns())
+                checked = self._requests.check(parts[0], parts[len(route) :], time.monotonic_ns(), why_late)
                 if isinstance(checked, dict):
                     await self._reply(route, checked)
                 else:

@@ -21,6 +21,7 @@ from shearloop.tools.commission.report import Measured, judged
 STAGE: Final = "5 wrench"
 SIGMAS: Final = 5.0
 MASS_TOLERANCE: Final = 0.1
+LARGEST_KG: Final = 5.0
 _READ_S: Final = 2.0
 
 
@@ -133,15 +134,20 @@ def judge_rest(readings: Sequence[Reading], settings: UrSettings) -> list[Line]:
 
 
 def _hung_mass(context: Context) -> Line:
-    before = read(context)
+    before, least_kg = read(context), least_mass_kg(context.settings)
     kg = context.operator.number(
         "Hang a known mass on the tool and let it rest; its mass in kg",
-        *(0.1, 5.0),
-        Played("the mass that you type is hung for you, for instance 1", ("robot hang {}",)),
+        *(least_kg, LARGEST_KG),
+        Played(f"the mass that you type is hung for you, for instance {math.ceil(least_kg):g}", ("robot hang {}",)),
     )
     after = read(context)
     context.operator.act("Take the mass off", Played("it is taken off for you", ("robot hang 0",)))
     return judge_mass(before, after, kg, context.settings)
+
+
+def least_mass_kg(settings: UrSettings) -> float:
+    """Return the smallest mass whose weight a wrench that reads nothing cannot have: twice its noise."""
+    return math.ceil(20 * settings.facts.noise_n / constants.g) / 10
 
 
 def judge_mass(before: Reading, after: Reading, kg: float, settings: UrSettings) -> Line:

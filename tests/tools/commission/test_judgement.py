@@ -27,8 +27,9 @@ from shearloop.tools.commission.stops import Stop, judge_stops
 from shearloop.tools.commission.tap import frame_step_s, judge_clocks, load_step_s
 from shearloop.tools.commission.tool import Held, judge_signs, judge_twists
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
-from shearloop.tools.commission.wrench import Reading, judge_mass, judge_rest
+from shearloop.tools.commission.wrench import LARGEST_KG, Reading, judge_mass, judge_rest, least_mass_kg
 from tests.drivers.ur.robots import DELIVERED
+from tests.emulators.test_cb3 import SETTINGS as CB3
 
 SIX = (0.0,) * 6
 AT_REST = RtdeOutputs(0.0, SIX, SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1.0, 1, 0, 0.002, 1.0, (0.0, 0.0, 0.0), SIX)
@@ -142,6 +143,13 @@ def test_a_wrench_without_a_load_fails_its_line(reading, lines):
 def test_a_hung_mass_is_weighed(force_n, lines):
     after = dataclasses.replace(READING, mean=(0.0, 0.0, force_n, 0.0, 0.0, 0.0))
     assert failed([judge_mass(READING, after, 2.0, DELIVERED)]) == lines
+
+
+@pytest.mark.parametrize("settings", [DELIVERED, CB3], ids=["e-series", "cb3"])
+def test_a_wrench_that_reads_nothing_fails_with_every_mass_that_may_be_hung(settings):
+    least_kg = least_mass_kg(settings)
+    assert least_kg < LARGEST_KG
+    assert failed([judge_mass(READING, READING, least_kg, settings)]) == ["hung mass"]
 
 
 def frames(period_s: float = 0.5, dead: int | None = None, noise_v: float = 0.001) -> list[Frame]:

@@ -214,7 +214,7 @@ class Rig:
 
     def _question_of(self, experiment: ReadExperiment) -> Question:
         file = experiment.file
-        motion = first_motion(file)
+        motion = first_motion(file, self.experiments.gripper)
         robot = self.experiments.robot
         limits = robot.settings.limits if robot is not None else None
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)

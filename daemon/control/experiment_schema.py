@@ -12,7 +12,7 @@ from shearloop.daemon.commissioning import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD
 from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
-from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S
+from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S, GripperModel
 from shearloop.mistakes import shown
 
 MOST_ANGLES = 1000
@@ -258,15 +258,20 @@ def first_motion_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
-def first_motion(file: ExperimentFile) -> str:
+def opens_to_mm(step: ReleaseStep, gripper: GripperModel | None) -> float:
+    """Return the width to which a step opens the fingers of a gripper; as it is written where none is known."""
+    return step.width_mm if gripper is None else min(step.width_mm, gripper.stroke_mm)
+
+
+def first_motion(file: ExperimentFile, gripper: GripperModel | None = None) -> str:
     """Return the first motion of an experiment as a sentence, for the operator who starts it."""
     for number, step in enumerate(file.steps, 1):
-        if (motion := motion_of(step)) is not None:
+        if (motion := motion_of(step, gripper)) is not None:
             return f"the first motion is step {number} of {len(file.steps)} ({step.do}): {motion}"
     return "no step moves anything"
 
 
-def motion_of(step: Step) -> str | None:
+def motion_of(step: Step, gripper: GripperModel | None = None) -> str | None:
     """Return what moves in a step, as a sentence, or None."""
     match step:
         case ApproachStep(along_tool_m=float(distance_m)):
@@ -277,7 +282,7 @@ def motion_of(step: Step) -> str | None:
         case GripStep():
             return f"the fingers close to {step.width_mm:g} mm, or onto a tool with at most {step.force_n:g} N"
         case ReleaseStep():
-            return f"the fingers open to {step.width_mm:g} mm, and a tool in them drops"
+            return f"the fingers open to {opens_to_mm(step, gripper):g} mm, and a tool in them drops"
         case TurnToStep():
             return f"the wrist turns to {step.angle_rad:g} rad, at {step.speed_rad_per_s:g} rad/s"
         case TwistStep():
@@ -285,7 +290,7 @@ def motion_of(step: Step) -> str | None:
         case IdentifyStep():
             return f"the wrist turns to and fro, by at most {step.amplitude_rad:g} rad"
         case HoldTorqueStep():
-            return f"the wrist turns until the torque is {step.torque_nm:+g} N·m"
+            return f"the wrist turns until the torque is {step.signed_torque_nm:+g} N·m"
         case TightenStep():
             return f"the wrist turns {step.direction}, at {step.speed_rad_per_s:g} rad/s"
         case _:

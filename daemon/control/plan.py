@@ -182,8 +182,7 @@ def _words(step: Step, gripper: GripperModel | None) -> str:
             to = f"closes the fingers to {step.width_mm:g} mm, or onto a tool, at {step.speed_mm_per_s:g} mm/s"
             return f"{to} with up to {step.force_n:g} N; {empty}"
         case steps.ReleaseStep():
-            width_mm = min(step.width_mm, gripper.stroke_mm) if gripper is not None else step.width_mm
-            return f"opens the fingers to {width_mm:g} mm: a held tool drops"
+            return f"opens the fingers to {steps.opens_to_mm(step, gripper):g} mm: a held tool drops"
         case steps.TareStep():
             return "takes the zero of every torque sensor; nothing turns"
         case steps.IdentifyStep():

@@ -15,11 +15,13 @@ from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
 from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, first_motion
 from shearloop.daemon.control.loop_runner import wrench_source
+from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.torques import WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.robotiq.models import MODELS
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS
@@ -286,10 +288,22 @@ def test_no_straight_move_begins_with_a_tool_that_is_or_may_be_gripped(sense):
         ([TWIST], "the wrist twists to 1 rad, at 0.3 rad/s"),
         ([GRIP], "the fingers close to 10 mm, or onto a tool with at most 60 N"),
         ([{"do": "hold_torque", "torque_nm": 0.1}], "until the torque is +0.1 N·m"),
+        ([{"do": "hold_torque", "torque_nm": 0.1, "direction": "clockwise"}], "until the torque is -0.1 N·m"),
     ],
 )
 def test_the_first_motion_is_told_before_a_start(steps, said):
     assert said in first_motion(ExperimentFile.model_validate({"name": "test", "steps": steps}))
+
+
+@pytest.mark.parametrize(
+    ("step", "model", "opens_mm"),
+    [({}, None, 140), ({}, "Hand-E", 50), ({}, "2F-85", 85), ({"width_mm": 30}, "Hand-E", 30)],
+)
+def test_the_first_motion_opens_no_further_than_the_configured_gripper(step, model, opens_mm):
+    file = ExperimentFile.model_validate({"name": "test", "steps": [{"do": "release", **step}]})
+    gripper = MODELS[model] if model is not None else None
+    assert f"the fingers open to {opens_mm} mm, and" in first_motion(file, gripper)
+    assert f"opens the fingers to {opens_mm} mm:" in "\n".join(plan_of(file, gripper=gripper).sentences())
 
 
 def test_a_noisy_source_supervises_beyond_its_noise_and_drives_nothing_gentle():

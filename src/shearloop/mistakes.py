@@ -5,6 +5,7 @@ not a number; allowed: from 0 to 10`. With the nodes of a YAML file it begins wi
 """
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -20,6 +21,9 @@ from shearloop.words import counted
 Model = TypeVar("Model")
 
 _LONGEST_VALUE = 60
+# A decimal with a comma, as German and French have it, and the cure.
+_DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
+_POINT = "; the decimal sign is a point: 0.1, not 0,1"
 # So many mistakes are shown of one file.
 _MOST_MISTAKES = 100
 
@@ -88,6 +92,9 @@ def mistake_lines(
             key += "." + details["ctx"]["discriminator"].strip("'")
         subject = f"{key}: " if key else ""
         sentence = _sentence(details, schema, _written(location, content, root, key=wrong_key))
+        if wrong_key and root is not None and not _written(location, content, root, key=False):
+            # In braces, YAML reads the part behind a comma as a key without a value.
+            sentence += _POINT
         found[f"{where}{f':{line}' if root is not None else ''}: {subject}{sentence}"] = line
     return sorted(found, key=lambda text: found[text]) + (
         [f"{where}: {counted(len(more), 'more mistake')}"] if more else []
@@ -168,6 +175,8 @@ def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str = "
     else:
         wrong = (words for begin, words in _WRONG if kind.startswith(begin))
         sentence = f"{shown(found)} {next(wrong, details['msg'])}"
+    if isinstance(found, str) and _DECIMAL_COMMA.fullmatch(found) and kind.startswith(("float_", "int_")):
+        sentence += _POINT
     near = get_close_matches(str(found), choices, 1)
     hint = f"did you mean {near[0]}?" if near else _unit_hint(location, found, here)
     return "; ".join(filter(None, (sentence, f"allowed: {allowed}" if allowed else "", hint)))

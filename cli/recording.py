@@ -85,12 +85,13 @@ def _list(args: argparse.Namespace) -> int:
         return 0
     rows = []
     for one in found:
-        began = "" if one.first_unix_ns is None else _local_time(one.first_unix_ns)
-        lasts = "" if one.duration_s is None else f"{one.duration_s:.0f} s"
+        # A recording without an index has neither of these; an empty cell would look like a shifted row.
+        began = "–" if one.first_unix_ns is None else _local_time(one.first_unix_ns)
+        lasts = "–" if one.duration_s is None else f"{one.duration_s:.0f} s"
         remark = one.unreadable or ("" if one.closed else "not closed, or being written")
-        ran = ", ".join(one.experiments)
+        ran = ", ".join(one.experiments) or "–"
         rows.append((began, lasts, f"{one.size_bytes / 1e6:.1f} MB", one.path, ran, remark))
-    print(*table(("from", "lasts", "size", "file", "experiment", ""), rows), sep="\n")
+    print(*table(("from", "lasts", "size", "file", "experiment", "remark"), rows), sep="\n")
     return 0
 
 

@@ -11,18 +11,28 @@ from typing import TYPE_CHECKING
 from shearloop.cli.options import add_json, add_option
 from shearloop.cli.terminal import print_result
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.errors import UserError
 from shearloop.words import counted
 
 if TYPE_CHECKING:
+    import zmq.asyncio
+
+    from shearloop.daemon.clock import Clock
     from shearloop.daemon.config import DaemonConfig
+    from shearloop.daemon.messaging.publisher import Publisher
     from shearloop.tools.recordings.replay import RecordedRun, ReplayComparison
+
+
+# A port that nobody is told: a comparison needs no subscriber, and a daemon may have the usual address.
+UNPUBLISHED = "tcp://127.0.0.1:*"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_option(parser, "recording", Path, "REC", "made by `shearloop run --record` or imported")
     add_option(parser, "--speed", _speed, "N", "factor, or max for no waiting (default: %(default)s)", default="1")
-    add_option(parser, "--publish", str, "ADDRESS", "publish here (default: %(default)s)", default=PUBLISH_ADDRESS)
+    text = f"publish here (default: {PUBLISH_ADDRESS}; with --check, nowhere)"
+    add_option(parser, "--publish", str, "ADDRESS", text)
     add_option(parser, "--config", Path, "FILE", "instead of the configuration in the recording")
     parser.add_argument("--wait", action="store_true", help="begin with the first subscriber")
     printed = parser.add_mutually_exclusive_group()
@@ -69,13 +79,12 @@ async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Nam
     import zmq.asyncio
 
     from shearloop.cli.terminal import print_estimate
-    from shearloop.daemon.messaging.publisher import Publisher
     from shearloop.tools.outputs import progress_bar
     from shearloop.tools.recordings.replay import Replay, ReplayClock
 
     clock = ReplayClock()
     with ExitStack() as opened:
-        publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), args.publish, clock)
+        publisher = _publisher(opened.enter_context(zmq.asyncio.Context()), args, clock)
         opened.callback(publisher.close)
         replay = Replay(run, config, publisher, clock)
         if args.show:
@@ -87,6 +96,20 @@ async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Nam
         # The last messages are still being sent.
         await asyncio.sleep(0.1)
     return replay.comparison
+
+
+def _publisher(context: "zmq.asyncio.Context", args: argparse.Namespace, clock: "Clock") -> "Publisher":
+    """Return the publisher of a replay; raises UserError, with the cure, for an address that it cannot have."""
+    from shearloop.daemon.messaging.publisher import Publisher
+
+    alone = args.check and not args.wait
+    address = args.publish or (UNPUBLISHED if alone else PUBLISH_ADDRESS)
+    try:
+        return Publisher(context, address, clock)
+    except UserError as error:
+        raise UserError(
+            f"{error}: give another one with `--publish`, such as --publish tcp://127.0.0.1:7771"
+        ) from error
 
 
 def _comparison_text(comparison: "ReplayComparison", same_code: bool) -> list[str]:

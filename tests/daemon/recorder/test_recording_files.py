@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 from mcap.writer import Writer
 from scipy.io import loadmat, savemat
 
 import shearloop
 from shearloop.bank.channels import PAPER_TABLE
+from shearloop.cli import replay
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.recorder import daemon_identity
@@ -72,12 +74,32 @@ def test_list_shows_the_recordings_of_a_folder_with_what_is_known_of_each(record
     assert lines[1].split()[3] == "2"
     assert "this is not an MCAP file, or is empty" in lines[3]
     assert "not closed, or being written" in lines[4]
+    assert lines[4].split()[:3:2] == ["–", f"{torn.stat().st_size / 1e6:.1f}"]
+    # Each column begins at its heading, also in a row that lacks some.
+    for heading, begins in (("size", "0.0 MB"), ("file", str(tmp_path)), ("experiment", "–"), ("remark", "not closed")):
+        assert lines[4][lines[0].index(heading) :].startswith(begins)
     found = [json.loads(line) for line in ran("recording", "list", tmp_path, "--json").out.splitlines()]
     assert [one["closed"] for one in found] == [True, True, True, False]
     assert found[0]["first_unix_ns"] == 10**18
     assert "is no folder" in mistake("recording", "list", recording)
     later.unlink()
     assert "no recording is in this folder" in ran("recording", "list", later.parent).out
+
+
+def test_a_check_runs_beside_a_daemon(recording, tiny_bank, tmp_path, ran, mistake, monkeypatch):
+    config = tmp_path / "rig.yaml"
+    config.write_text(f"fingertips: {{right: {{device: {{path: a}}, bank: {tiny_bank}}}}}")
+    arguments = ("recording", "replay", recording, "--speed", "max", "--config", config)
+    with zmq.Context() as context, context.socket(zmq.PUB) as daemon:
+        daemon.bind("tcp://127.0.0.1:*")
+        address = daemon.getsockopt_string(zmq.LAST_ENDPOINT)
+        monkeypatch.setattr(replay, "PUBLISH_ADDRESS", address)
+        # A recording without raw input has nothing to compare.
+        assert "Nothing was compared" in ran(*arguments, "--check", status=1).err
+        for more in ((), ("--check", "--publish", address)):
+            said = mistake(*arguments, *more)
+            assert f"`publish: {address}` is already in use" in said
+            assert "give another one with `--publish`" in said
 
 
 def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, ran, mistake):

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 LOOPBACKS = tuple(f"127.0.0.{number}" for number in range(1, 255))
 # Control cycles per second: twice the states that the daemon asks for, and gentle to this computer.
 EMULATED_RATE_HZ = "250"
+# Of the emulated tool, where no experiment of the configuration has a `tool_mm`.
+_TOOL_MM = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +121,6 @@ class _DeviceReplacer:
 
     def _rig(self, robot: "UrSettings") -> None:
         """Play robot, gripper, load cell and fingertips over one physics."""
-        from shearloop.daemon.experiment_files import read_document
-
         config = self._config
         arguments = ["--host", self._host, "--run-dir", str(self._folder), *_robot_arguments(robot)]
         for name, fingertip in config.fingertips.items():
@@ -131,10 +131,24 @@ class _DeviceReplacer:
         else:
             arguments.append("--no-load-cell")
         arguments += self._gripper()
-        if config.experiment is not None:
-            tool_mm = read_document(config.experiment).content.get("tool_mm")
-            arguments += [] if tool_mm is None else ["--diameter-mm", str(tool_mm)]
+        arguments += ["--diameter-mm", self._tool_mm()]
         self._emulators.append({"device": "rig", "arguments": arguments})
+
+    def _tool_mm(self) -> str:
+        """Return the diameter of the emulated tool, which all experiments of the rehearsal grip."""
+        from shearloop.daemon.experiment_files import read_document
+
+        experiment = self._config.experiment
+        named = read_document(experiment).content.get("tool_mm") if experiment is not None else None
+        tool_mm = str(_TOOL_MM if named is None else named)
+        whence = (
+            f"as `tool_mm` of {experiment} says" if named is not None else "as no `experiment` with `tool_mm` is named"
+        )
+        self._sentences.append(
+            f"the emulated tool has a diameter of {tool_mm} mm, {whence}; "
+            "every experiment that you start grips this tool"
+        )
+        return tool_mm
 
     def _boards(self) -> None:
         """Play boards that no robot turns: each repeats a programme of twists, or rests."""

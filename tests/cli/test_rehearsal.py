@@ -113,6 +113,18 @@ def test_every_device_of_the_configuration_is_played_and_no_real_address_is_left
         assert (played["skin"].robot is not None) == (keys == ("robot", "skin"))
 
 
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize(("changes", "tool_mm"), [({}, 20), ({"experiment": "short.yaml"}, 30)])
+def test_the_first_lines_say_how_large_the_tool_of_every_experiment_is(real_rig, changes, tool_mm):
+    path = real_rig("robot", "load_cell", "gripper", **changes)
+    with rehearsal(load_daemon_config(path), path) as rehearsed:
+        (rig,) = check_emulators(rehearsed.config.emulators, path)
+        (sentence,) = (said for said in rehearsed.sentences if "emulated tool" in said)
+    assert rig.diameter_mm == tool_mm
+    assert f"a diameter of {tool_mm} mm, " in sentence
+    assert "every experiment that you start grips this tool" in sentence
+
+
 def test_a_calibrated_load_cell_gets_the_counts_of_its_own_calibration(real_rig, tmp_path):
     from shearloop.cli.emulate.devices import load_cell_sketch
 

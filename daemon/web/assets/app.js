@@ -6,7 +6,7 @@ import { Controls } from "./controls.js";
 import { Link } from "./link.js";
 import { estimatesFirst, eventsPanel, FingertipPanel, gripperPanel, headPanel, healthPanel, isFingertip, loopPanel, robotPanel, shearPanel, torquePanel, wantedNow } from "./panels.js";
 import { Series } from "./series.js";
-import { age, byId, number, put, show } from "./text.js";
+import { age, byId, number, put, putLines, show } from "./text.js";
 
 const REDRAWS_PER_S = 30;
 // Estimates differ in shape, and in lightness of blue and brown.
@@ -116,7 +116,7 @@ function linkLine() {
   const received = Number.isFinite(link.sinceDaemon());
   const end = link.end()?.content;
   show(byId("summary"), state === "ended" && Boolean(end?.summary));
-  put(byId("summary-text"), end?.summary ?? "");
+  putLines(byId("summary-text"), (end?.summary ?? "").split("\n"));
   const [name, reason] = {
     ended: [end?.finished ? "✓ DONE" : "ended", `the daemon ${link.viewerLost() ? "and the viewer have" : "has"} ended; the last values are shown`],
     live: ["● live", ""],

@@ -1,7 +1,7 @@
 // The buttons: stop needs no token, every motion needs it.
 
 import { ACTIVE } from "./panels.js";
-import { byId, put, show } from "./text.js";
+import { byId, put, putLines, show } from "./text.js";
 
 const KEY = "shearloop-token";
 const TOKEN_NEEDED = "needs the token: open the address that `shearloop view` printed";
@@ -101,7 +101,7 @@ export class Controls {
     this.asked = name;
     this.digest = digest;
     put(byId("question-text"), question);
-    put(byId("plan"), plan.join("\n"));
+    putLines(byId("plan"), plan);
     show(byId("plan"), plan.length > 0);
     put(byId("confirm"), `Yes, ${name}`);
     show(byId("question"), name !== "");

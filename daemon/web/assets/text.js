@@ -8,6 +8,19 @@ export function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
+// Puts lines one below the other; the rest of a long one begins below its text, not below its number or its name.
+export function putLines(element, lines) {
+  const text = lines.join("\n");
+  if (element.textContent === text) return;
+  element.replaceChildren(...lines.map((line, i) => {
+    const part = document.createElement("span");
+    part.className = "hanging";
+    part.style.setProperty("--hang", `${/^ *(\d+ +\S+ +)?/.exec(line)[0].length}ch`);
+    part.textContent = i < lines.length - 1 ? `${line}\n` : line;
+    return part;
+  }));
+}
+
 export function show(element, shown) {
   if (element.hidden === shown) element.hidden = !shown;
 }

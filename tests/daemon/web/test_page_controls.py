@@ -141,6 +141,21 @@ def test_the_picked_experiment_shows_its_plan_and_is_the_one_that_starts(browsed
     page.click("[data-command=start]")
     browsed.until("#plan", "\n".join(PLAN))
     assert page.is_visible("#plan")
+    # The rest of a long line begins below its text.
+    places = """() => [...document.querySelectorAll('#plan > *')].map((line) => {
+      const range = document.createRange();
+      range.selectNodeContents(line);
+      const [first, ...others] = range.getClientRects();
+      const second = others.find((each) => each.top > first.bottom - 1);
+      const width = getComputedStyle(line).getPropertyValue('--hang');
+      return [width, second && Math.round(second.left - first.left)];
+    })"""
+    assert [hang for hang, _ in page.evaluate(places)] == ["0ch", "12ch", "14ch"]
+    page.evaluate("document.querySelector('#plan').style.width = '20ch'")
+    narrow = page.evaluate(places)
+    assert narrow[0][1] == 0
+    assert all(left > 50 for _, left in narrow[1:]), narrow
+    page.evaluate("document.querySelector('#plan').style.width = ''")
     page.select_option("#experiment", label="hold 0.10 N·m")
     page.click("#confirm")
     browsed.until("#answer", "start: done")

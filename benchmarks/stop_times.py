@@ -224,7 +224,7 @@ class RunningRig:
                 return
             # Devices come back at their own time.
             time.sleep(0.2)
-            self.send("unlock")
+            self.send("unlock", confirmed=True)
         raise RuntimeError(f"the experiment does not start: {reply}")
 
     def cause(self, cause: Cause) -> int:

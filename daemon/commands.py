@@ -26,6 +26,7 @@ EXPERIMENTS = "experiments"
 ARGUMENTS: Mapping[str, Mapping[str, type]] = {
     "tare": {"source": str, "confirmed": bool},
     "start": {"experiment": str, "ask": bool, "digest": str},
+    "unlock": {"confirmed": bool, "digest": str},
     "release": {"confirmed": bool, "ask": bool, "digest": str},
 }
 STOP_DELAY_S = 0.05
@@ -130,23 +131,29 @@ class Commands:
         _refuse_if(required_rig(self.rig).control_loop.resume())
         return {}
 
-    async def _unlock(self, _request: Request) -> Reply:
-        _refuse_if(await required_rig(self.rig).runner.unlock())
+    async def _unlock(self, request: Request) -> Reply:
+        rig = required_rig(self.rig)
+        confirmed, sentence = bool(request.get("confirmed")), rig.control_loop.unlock_question()
+        if sentence:
+            question = Question(f"Unlock? {_capital(sentence)}.", digest_of(*rig.control_loop.release_stakes()))
+            _refuse_if(rig.runner.unlock_refusal())
+            if not confirmed:
+                reason = f"{sentence}; secure it, then confirm it with `shearloop command unlock --yes`"
+                raise CommandRefusedError(reason, **question.facts)
+            _refuse_if_changed(question, sentence, request)
+        _refuse_if(await rig.runner.unlock(confirmed=confirmed))
         return {}
 
     async def _release(self, request: Request) -> Reply:
         rig = required_rig(self.rig)
         _refuse_if(rig.runner.release_refusal())
         sentence = rig.control_loop.release_question()
-        text = f"Release? {sentence[0].upper()}{sentence[1:]}."
-        question = Question(text, digest_of(*rig.control_loop.release_stakes()))
+        question = Question(f"Release? {_capital(sentence)}.", digest_of(*rig.control_loop.release_stakes()))
         if request.get("ask"):
             return {**question.facts}
         if not request.get("confirmed"):
             raise CommandRefusedError(f"{sentence}; confirm it with `shearloop command release --yes`")
-        if request.get("digest", question.digest) != question.digest:
-            changed = f"what the gripper says has changed since the question: {sentence}; answer it again"
-            raise CommandRefusedError(changed, **question.facts)
+        _refuse_if_changed(question, sentence, request)
         _refuse_if(await rig.runner.release())
         return {}
 
@@ -216,3 +223,14 @@ def required_rig(rig: "Rig | None") -> "Rig":
 def _refuse_if(reason: str | None) -> None:
     if reason:
         raise CommandRefusedError(reason)
+
+
+def _refuse_if_changed(question: Question, sentence: str, request: Request) -> None:
+    """Refuse what was confirmed with another question in view, and ask the present one."""
+    if request.get("digest", question.digest) != question.digest:
+        changed = f"what the gripper says has changed since the question: {sentence}; answer it again"
+        raise CommandRefusedError(changed, **question.facts)
+
+
+def _capital(sentence: str) -> str:
+    return f"{sentence[0].upper()}{sentence[1:]}"

@@ -82,9 +82,12 @@ class ActionExecutor:
         elif self._task is not None:
             self._task.cancel()
 
-    async def unlock(self) -> None:
-        """Enable robot and gripper while no experiment runs; raises DriverError and ActionError."""
-        await self._by_operator("unlock", "unlocking", self._unlock)
+    async def unlock(self, *, confirmed: bool = False) -> None:
+        """Enable robot and gripper while no experiment runs; raises DriverError and ActionError.
+
+        `confirmed`: the operator says that a tool may drop.
+        """
+        await self._by_operator("unlock", "unlocking", partial(self._unlock, confirmed=confirmed))
 
     async def open_by_operator(self) -> None:
         """Open the gripper while no experiment runs; raises DriverError and ActionError."""
@@ -108,13 +111,13 @@ class ActionExecutor:
         await self.gripper.open_by_operator()
         self.fingers_move = False
 
-    async def _unlock(self) -> None:
+    async def _unlock(self, *, confirmed: bool) -> None:
         _accepted(await self.robot.send(Unlock()))
         if self.gripper is not None:
             # An activation opens and closes the fingers; after a failure they may still move.
             self.fingers_move = True
             try:
-                await self.gripper.unlock()
+                await self.gripper.unlock(confirmed=confirmed)
             except (ActionError, DriverError) as error:
                 raise ActionError(
                     f"the robot is unlocked and may move again, and the gripper is not: {error}"

@@ -76,6 +76,11 @@ class _GrippedTool:
     release_error: str | None = None
 
 
+def activation_sentence(what: str) -> str:
+    """Return what an activation does after a fault, and to what."""
+    return f"after its fault the gripper is activated again, which opens its fingers, and a tool in it drops; {what}"
+
+
 class ControlLoop:
     """One closed loop: one arm, one gripper, and one of several torques that drives."""
 
@@ -272,6 +277,13 @@ class ControlLoop:
         what = self.held or f"{width}, and it does not say that it holds something"
         renewed = "; after its fault the fingers open and close once" if gripper is not None and gripper.fault else ""
         return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
+
+    def unlock_question(self) -> str:
+        """Return what an unlock drops, for the operator who confirms it; empty where it opens no fingers on a tool."""
+        gripper = self.inputs.gripper
+        if gripper is None or not gripper.fault or not self.may_hold():
+            return ""
+        return activation_sentence(self.held or f"its fingers are {gripper.width_mm:.1f} mm apart, and may hold a tool")
 
     def release_stakes(self) -> tuple[str, ...]:
         """Return what a confirmation of `release_question` depends on; a width that wavers is not part of it."""

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.control_loop import ControlLoop, activation_sentence
 from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.finger_motion import FingerMotion
@@ -75,7 +75,7 @@ class GripperTask:
 
     async def open_by_operator(self) -> None:
         """Open wide, also after a fault, once the operator says that a tool may drop; raises as `release` does."""
-        await self.unlock()
+        await self.unlock(confirmed=True)
         await self.release()
 
     async def halt(self) -> None:
@@ -83,13 +83,22 @@ class GripperTask:
         with self._motion.commanded(self.clock.now_ns()):
             await _tried(self.gripper.halt)
 
-    async def unlock(self) -> None:
-        """Activate again after a fault, once the operator says that the fingers are clear; raises DriverError."""
-        # Read now: the latest state may be older than the fault, and activating opens the fingers.
+    async def unlock(self, *, confirmed: bool = False) -> None:
+        """Activate again after a fault, which opens the fingers; raises DriverError.
+
+        Where they hold something, or may, it has to be `confirmed` by the operator, else this raises ActionError.
+        """
+        # Read now: the latest state may be older than the fault.
         state = await self.gripper.read()
-        if state.fault.needs_activation:
-            with self._motion.commanded(self.clock.now_ns()):
-                await self.gripper.activate(operator_confirmed=True)
+        if not state.fault.needs_activation:
+            return
+        status = status_of(state)
+        self.control_loop.on_gripper(status)
+        if not confirmed and (status.holding or status.moving or status.uncertain):
+            what = f"its fingers are {status.width_mm:.1f} mm apart, and hold something or may hold it"
+            raise ActionError(f"{activation_sentence(what)}; confirm it with `shearloop command unlock --yes`")
+        with self._motion.commanded(self.clock.now_ns()):
+            await self.gripper.activate(operator_confirmed=True)
 
     @property
     def is_holding(self) -> bool | None:

@@ -216,14 +216,23 @@ class ControlLoopRunner:
                 while self._running and self._timeline.pending:
                     await self.states.changed.wait()
 
-    async def unlock(self) -> str | None:
-        """Enable robot and gripper after a stop, on the operator's command; return None, or why not."""
+    def unlock_refusal(self) -> str | None:
+        """Return why robot and gripper cannot be unlocked now, or None."""
         if self._closed:
             return ENDING
         if (experiment := self._control_loop.running) is not None:
             return f"the experiment {experiment.file.name!r} is running; stop it first"
+        return UNLOCKING if self.actions.unlocking else None
+
+    async def unlock(self, *, confirmed: bool = False) -> str | None:
+        """Enable robot and gripper after a stop, on the operator's command; return None, or why not.
+
+        `confirmed`: the operator says that a tool may drop, where the gripper is activated again.
+        """
+        if (reason := self.unlock_refusal()) is not None:
+            return reason
         try:
-            await self.actions.unlock()
+            await self.actions.unlock(confirmed=confirmed)
         except (ActionError, DriverError) as error:
             return str(error)
         self._control_loop.acknowledge()

@@ -112,7 +112,8 @@ class FaultCode(Enum):
     GRIPPER_FAULT = Rule(
         _KEEP,
         "the gripper reports a fault: {detail}.",
-        "Clear the fault; `shearloop command unlock` then activates the gripper again.",
+        "Clear the fault. `shearloop command unlock` then activates the gripper again, which opens its fingers: where "
+        "they may hold a tool, it asks first.",
     )
     GRIP_LOST = Rule(
         _KEEP, "the gripper no longer holds an object: {detail}.", "Put the tool back, then `shearloop command unlock`."

@@ -52,7 +52,9 @@ NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock", "release")
 # Those that the page asks about first, with the daemon's question. The confirmation gives back the question's digest.
 ASKED = ("start", "release")
 # What a request may say of each command; a word that is not known must not pass for a confirmation.
-WORDS = {"start": ("experiment", "digest"), "release": ("digest",)}
+WORDS = {"start": ("experiment", "digest"), "unlock": ("digest",), "release": ("digest",)}
+# Those that are carried out at once, unless the daemon's refusal has a question; the digest answers it.
+ASKED_IF_NEEDED = ("unlock",)
 # The parts of a question, which a refusal has as well where another one is to be answered.
 QUESTION = ("question", "plan", "digest")
 # Those that take long.
@@ -342,7 +344,7 @@ class _Page:
         # The first press asks, the second one confirms what was asked.
         if name in ASKED and "digest" not in arguments:
             arguments["ask"] = True
-        elif name == "release":
+        elif name == "release" or (name in ASKED_IF_NEEDED and "digest" in arguments):
             arguments["confirmed"] = True
         return await self._reply(name, self._bridge.command(name, **arguments))
 

@@ -245,6 +245,25 @@ async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig
     assert states[-1]["width_mm"] > held_mm + 5.0
 
 
+async def test_an_unlock_after_a_fault_of_the_gripper_asks_before_it_drops_the_tool(rig_config, tiny_bank, tmp_path):
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, fault, command):
+        await started(command, experiment(tmp_path, SLOW_TWIST))
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
+        fault("gripper fault 14")
+        await watcher.until("loop.state", lambda state: FaultCode.GRIPPER_FAULT.text in state["faults"])
+        held_mm = watcher.seen["gripper.state"][-1]["width_mm"]
+        refused = await command("unlock")
+        assert "which opens its fingers, and a tool in it drops; its fingers hold something" in refused["reason"]
+        assert "with at most 60 N" in refused["question"]
+        seen = len(watcher.seen["gripper.state"])
+        await watcher.until("gripper.state", lambda _: len(watcher.seen["gripper.state"]) > seen + 5)
+        assert watcher.seen["gripper.state"][-1]["width_mm"] == held_mm
+        reply = await command("unlock", confirmed=True, digest=refused["digest"])
+        while not reply["ok"]:
+            reply = await command("unlock", confirmed=True)
+        assert watcher.seen["gripper.state"][-1]["width_mm"] > held_mm + 50
+
+
 async def test_a_board_that_is_unplugged_holds_the_wrist(rig_config, tiny_bank, tmp_path):
     async with running_rig(rig_config, tiny_bank) as (_, watcher, fault, command):
         await started(command, experiment(tmp_path, SLOW_TWIST))

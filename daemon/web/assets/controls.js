@@ -123,7 +123,9 @@ export class Controls {
     if (name === "start" && picked) words.set("experiment", picked);
     this.tell(`${name} …`);
     const reply = await this.ask(`commands/${name}?${words}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
-    if (!reply.ok) this.tell(`${name} was refused: ${reply.reason}`, "bad");
+    // A refusal of the first press with a question is no more than the question.
+    const asks_only = reply.question && !digest;
+    if (!reply.ok) this.tell(asks_only ? "" : `${name} was refused: ${reply.reason}`, "bad");
     else this.tell(reply.question ? "" : `${name}: done`);
     if (reply.question) this.ask_about(name, reply.question, reply.plan, reply.digest);
     // Ask again after a wrong token.

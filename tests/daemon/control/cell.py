@@ -156,7 +156,8 @@ class Gripper:
     async def release(self) -> None:
         await self.grip(OPENING)
 
-    async def unlock(self) -> None:
+    async def unlock(self, *, confirmed: bool = False) -> None:
+        self.asked += ["activate"] if confirmed else []
         await self.there.wait()
         if self.unlock_error is not None:
             raise self.unlock_error
@@ -213,6 +214,8 @@ class Cell:
         )
         self.task: asyncio.Task[None] | None = None
         self.holding = True
+        # What the gripper's state has besides.
+        self.hand: dict[str, Any] = {}
 
     def drive(self) -> None:
         self.task = asyncio.create_task(self.runner.run())
@@ -226,7 +229,7 @@ class Cell:
         """Take what the sensors measure before a state of the robot."""
         width_mm = 30.0 if self.holding else 140.0
         status = GripperStatus(self.robot.bench.now_ns, width_mm, holding=self.holding, moving=False)
-        self.control_loop.on_gripper(status)
+        self.control_loop.on_gripper(replace(status, **self.hand))
 
     async def cycles(self, count: int) -> None:
         for _ in range(count):

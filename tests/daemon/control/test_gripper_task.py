@@ -154,7 +154,11 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_pat
         assert rig.model.width_mm == held_mm
         rig.model.fail(12)
         assert "internal fault" in gripper_task.status_of(await rig.driver.read()).fault
-        await task.unlock()
+        dropped = r"a tool in it drops; its fingers are 40\.\d mm apart.*`shearloop command unlock --yes`"
+        with pytest.raises(ActionError, match=dropped):
+            await task.unlock()
+        assert rig.model.width_mm == held_mm
+        await task.unlock(confirmed=True)
         assert not (await rig.driver.read()).fault.needs_activation
 
 
@@ -162,6 +166,15 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_pat
 async def test_unlock_handles_a_fault_newer_than_the_state(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
         assert not (await rig.driver.read()).fault.needs_activation
+        rig.model.fail(12)
+        await task_of(rig).unlock(confirmed=True)
+        assert not (await rig.driver.read()).fault.needs_activation
+
+
+@WAYS
+async def test_fingers_that_are_known_to_be_empty_are_activated_unasked(way, tmp_path):
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        await task_of(rig).release()
         rig.model.fail(12)
         await task_of(rig).unlock()
         assert not (await rig.driver.read()).fault.needs_activation

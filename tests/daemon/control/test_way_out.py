@@ -67,8 +67,7 @@ async def test_a_release_whose_question_has_changed_opens_nothing():
     async with with_gripper() as cell:
         cell.holding = False
         await cell.cycles(5)
-        rig = SimpleNamespace(runner=cell.runner, control_loop=cell.control_loop)
-        release = Commands(rig, None, None, None, asyncio.Event()).handlers()["release"]
+        release = commands_of(cell)["release"]
         asked = await release({"ask": True})
         assert "it does not say that it holds something" in asked["question"]
         cell.holding = True
@@ -80,6 +79,47 @@ async def test_a_release_whose_question_has_changed_opens_nothing():
         await cell.cycles(10)
         assert await answered == {}
         assert cell.gripper.asked == ["open"]
+
+
+def commands_of(cell: Cell) -> Any:
+    rig = SimpleNamespace(runner=cell.runner, control_loop=cell.control_loop)
+    return Commands(rig, None, None, None, asyncio.Event()).handlers()
+
+
+@pytest.mark.parametrize("hand", [{"holding": True}, {"uncertain": True}, {"moving": True}])
+@pytest.mark.parametrize("befalls", [None, emergency_stop])
+async def test_an_unlock_that_would_drop_a_tool_asks_before_anything_is_unlocked(hand, befalls):
+    async with with_gripper() as cell:
+        cell.hand = {"holding": False, "fault": "The motor drew too much current.", **hand}
+        if befalls is not None:
+            befalls(cell)
+        await cell.cycles(10)
+        unlock, sent = commands_of(cell)["unlock"], len(cell.robot.commands)
+        with pytest.raises(
+            CommandRefusedError, match=r"a tool in it drops; .* 30\.0 mm .*`shearloop command unlock --yes`"
+        ) as refused:
+            await unlock({})
+        assert "Unlock? After its fault" in refused.value.facts["question"]
+        with pytest.raises(CommandRefusedError, match="changed since the question"):
+            await unlock({"confirmed": True, "digest": "of another question"})
+        assert (len(cell.robot.commands), cell.gripper.asked) == (sent, [])
+        cell.robot.bench.arm.be(safety_mode=1, robot_mode=7)
+        answered = asyncio.create_task(unlock({"confirmed": True, "digest": refused.value.facts["digest"]}))
+        while not answered.done():
+            await cell.cycles(1)
+        assert answered.result() == {}
+        assert cell.gripper.asked == ["activate"]
+
+
+@pytest.mark.parametrize("hand", [{"holding": True}, {"holding": False, "fault": "The motor drew too much current."}])
+async def test_an_unlock_that_drops_nothing_asks_nothing(hand):
+    async with with_gripper() as cell:
+        cell.hand = hand
+        await cell.cycles(10)
+        answered = asyncio.create_task(commands_of(cell)["unlock"]({}))
+        while not answered.done():
+            await cell.cycles(1)
+        assert answered.result() == {}
 
 
 async def test_no_release_while_the_wrist_moves_or_an_experiment_runs():

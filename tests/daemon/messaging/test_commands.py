@@ -176,7 +176,7 @@ def test_who_sends_a_command_is_one_printable_line(by, shown):
         ("start", {"confirmed": True}, "`start` has no argument 'confirmed'"),
         ("start", {"experiment": ""}, "`experiment` is '', and has to be text"),
         ("start", {"experiment": False}, "has to be text"),
-        ("unlock", {"ask": True}, "`unlock` has no argument 'ask'; it has none"),
+        ("unlock", {"ask": True}, "`unlock` has no argument 'ask'; it has confirmed, digest"),
     ],
 )
 async def test_an_argument_that_a_command_does_not_have_moves_nothing(name, request_, why):

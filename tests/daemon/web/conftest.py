@@ -56,13 +56,15 @@ class FakeDaemon(Killable):
         self._folder = folder
         self.forget()
 
-    def say(self, *, refusal: str = "", digest: str = "a", **changed: Mapping[str, Any] | None) -> None:
+    def say(
+        self, *, refusal: str = "", digest: str = "a", drops: bool = False, **changed: Mapping[str, Any] | None
+    ) -> None:
         """Say all messages from now on, with changes to some; None takes one out. Refuse commands where told so.
 
-        `digest` is of the questions.
+        `digest` is of the questions; `drops`: an unlock drops a tool, and asks.
         """
         new = self._folder / "changed.new"
-        new.write_text(json.dumps({"messages": changed, "refusal": refusal, "digest": digest}))
+        new.write_text(json.dumps({"messages": changed, "refusal": refusal, "digest": digest, "drops": drops}))
         new.rename(self._folder / "changed")
 
     @property

@@ -115,7 +115,8 @@ async def serve(folder: Path) -> None:
             question = {"question": f"Really {name}? The first motion is told.", "digest": told["digest"], **plan}
             if request.get("ask"):
                 return question
-            if name in ("start", "release") and request.get("digest") != told["digest"]:
+            asks = ("start", "release", "unlock") if told["drops"] else ("start", "release")
+            if name in asks and request.get("digest") != told["digest"]:
                 raise CommandRefusedError("the file has changed", **question)
             with (folder / "asked").open("a") as asked:
                 asked.write(" ".join(filter(None, (name, Path(request.get("experiment", "")).stem))) + "\n")

@@ -180,6 +180,22 @@ def test_what_has_changed_since_the_question_is_asked_again(name, browsed):
     assert len(browsed.daemon.asked) == 1
 
 
+def test_an_unlock_that_drops_a_tool_needs_a_confirmation(browsed):
+    page = browsed.open(token=True)
+    stopped = {"phase": "stopped", "response": "stop and keep grip"}
+    browsed.daemon.say(loop=stopped, drops=True)
+    page.click("[data-command=unlock]:enabled")
+    browsed.until("#question-text", "Really unlock?")
+    assert browsed.daemon.asked == [], "nothing is unlocked"
+    browsed.daemon.say(loop=stopped, drops=True, digest="b")
+    page.click("#confirm")
+    browsed.until("#answer", "unlock was refused: the file has changed")
+    browsed.until("#question-text", "Really unlock?")
+    page.click("#confirm")
+    browsed.until("#answer", "unlock: done")
+    assert browsed.daemon.asked == ["unlock"]
+
+
 def test_a_refusal_goes_after_some_seconds(browsed):
     page = browsed.open(token=True)
     browsed.daemon.say(loop={"phase": "running"}, refusal="no experiment is running")

@@ -163,6 +163,22 @@ async def test_a_confirmation_is_the_digest_of_a_question(tmp_path):
         )
 
 
+async def test_an_unlock_is_sent_at_once_and_confirmed_by_the_digest_of_its_question(tmp_path):
+    requests: list[Mapping[str, Any]] = []
+
+    async def unlock(request: Mapping[str, Any]) -> dict[str, Any]:
+        requests.append({key: value for key, value in request.items() if key not in ("command", "by")})
+        if not request.get("confirmed"):
+            raise CommandRefusedError("a tool in it drops", question="Unlock? A tool in it drops.", digest="d")
+        return {}
+
+    async with served(tmp_path, unlock=unlock) as page:
+        status, reply = await post(page, "/commands/unlock", **BEARER)
+        assert (status, reply["question"], reply["digest"]) == (409, "Unlock? A tool in it drops.", "d")
+        assert (await post(page, "/commands/unlock?digest=d", **BEARER))[0] == 200
+        assert requests == [{}, {"confirmed": True, "digest": "d"}]
+
+
 async def test_wrong_tokens_are_soon_refused_unread_and_seldom_logged(tmp_path, log):
     async with served(tmp_path) as page:
         statuses = [(await post(page, "/commands/start", Authorization="Bearer wrong"))[0] for _ in range(200)]

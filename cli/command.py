@@ -50,7 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     yes = "for release and unlock: the tool may drop; for tare: nothing is held"
     parser.add_argument("--yes", action="store_true", help=yes)
     add_connection(parser, addresses.COMMAND_ADDRESS, "the daemon's command address")
-    default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for unlock and release {addresses.UNLOCK_TIMEOUT_S:g} s"
+    default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for {', '.join(addresses.SLOW)} {addresses.UNLOCK_TIMEOUT_S:g} s"
     add_option(parser, "--timeout", TIMEOUT_S, "S", f"time to wait for the reply (default: {default})")
     parser.add_argument("--json", action="store_true", help="print the reply as JSON")
 
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         # It imports too much for a `stop` on a busy computer.
         from shearloop.daemon.messaging.client import send_command
 
-        if args.name in ("unlock", "release") and args.timeout is None:
+        if args.name in addresses.SLOW and args.timeout is None:
             # A missing daemon is reported without the long timeout.
             send_command(address, {"command": "status"}, addresses.COMMAND_TIMEOUT_S, keys)
             timeout_s = addresses.UNLOCK_TIMEOUT_S

@@ -19,6 +19,8 @@ _NAME_BYTES = 80
 COMMAND_TIMEOUT_S = 2.0
 # The robot may have to power up, release its brakes and start its program, and the gripper to activate.
 UNLOCK_TIMEOUT_S = 60.0
+# Commands that take longer than an answer: `start` reads a file, which a network drive may delay, and enables motion.
+SLOW = ("start", "unlock", "release")
 
 
 def expanded(address: str) -> str:

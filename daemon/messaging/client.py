@@ -127,6 +127,7 @@ async def ask(
     context: zmq.asyncio.Context, address: str, content: Mapping[str, Any], timeout_s: float, keys: ClientKeys | None
 ) -> dict[str, Any]:
     """Send one command and return the daemon's reply; raises UserError if no reply comes in time."""
+    may_act = content.get("command") not in ("status", "experiments") and not content.get("ask")
     with context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         connect(socket, address, keys)
@@ -135,9 +136,10 @@ async def ask(
                 await socket.send(encode(content))
                 return decode(await socket.recv())
         except TimeoutError as error:
+            late = ". One that runs may still carry it out: see `shearloop command status`" if may_act else ""
             raise UserError(
                 f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
-                f"or give the address of its `commands` key with --connect{keys_hint(keys)}"
+                f"or give the address of its `commands` key with --connect{keys_hint(keys)}{late}"
             ) from error
         except ValueError as error:
             raise foreign_reply(address, error) from error

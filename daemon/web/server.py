@@ -27,7 +27,7 @@ from aiohttp import WSCloseCode, web
 from shearloop.bank.fingertip import Fingertip
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging import messages
-from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S, needs_keys
+from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.callers import caller
 from shearloop.daemon.messaging.client import ask, connect
 from shearloop.daemon.messaging.keys import ClientKeys
@@ -57,8 +57,6 @@ WORDS = {"start": ("experiment", "digest"), "unlock": ("digest",), "release": ("
 ASKED_IF_NEEDED = ("unlock",)
 # The parts of a question, which a refusal has as well where another one is to be answered.
 QUESTION = ("question", "plan", "digest")
-# Those that take long.
-SLOW = ("unlock", "release")
 # Wrong tokens that are compared at once, and then per second.
 WRONG_BURST, WRONG_PER_S = 20.0, 1.0
 # Maximum redraw rate of a page.

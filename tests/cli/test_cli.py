@@ -176,6 +176,7 @@ def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, m
         (["command", "stop", "--connect", "tcp://127.0.0.1:7762a", "--timeout", "0.05"], "a whole number up to 65535"),
         (["listen", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no message came"),
         (["command", "tare", "--connect", "ipc:///nobody", "--timeout", "0.05"], "no daemon answered at ipc:///nobody"),
+        (["command", "tare", "--connect", "ipc:///nobody", "--timeout", "0.05"], "that runs may still carry it out"),
     ],
 )
 def test_a_command_line_mistake_is_one_sentence(arguments, part, mistake):
@@ -571,7 +572,7 @@ def test_invalid_emulators_and_recordings_are_refused_before_the_start(config, t
     assert "the recording cannot be read" in mistake("run", known, "--play", str(tmp_path / "none.mat"))
 
 
-def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, capsys, tmp_path):
+def test_what_takes_long_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, capsys, tmp_path):
     asked: list[tuple[str, float]] = []
 
     def answers(_address: str, content: dict[str, Any], timeout_s: float, _keys: object) -> dict[str, Any]:
@@ -580,9 +581,11 @@ def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(monkeypatch, caps
 
     monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", answers)
     assert main(["command", "unlock"]) == 0
+    assert main(["command", "start"]) == 0
     assert main(["command", "unlock", "--timeout", "5"]) == 0
     assert main(["command", "stop", "--connect", f"ipc://{tmp_path}/commands"]) == 0
-    assert asked == [("status", 2.0), ("unlock", 60.0), ("unlock", 5.0), ("stop", 2.0)]
+    long = [("status", 2.0), ("unlock", 60.0), ("status", 2.0), ("start", 60.0)]
+    assert asked == [*long, ("unlock", 5.0), ("stop", 2.0)]
     assert "unlock: done" in capsys.readouterr().out
 
 

@@ -76,6 +76,8 @@ class _StepSummary:
     from_ns: int
     to_ns: int
     holds: int = 0
+    # By the operator.
+    paused_s: float = 0.0
     set_point_nm: float | None = None
     # The first message of the closed loop that holds.
     held_from_ns: int | None = None
@@ -189,6 +191,8 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
     now_ns = content["t_mono_ns"]
     if run.last["phase"] == "held":
         run.held_s += _elapsed_s(run.last, content)
+    if run.last["phase"] == "paused" and run.steps:
+        run.steps[-1].paused_s += _elapsed_s(run.last, content)
     if content["response"] == "hold" and run.last["response"] != "hold":
         run.hold_reasons[FaultCode.of_text(_codes(content)[0]).value.kind] += 1
     run.last = content
@@ -230,7 +234,8 @@ def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[s
     for step in run.steps:
         took_s = (step.to_ns - step.from_ns) / 1e9
         details = {"identify": run.identified, "twist": f"   {counted(step.holds, 'angle')} held"}.get(step.name, "")
-        yield f"  step {step.number} of {run.first['steps']}  {step.name:<12} {took_s:6.1f} s{details}"
+        paused = f"   {step.paused_s:.1f} s of them paused" if step.paused_s else ""
+        yield f"  step {step.number} of {run.first['steps']}  {step.name:<12} {took_s:6.1f} s{paused}{details}"
         if step.set_point_nm is not None and step.held_from_ns is not None:
             here = [event for event in events if step.from_ns <= event[0] <= step.to_ns]
             yield from _held(step, step.set_point_nm, step.held_from_ns, run, truth, here)
@@ -283,8 +288,11 @@ def _held(
     for name, series in sources.items():
         held = series.acquired_between(from_ns, step.to_ns).torque_nm
         if held.size:
-            mean = f"    {name:<11} {_torque(held.mean(), '+.4f')} on average, standard deviation {held.std():.4f}"
-            yield f"{mean}, within ± {BAND:.0%} for {np.mean(_in_band(held, set_nm)):.0%} of the time"
+            near = np.mean(_in_band(held, set_nm))
+            # A band around 0 would have no width.
+            within = f", within ± {BAND:.0%} for {near:.0%} of the time" if set_nm else ""
+            mean = f"    {name:<11} {_torque(held.mean(), '+.4f')} on average"
+            yield f"{mean}, standard deviation {held.std():.4f}{within}"
     # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
     names = sorted(set(sources) - {driving}, key=lambda name: (name != TRUE, name != LOAD_CELL, name))
     for name in names[:1]:
@@ -302,7 +310,8 @@ def _held(
                 never = "not back by the end" if next_ns is None else "not back by the next one"
                 back = never if back_s == np.inf else f"back within ± {BAND:.0%} after {back_s:.1f} s"
                 since_s = (t_ns - from_ns) / 1e9
-                yield f"    disturbed after {since_s:.1f} s ({description}): {_torque(worst_nm, '.3f')} off, {back}"
+                off = f"    disturbed after {since_s:.1f} s ({description}): {_torque(worst_nm, '.3f')} off"
+                yield f"{off}, {back}" if set_nm else off
 
 
 def _in_band(torque_nm: FloatArray, set_nm: float) -> NDArray[np.bool_]:

@@ -305,11 +305,13 @@ def _hold_torque(step: steps.HoldTorqueStep) -> StepProgram:
 
 def _tighten(step: steps.TightenStep) -> StepProgram:
     start_rad = (yield StepCommand(activity="reading the wrist's angle")).wrist_rad
-    velocity = ConstantVelocity(steps.SIGNS[step.direction] * step.speed_rad_per_s)
+    sign = steps.SIGNS[step.direction]
+    velocity = ConstantVelocity(sign * step.speed_rad_per_s)
     while True:
         activity = f"turning {step.direction} until {step.until_torque_nm:.3f} N·m or {step.until_angle_rad:.2f} rad"
         view = yield StepCommand(velocity, activity=activity)
-        if view.torque_nm is not None and abs(view.torque_nm) >= step.until_torque_nm:
+        # A torque the other way is what the steps before have left.
+        if view.torque_nm is not None and sign * view.torque_nm >= step.until_torque_nm:
             return
         if abs(view.wrist_rad - start_rad) >= step.until_angle_rad:
             return

@@ -156,6 +156,20 @@ def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase):
     assert summary_of(loop_state(0, phase=phase)) == ""
 
 
+def test_the_pause_of_an_operator_is_told_beside_the_time_that_it_is_part_of():
+    paused = {"phase": "paused", "hold": 1}
+    text = summary_of_hold(None, [], loop_state(20, **paused), loop_state(23, **paused), loop_state(26.3, hold=1))
+    assert "hold_torque    34.0 s   6.3 s of them paused" in text
+
+
+def test_a_set_point_of_nothing_has_no_band():
+    states = [loop_state(t_s, hold=1, set_point_nm=0.0) for t_s in (10, 14)]
+    readings = [{"source": "right", "t_mono_ns": t_s * S, "torque_nm": 0.001, "valid": True} for t_s in range(15, 40)]
+    text = summary_of(*states, *readings, loop_state(44, phase="done", set_point_nm=0.0), sent=[(20 * S, "kick")])
+    assert "right       +0.0010 N·m on average, standard deviation 0.0000\n" in text
+    assert "within ±" not in text
+
+
 def test_where_a_screw_ended_and_what_it_took_is_told():
     truth = TorqueSeries(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
     turning = {"step_name": "tighten", "torque_source": "load_cell", "set_point_nm": None}

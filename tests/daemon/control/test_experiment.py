@@ -107,6 +107,13 @@ def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first():
         assert bench.wrist_rad == pytest.approx(-reached_rad, abs=0.002), "clockwise is negative"
 
 
+def test_a_torque_the_other_way_does_not_end_a_tightening():
+    tighten = {"do": "tighten", "until_torque_nm": 0.05, "until_angle_rad": 3.0}
+    bench = Bench(experiment({**tighten, "direction": "counterclockwise"}, {**tighten, "direction": "clockwise"}))
+    bench.run()
+    assert bench.wrist_rad == pytest.approx(-0.25, abs=0.002)
+
+
 def test_a_failed_action_stops_the_experiment_with_its_reason():
     machine = experiment({"do": "grip"}, {"do": "release"})
     assert not machine.end_action("of the step before")

@@ -7,7 +7,7 @@ from pathlib import Path
 from shearloop.cli.options import PORT, add_connection, add_fingertip, add_option, client_keys, load_fingertip
 from shearloop.cli.terminal import print_result
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
-from shearloop.errors import require
+from shearloop.errors import UserError, require
 
 PAGE_PORT = 7760
 
@@ -39,6 +39,11 @@ def _serve_page(args: argparse.Namespace) -> int:
     from shearloop.daemon.logs import logging_to_stderr
     from shearloop.daemon.web.server import DaemonAddress, default_token_path, load_token, serve
 
+    if (args.connect == PUBLISH_ADDRESS) != (args.commands == COMMAND_ADDRESS):
+        raise UserError(
+            f"the page would show the daemon at {args.connect} and stop the one at {args.commands}; give both "
+            "--connect and --commands of the same daemon"
+        )
     address = DaemonAddress(args.connect, args.commands, client_keys(args))
     path = args.token_file or default_token_path()
     token = load_token(path, new=args.new_token)

@@ -177,7 +177,13 @@ class Commands:
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}
 
     async def _stop(self, request: Request) -> Reply:
-        spare_daemon = bool(request.get("spare_daemon"))
+        # The process tells a page that showed another daemon.
+        return {**self._stopped(request), "process": os.getpid()}
+
+    def _stopped(self, request: Request) -> Reply:
+        """Stop what moves or is about to, else the daemon; return what was stopped."""
+        # A word that is not known may be a misspelt `spare_daemon`.
+        spare_daemon = bool(request.get("spare_daemon") or request.keys() - {"command", "by", "spare_daemon"})
         stopped = self.rig.runner.stop(also_idle=spare_daemon) if self.rig is not None else None
         waiting = self.experiment.call_off() if self.experiment is not None else None
         if stopped is not None:

@@ -153,6 +153,7 @@ class HealthReporter:
                 t_mono_ns=self.clock.now_ns(),
                 tasks=self.tasks(),
                 host=platform.node(),
+                process=os.getpid(),
                 rig=self.rig,
                 emulated=self.emulated,
                 cap=self.cap(),

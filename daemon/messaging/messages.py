@@ -268,6 +268,7 @@ class Health(Message):
         "", "per task: alive, done, restarts, rate_hz, expected_hz, errors by kind, and the latest error in a sentence"
     )
     host: str = column("", "name of the computer that the daemon runs on")
+    process: int = column("", "number of the daemon's process; `status` has it too")
     rig: str = column("", "name of the rig: the configuration's `name`, else that of its file")
     emulated: bool = column("", "whether every device is emulated, by `emulated: true` in the configuration")
     cap: str = column("", "cap on a robot's speeds and torque, and why; empty where none holds")

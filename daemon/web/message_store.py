@@ -17,6 +17,7 @@ from shearloop.daemon.messaging.messages import (
     DaemonEnd,
     EitEstimate,
     EitHeatmap,
+    Health,
     LoopStop,
     stop_times,
 )
@@ -68,6 +69,8 @@ class MessageStore:
         self.number = 0
         # Whether the latest message says that the daemon has ended.
         self._ended = False
+        # The daemon's process, by its latest `health`.
+        self.process: int | None = None
         self.refused: Counter[str] = Counter()
         self._log = EventLog()
 
@@ -88,6 +91,8 @@ class MessageStore:
                 return
             self.number += 1
             self._ended = topic == DaemonEnd.topic
+            if topic == Health.topic:
+                self.process = content.get("process")
             self._stored[topic, source] = StoredMessage(self.number, now_s, text.removeprefix("{"))
             self._log.add(topic, content, self.number)
             if topic in CHARTED:

@@ -150,8 +150,24 @@ class Bridge:
 
     async def command(self, name: str, **arguments: bool | str) -> dict[str, Any]:
         """Return the daemon's reply to a command; raise UserError without a reply."""
+        if name != "experiments":
+            status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
+            self._check_shown(status.get("daemon", {}).get("process"), "nothing was sent to it")
         content = {"command": name, "by": caller(PROGRAM), **arguments}
         return await self._request(content, UNLOCK_TIMEOUT_S if name in SLOW else COMMAND_TIMEOUT_S)
+
+    def _check_shown(self, process: int | None, done: str) -> None:
+        """Raise UserError if the page shows another daemon than this process; `done` says what that one did.
+
+        After a restart of the daemon they differ for a second.
+        """
+        shown = self.latest.process
+        if shown is not None and process not in (None, shown):
+            raise UserError(
+                f"the page shows the daemon at {self.address.publish}, process {shown}, and the one at "
+                f"{self.address.commands} is process {process}: {done}. After a restart of the daemon try again; else "
+                "start the page with the addresses of one daemon"
+            )
 
     async def stop(self) -> dict[str, Any]:
         """Return the daemon's reply to a stop of all motion; simultaneous calls share one request.
@@ -170,7 +186,9 @@ class Bridge:
             # A local daemon accepts it even without valid keys.
             with contextlib.suppress(TimeoutError, StopSocketTakenError):
                 reply = await asyncio.to_thread(send_to_stop_socket, address, content, COMMAND_TIMEOUT_S)
-        return reply or await self._request(content, COMMAND_TIMEOUT_S)
+        reply = reply or await self._request(content, COMMAND_TIMEOUT_S)
+        self._check_shown(reply.get("process"), "that one was stopped")
+        return reply
 
     async def _request(self, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
         return await ask(self._context, self.address.commands, content, timeout_s, self.address.keys)

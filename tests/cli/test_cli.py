@@ -303,6 +303,11 @@ def test_other_spellings_work_and_answer_with_the_command(old, new, ran, tmp_pat
     assert set(OTHER_SPELLINGS).isdisjoint(COMMANDS)
 
 
+@pytest.mark.parametrize("one", [("--connect", "tcp://127.0.0.1:8791"), ("--commands", "tcp://127.0.0.1:8792")])
+def test_a_page_of_one_daemon_does_not_command_another(one, mistake):
+    assert "give both --connect and --commands of the same daemon" in mistake("view", *one)
+
+
 @pytest.mark.parametrize("word", ["release", "resume", "start", "tare", "unlock"])
 def test_what_may_move_the_rig_is_named_and_not_carried_out_without_the_word_command(word, ran, monkeypatch):
     monkeypatch.setattr("shearloop.cli.command.run", Mock(side_effect=AssertionError))

@@ -1,6 +1,7 @@
 """The way out: a gripped tool can be released by an explicit command; and nothing is tared, or torn, that is held."""
 
 import asyncio
+import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -378,4 +379,7 @@ async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
         assert reply["held"] == "its fingers hold something 30.0 mm wide, with an unknown force"
         cell.holding = False
         await cell.cycles(2)
-        assert await stop_command({}) == {"ended": True}
+        assert "ended" not in await stop_command({"command": "stop", "spare_deamon": True}), (
+            "a misspelt word ends nothing"
+        )
+        assert await stop_command({}) == {"ended": True, "process": os.getpid()}

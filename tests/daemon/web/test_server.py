@@ -32,6 +32,7 @@ from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.web import server as server_module
 from shearloop.daemon.web.message_store import MessageStore
 from shearloop.daemon.web.server import (
+    ASKED,
     HEADERS,
     NEEDS_TOKEN,
     WRONG_BURST,
@@ -177,6 +178,27 @@ async def test_an_unlock_is_sent_at_once_and_confirmed_by_the_digest_of_its_ques
         assert (status, reply["question"], reply["digest"]) == (409, "Unlock? A tool in it drops.", "d")
         assert (await post(page, "/commands/unlock?digest=d", **BEARER))[0] == 200
         assert requests == [{}, {"confirmed": True, "digest": "d"}]
+
+
+async def test_a_page_that_shows_one_daemon_moves_no_other_one_and_says_which_it_stopped(tmp_path):
+    async def status(_request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"tasks": {}, "daemon": {"process": 22, "rig": "other", "folder": "/"}}
+
+    async def stop(_request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"stopped": "hold", "process": 22}
+
+    async with served(tmp_path, status=status, stop=stop) as page:
+        shown = {"source": "daemon", "timestamp": 0.0, "t_mono_ns": 0, "seq": 0, "topic": "health"}
+        for process, answers in ((22, 200), (11, 503)):
+            page.bridge.latest.add("health", {**shown, "process": process}, 0.0)
+            for name in NEEDS_TOKEN:
+                digest = "?digest=d" if name in ASKED else ""
+                code, _ = await post(page, f"/commands/{name}{digest}", **BEARER)
+                assert code == (409 if (name, answers) == ("pause", 200) else answers), name
+            code, reply = await post(page, "/stop")
+            assert (code, reply["ok"]) == (answers, answers == 200)
+        assert "process 22: that one was stopped" in reply["reason"]
+        assert len(page.asked) == len(NEEDS_TOKEN), "nothing was sent to the other daemon"
 
 
 async def test_wrong_tokens_are_soon_refused_unread_and_seldom_logged(tmp_path, log):

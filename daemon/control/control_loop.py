@@ -106,6 +106,8 @@ class ControlLoop:
         self.experiment: Experiment | None = None
         # How many experiments have begun.
         self.runs = 0
+        # Requests of other programs to the gripper that are known; one that comes during an experiment is a fault.
+        self._others_requests = 0
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
         self.config = config
         self._sources = sources
@@ -171,7 +173,11 @@ class ControlLoop:
         """Forget a grip that the gripper does not have at present: the next one has an angle of its own."""
         gripped, judged = self._gripped, self._on_judged
         why = gripped.grip.why_another(gripper)
-        if judged is not None and not gripper.moving:
+        if gripper.others_requests != self._others_requests:
+            self._others_requests = gripper.others_requests
+            # The tool may have been exchanged, or gripped tighter.
+            why = why or "another program, or the pendant, has commanded it since then"
+        if judged is not None and (why or not gripper.moving):
             self._on_judged = None
             judged(why)
         if why and (gripped.grip.known or judged is not None):
@@ -239,8 +245,9 @@ class ControlLoop:
         gripper, force_n = self.inputs.gripper, self._gripped.grip.force_n
         if "gripper" not in self._watched.required or gripper is None or not gripper.holding:
             return None
-        force = f"with at most {force_n:g} N" if force_n is not None else "with an unknown force"
-        return f"its fingers hold something {gripper.width_mm:.1f} mm wide, {force}"
+        known = force_n is not None and gripper.others_requests == self._others_requests
+        force = f"with at most {force_n:g} N" if known else "with an unknown force"
+        return f"{gripper.fingers}, {force}"
 
     @property
     def may_still_hold(self) -> str | None:
@@ -439,6 +446,7 @@ class ControlLoop:
                 twisted_rad=0.0 if arm is None or origin_rad is None else arm.wrist_rad - origin_rad,
                 expected_nm=controller.torque_nm if controller is not None else None,
                 overdue=running.overdue,
+                others_requests=self._others_requests,
             )
         found = [*detect_faults(self.inputs, watched, self.config, t_ns), *self._reported]
         self._reported.clear()

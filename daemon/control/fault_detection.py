@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
-from shearloop.daemon.control.inputs import LatestInputs
+from shearloop.daemon.control.inputs import GripperStatus, LatestInputs
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import stale_after_s
@@ -47,6 +47,8 @@ class Watched:
     twisted_rad: float = 0.0
     expected_nm: float | None = None
     overdue: str | None = None
+    # Requests of other programs to the gripper before the experiment; None while none runs.
+    others_requests: int | None = None
     # Factor on the deadlines for states and decisions: above 1 on an emulated rig alone, which cannot hurt.
     patience: float = 1.0
 
@@ -193,17 +195,23 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
         elif arm.blocked:
             found.append(Fault(FaultCode.ROBOT_BLOCKED, arm.blocked, t_ns=arm.t_ns))
     if gripper is not None and has_gripper:
-        age_s = (t_ns - gripper.t_ns) / 1e9
-        if age_s > watched.patience * HAND_STALE_S:
-            silent = f"the gripper last reported its state {age_s:.1f} s ago"
-            found.append(Fault(FaultCode.STATE_STALE, silent, t_ns=gripper.t_ns))
-        elif gripper.fault:
-            found.append(Fault(FaultCode.GRIPPER_FAULT, gripper.fault, t_ns=gripper.t_ns))
-        elif watched.grasp is Grasp.HELD and not gripper.holding:
-            empty = f"its fingers are {gripper.width_mm:.1f} mm apart with nothing between them"
-            found.append(Fault(FaultCode.GRIP_LOST, empty, t_ns=gripper.t_ns))
+        found += _gripper_faults(gripper, watched, t_ns)
     for name, reason in lost.items():
         if name in watched.required and name not in awaited:
             gone = (FaultCode.ROBOT_LOST, reason) if name == "robot" else (FaultCode.DEVICE_LOST, f"{name}: {reason}")
             found.append(Fault(*gone))
     return found
+
+
+def _gripper_faults(gripper: GripperStatus, watched: Watched, t_ns: int) -> list[Fault]:
+    age_s = (t_ns - gripper.t_ns) / 1e9
+    if age_s > watched.patience * HAND_STALE_S:
+        silent = f"the gripper last reported its state {age_s:.1f} s ago"
+        return [Fault(FaultCode.STATE_STALE, silent, t_ns=gripper.t_ns)]
+    if gripper.fault:
+        return [Fault(FaultCode.GRIPPER_FAULT, gripper.fault, t_ns=gripper.t_ns)]
+    if watched.others_requests not in (None, gripper.others_requests):
+        return [Fault(FaultCode.GRIPPER_COMMANDED, gripper.fingers, t_ns=gripper.t_ns)]
+    if watched.grasp is Grasp.HELD and not gripper.holding:
+        return [Fault(FaultCode.GRIP_LOST, gripper.fingers, t_ns=gripper.t_ns)]
+    return []

@@ -50,8 +50,8 @@ class FingerMotion:
             if not self._commands:
                 self._over.append((self._under_way[0], min(state.t_ns, self._ends_ns)))
                 self._under_way = None
-        elif before is not None and before.object is not state.object:
-            # The whole motion lies between two states: the fingers lost the tool, or met one.
+        elif before is not None and _differ(before, state):
+            # The whole motion lies between two states: the fingers lost the tool, met one, or gripped it anew.
             self._over.append((before.t_ns, state.t_ns))
 
     def moved_between(self, from_ns: int, to_ns: int) -> bool:
@@ -73,3 +73,7 @@ class FingerMotion:
             self._under_way = None
         began_ns = from_ns if self._under_way is None else self._under_way[0]
         self._under_way = began_ns, sign_ns
+
+
+def _differ(one: GripperState, other: GripperState) -> bool:
+    return one.object is not other.object or one.others_requests != other.others_requests

@@ -175,4 +175,5 @@ def status_of(state: GripperState) -> GripperStatus:
         # the fingers where they are, possibly on a tool.
         uncertain=state.object is ObjectStatus.UNKNOWN,
         requested_counts=state.requested_counts,
+        others_requests=state.others_requests,
     )

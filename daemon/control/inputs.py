@@ -31,7 +31,8 @@ class GripperStatus:
     """State of the gripper, as far as the loop needs it.
 
     `uncertain`: the gripper cannot say whether it holds an object, because it is inactive, lost its power, or was
-    stopped on its way. `requested_counts`: the position that it was last asked for, by anybody.
+    stopped on its way. `requested_counts`: the position that it was last asked for, by anybody. `others_requests`: how
+    many requests of other programs were seen.
     """
 
     t_ns: int
@@ -41,6 +42,19 @@ class GripperStatus:
     fault: str = ""
     uncertain: bool = False
     requested_counts: int | None = None
+    others_requests: int = 0
+
+    @property
+    def fingers(self) -> str:
+        """What its fingers do, with their width."""
+        width = f"{self.width_mm:.1f} mm"
+        if self.holding:
+            return f"its fingers hold something {width} wide"
+        if self.moving:
+            return f"its fingers move, {width} apart"
+        if self.uncertain:
+            return f"its fingers stand {width} apart, and it cannot say whether they hold something"
+        return f"its fingers are {width} apart with nothing between them"
 
 
 @dataclass(slots=True)

@@ -115,8 +115,15 @@ class FaultCode(Enum):
         "Clear the fault. `shearloop command unlock` then activates the gripper again, which opens its fingers: where "
         "they may hold a tool, it asks first.",
     )
+    GRIPPER_COMMANDED = Rule(
+        _KEEP,
+        "another program, or the pendant, commands the gripper: {detail}.",
+        "Let nothing else command it, look at the tool, then `shearloop command unlock`.",
+    )
     GRIP_LOST = Rule(
-        _KEEP, "the gripper no longer holds an object: {detail}.", "Put the tool back, then `shearloop command unlock`."
+        _KEEP,
+        "the gripper no longer holds an object: {detail}.",
+        "Put the tool back if it is not between the fingers, then `shearloop command unlock`.",
     )
     NOT_RELEASED = Rule(
         _KEEP,

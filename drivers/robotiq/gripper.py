@@ -19,6 +19,7 @@ from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import DeviceCalibrationError, DriverError
 from shearloop.drivers.robotiq import messages
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel, ModelName
+from shearloop.drivers.robotiq.requests import RequestWatch
 
 if TYPE_CHECKING:
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
@@ -198,7 +199,7 @@ class RobotiqGripper:
     latest: messages.GripperState | None = field(default=None, init=False)
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
     _seq: int = field(default=0, init=False)
-    _last_move: messages.GripperMove | None = field(default=None, init=False)
+    _requests: RequestWatch = field(default_factory=RequestWatch, init=False)
     _loss: DriverError | None = field(default=None, init=False)
     # The latest readout since the last request, and its beginning.
     _latest: tuple[messages.Readout, int] | None = field(default=None, init=False)
@@ -217,8 +218,7 @@ class RobotiqGripper:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
         await self._exchange(self.client.connect)
         self.connected, self._loss = True, None
-        # Another program may have commanded the gripper since.
-        self._last_move = None
+        self._requests.on_connection()
         return await self.read()
 
     async def close(self) -> None:
@@ -247,7 +247,6 @@ class RobotiqGripper:
                 )
             if not blocking_fault(readout):
                 return self._state(readout, t_ns)
-        self._last_move = None
         await self._write(messages.GripperAction.RESET)
         not_reset = "The gripper does not take the reset; check that nothing else commands it."
         await self._wait_until(
@@ -272,7 +271,6 @@ class RobotiqGripper:
         readout, _ = await self._recent()
         if blocking := blocking_fault(readout):
             raise messages.GripperFaultError(blocking)
-        self._last_move = sent
         await self._write(sent)
         return sent
 
@@ -280,13 +278,18 @@ class RobotiqGripper:
         """Return the state at the end of the motion: at its target, or on an object."""
 
         def has_finished(readout: messages.Readout) -> bool:
-            if self._last_move is not sent:
+            if self._requests.sent is not sent:
                 raise messages.GripperRefusedError(
                     "Another command took over before the gripper had finished its motion."
                 )
+            if self._requests.overtaken:
+                raise messages.GripperRefusedError(
+                    "Another program commanded the gripper before it had finished its motion; end that program, or "
+                    "leave the gripper to it."
+                )
             if blocking := blocking_fault(readout):
                 raise messages.GripperFaultError(blocking)
-            return object_status(readout, sent) is not messages.ObjectStatus.MOVING
+            return self._requests.carries_out(readout) and readout.obj is not messages.ObjectStatus.MOVING
 
         return await self._wait_until(
             has_finished,
@@ -309,7 +312,6 @@ class RobotiqGripper:
 
     async def halt(self) -> None:
         """Stop the fingers where they are; they keep their grip. An activation is ended by a reset."""
-        self._last_move = None
         await self._write(messages.GripperAction.HALT)
         readout, _ = await self._read(whole=True)
         # The status may not show an activation yet that has just been requested. A major fault stops the fingers, and
@@ -365,6 +367,7 @@ class RobotiqGripper:
 
     async def _read(self, *, whole: bool = False) -> tuple[messages.Readout, int]:
         self._latest = await self._exchange(partial(self.client.read, whole=whole))
+        self._requests.take(*self._latest)
         self._news.set()
         self._news.clear()
         return self._latest
@@ -385,9 +388,18 @@ class RobotiqGripper:
         return await self._read()
 
     async def _write(self, request: messages.Request) -> None:
-        self._latest = None
+        self._note(request)
         await self._exchange(partial(self.client.write, request))
+        # A readout may have come before the write.
         self._latest = None
+
+    def _note(self, request: messages.Request) -> None:
+        """Expect a request's echo from here on."""
+        self._latest, t_ns = None, time.monotonic_ns()
+        if isinstance(request, messages.GripperMove):
+            self._requests.on_move(request, t_ns)
+        else:
+            self._requests.on_action(t_ns)
 
     async def _exchange(self, exchange: Callable[[], Awaitable[T]]) -> tuple[T, int]:
         """Return an exchange's result and its beginning. It goes on when its caller is cancelled.
@@ -417,11 +429,12 @@ class RobotiqGripper:
             position_counts=readout.pos,
             width_mm=self.calibration.width_mm(readout.pos),
             width_std_mm=self.calibration.width_std_mm,
-            object=object_status(readout, self._last_move),
+            object=self._requests.object_status(readout),
             activation=readout.sta,
             current_ma=None if readout.current is None else readout.current * messages.MA_PER_COUNT,
             fault=messages.fault_of(readout.flt),
             requested_counts=readout.pre,
+            others_requests=self._requests.others,
         )
         self._seq += 1
         return state
@@ -432,18 +445,6 @@ def _is_active(readout: messages.Readout) -> bool:
     if readout.act and readout.flt >= _OVER_TEMPERATURE and readout.flt != _NO_COMMUNICATION:
         raise messages.GripperFaultError(messages.fault_of(readout.flt).sentence)
     return readout.act and readout.sta is messages.ActivationStatus.ACTIVE
-
-
-def object_status(readout: messages.Readout, last: messages.GripperMove | None) -> messages.ObjectStatus:
-    """Return what the fingers met in the last motion requested.
-
-    Until the gripper has taken up a target (GTO is 1 and the echo PRE equals it), OBJ belongs to the motion before.
-    """
-    if readout.sta is not messages.ActivationStatus.ACTIVE:
-        return messages.ObjectStatus.UNKNOWN
-    if last is not None and not (readout.gto and readout.pre == last.position):
-        return messages.ObjectStatus.MOVING
-    return readout.obj if readout.gto else messages.ObjectStatus.UNKNOWN
 
 
 def blocking_fault(readout: messages.Readout) -> str:

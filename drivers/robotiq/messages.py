@@ -131,7 +131,8 @@ class GripperState:
     """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were requested).
 
     width_mm ± width_std_mm is the width between the fingertips. `object` is MOVING until the gripper has taken up the
-    last command. `requested_counts` is the position that it was last asked for, by anybody.
+    last command. `requested_counts` is the position that it was last asked for, by anybody, and `others_requests` how
+    many requests of other programs were seen since the process began.
     """
 
     t_ns: int
@@ -143,6 +144,7 @@ class GripperState:
     current_ma: float | None
     fault: GripperFault
     requested_counts: int | None = None
+    others_requests: int = 0
 
     @property
     def moves(self) -> bool:

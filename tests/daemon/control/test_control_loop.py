@@ -9,6 +9,8 @@ import pytest
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, TareStep
+from shearloop.daemon.control.grip import Grip
+from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.safety import FaultCode, Response
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.torques import TorqueSample
@@ -149,6 +151,93 @@ def test_a_tool_that_is_taken_away_is_noticed_though_nobody_expected_it(step):
     rig.step()
     assert FaultCode.GRIP_LOST in {trouble.code for trouble in rig.control_loop.status.decision.faults}
     assert phase(rig) is ExperimentPhase.STOPPED
+
+
+@pytest.mark.parametrize(
+    ("sense", "force_n", "does", "note"),
+    [
+        ({}, 60.0, "its fingers hold something 19.7 mm wide", True),
+        ({"moving": True}, 0.0, "its fingers move, 19.7 mm apart", False),
+        ({}, 0.0, "its fingers are 19.7 mm apart with nothing between them", False),
+    ],
+)
+def test_a_gripper_that_another_program_commands_stops_the_twist_and_says_what_it_holds(sense, force_n, does, note):
+    """A request from the pendant before the start is none of the experiment's; one during it is."""
+    rig = Rig(new_loop())
+    rig.hand = replace(rig.hand, others_requests=1)
+    rig.meets = True
+    started(rig, GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
+    rig.run(5)
+    assert phase(rig) is ExperimentPhase.RUNNING
+    assert "30.0 mm wide, with at most 60 N" in rig.control_loop.release_question()
+    rig.hand, rig.force_n, rig.width_mm = replace(rig.hand, others_requests=2, **sense), force_n, 19.7
+    rig.step()
+    assert phase(rig) is ExperimentPhase.STOPPED
+    (fault,) = rig.control_loop.status.decision.reported
+    assert fault.cause == f"another program, or the pendant, commands the gripper: {does}"
+    rig.step()
+    codes = [fault.code for fault in rig.control_loop.status.decision.reported]
+    assert (FaultCode.TOOL_GRIPPED in codes) is note
+    question = rig.control_loop.release_question()
+    assert ("hold something 19.7 mm wide, with an unknown force" in question) is note
+    assert ("does not say that it holds something" in question) is not note
+
+
+@pytest.mark.parametrize("seen_moving", [False, True])
+def test_a_grip_that_another_program_has_changed_has_neither_our_force_nor_our_angle(seen_moving):
+    rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 60})
+    rig.run(2)
+    stop(rig)
+    rig.run(0.1)
+    assert rig.control_loop.grip.origin_rad is not None
+    assert "with at most 60 N" in (rig.control_loop.held or "")
+    rig.hand = replace(rig.hand, others_requests=1, requested_counts=250)
+    if seen_moving:
+        standing, force_n = rig.hand, rig.force_n
+        rig.hand, rig.force_n = replace(rig.hand, moving=True), 0.0
+        rig.run(0.1)
+        rig.hand, rig.force_n = standing, force_n
+    rig.run(0.1)
+    assert not rig.control_loop.grip.known
+    assert "has commanded it since then" in rig.control_loop.status.decision.reasons[-1]
+    assert "with an unknown force" in (rig.control_loop.held or "")
+    rig.control_loop.acknowledge()
+    started(rig, GRIP, {"do": "wait", "wait_s": 60})
+    rig.run(2)
+    assert "with at most 60 N" in (rig.control_loop.held or "")
+    assert phase(rig) is ExperimentPhase.RUNNING
+
+
+def test_a_grip_of_an_earlier_process_that_another_program_changes_is_not_the_present_one():
+    """Also where its first states show the fingers in motion, and then on something of the same width."""
+    judged: list[str] = []
+    loop = new_loop()
+    loop.restore_grip(Grip(0.3, 60.0, 30.0, 230), judged.append)
+    states = [
+        {"holding": False, "moving": True, "requested_counts": 230},
+        {"holding": False, "moving": True, "requested_counts": 250, "others_requests": 1},
+        {"holding": True, "moving": False, "requested_counts": 250, "others_requests": 1},
+    ]
+    for number, state in enumerate(states):
+        loop.on_gripper(GripperStatus(number, 30.0, **state))
+    assert judged == ["another program, or the pendant, has commanded it since then"]
+    assert not loop.grip.known
+
+
+@pytest.mark.parametrize(
+    ("sense", "does"),
+    [
+        ({"moving": True}, "its fingers move, 30.0 mm apart"),
+        ({"uncertain": True}, "its fingers stand 30.0 mm apart, and it cannot say whether they hold something"),
+        ({}, "its fingers are 30.0 mm apart with nothing between them"),
+    ],
+)
+def test_a_grip_that_is_lost_says_what_the_fingers_do(sense, does):
+    rig = twisting()
+    rig.hand, rig.force_n = replace(rig.hand, **sense), 0.0
+    rig.step()
+    (fault,) = rig.control_loop.status.decision.reported
+    assert fault.cause == f"the gripper no longer holds an object: {does}"
 
 
 @pytest.mark.parametrize(

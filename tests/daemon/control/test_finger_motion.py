@@ -11,9 +11,13 @@ HELD, MOVING, OPEN = ObjectStatus.CONTACT_CLOSING, ObjectStatus.MOVING, ObjectSt
 
 
 def state(
-    t_ms: int, status: ObjectStatus, activation: ActivationStatus = ActivationStatus.ACTIVE, fault: int = 0
+    t_ms: int,
+    status: ObjectStatus,
+    activation: ActivationStatus = ActivationStatus.ACTIVE,
+    fault: int = 0,
+    others_requests: int = 0,
 ) -> GripperState:
-    return GripperState(t_ms * MS, 100, 20.0, 0.5, status, activation, None, fault_of(fault))
+    return GripperState(t_ms * MS, 100, 20.0, 0.5, status, activation, None, fault_of(fault), None, others_requests)
 
 
 def moved(motion: FingerMotion, from_ms: int, to_ms: int) -> bool:
@@ -53,6 +57,10 @@ def test_fingers_that_lost_their_tool_between_two_states_have_moved():
     motion.take(state(200, OPEN))
     assert moved(motion, 120, 130)
     assert not moved(motion, 201, 300)
+    motion.take(state(400, HELD))
+    motion.take(state(500, HELD, others_requests=1))
+    assert moved(motion, 420, 430), "another program has gripped it anew"
+    assert not moved(motion, 501, 600)
 
 
 @pytest.mark.parametrize("changes", [{"activation": ActivationStatus.ACTIVATING}, {"fault": 11}])

@@ -51,6 +51,35 @@ async def test_gripper_activates_moves_and_measures_an_object(way, tmp_path):
 
 
 @WAYS
+async def test_a_grip_that_another_program_closes_is_a_grip(way, tmp_path):
+    """The pendant opens the gripper, closes it on a tool, and then tighter."""
+    async with a_rig(way, tmp_path, active=True) as rig:
+        driver, model = rig.driver, rig.model
+        await driver.finish(await driver.move(messages.GripperCommand(60.0)))
+        model.object_mm = 31.7
+        for others, position in enumerate((0, 240, 250), 1):
+            model.write(replace(model.command, pos=position))
+            state = await driver.read()
+            while state.others_requests < others or state.moves:
+                state = await driver.read()
+            assert state.others_requests == others
+            assert state.object.value == model.obj
+        assert state.object is messages.ObjectStatus.CONTACT_CLOSING
+        assert state.diameter_mm == pytest.approx(31.7, abs=0.5)
+
+
+@WAYS
+async def test_a_motion_that_another_program_takes_over_does_not_end_well(way, tmp_path):
+    async with a_rig(way, tmp_path, active=True) as rig:
+        sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
+        while (await rig.driver.read()).width_mm >= 140:
+            pass
+        rig.model.write(replace(rig.model.command, pos=3, spe=255))
+        with pytest.raises(messages.GripperRefusedError, match="Another program commanded the gripper"):
+            await rig.driver.finish(sent)
+
+
+@WAYS
 async def test_halted_gripper_reports_no_object(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
         sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
@@ -149,9 +178,13 @@ async def test_commands_are_clipped():
 
 
 @WAYS
-@pytest.mark.parametrize("command", [{"gto": False}, {"pos": 250}], ids=["halted", "sent further"])
-async def test_command_of_another_master_is_seen_at_the_next_poll(way, tmp_path, command):
-    """Position and object stay the same, but the target is no longer ours."""
+@pytest.mark.parametrize(
+    ("command", "holds", "others"),
+    [({"gto": False}, False, 0), ({"pos": 250}, True, 1)],
+    ids=["halted", "sent further"],
+)
+async def test_command_of_another_master_is_seen_at_the_next_poll(way, tmp_path, command, holds, others):
+    """Position and object stay the same, but the target is no longer ours. A halted gripper tells of no object."""
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
         await rig.driver.activate()
@@ -163,4 +196,5 @@ async def test_command_of_another_master_is_seen_at_the_next_poll(way, tmp_path,
         rig.model.write(replace(rig.model.command, **command))
         rig.model.step(STEP_S)
         assert rig.model.obj == messages.ObjectStatus.CONTACT_CLOSING
-        assert (await anext(states)).diameter_mm is None
+        state = await anext(states)
+        assert (state.diameter_mm is not None, state.others_requests) == (holds, others)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from shearloop.drivers.robotiq import gripper as gripper_module
 from shearloop.drivers.robotiq import messages
-from shearloop.drivers.robotiq.gripper import PAUSE_NS, RobotiqGripper, object_status
+from shearloop.drivers.robotiq.gripper import PAUSE_NS, RobotiqGripper
+from shearloop.drivers.robotiq.requests import ECHOED_WITHIN_NS, RequestWatch
 from tests.drivers.robotiq.gripper_rig import CALIBRATION
 
 S = 10**9
@@ -82,12 +83,66 @@ async def test_activation_that_hangs_or_fails_is_reported(connect, readouts, fai
         await connect(Client(*readouts)).activate(operator_confirmed=True)
 
 
-@given(st.sampled_from([status for status in messages.ObjectStatus if status >= 0]), st.integers(0, 255), st.booleans())
+OBJECTS = st.sampled_from([status for status in messages.ObjectStatus if status >= 0])
+TAKEN_UP = replace(ACTIVE, pre=GO.position)
+
+
+def watching(*readouts: messages.Readout, sent: messages.GripperMove | None = GO) -> RequestWatch:
+    """Return a watch over a move and the readouts after it, with 0.1 s between them."""
+    watch = RequestWatch()
+    if sent is not None:
+        watch.on_move(sent, 0)
+    for number, readout in enumerate(readouts, 1):
+        watch.take(readout, number * S // 10)
+    return watch
+
+
+@given(OBJECTS, st.integers(0, 255), st.booleans())
 def test_object_status_counts_only_for_the_last_target(obj, pre, gto):
     readout = replace(ACTIVE, obj=obj, pre=pre, gto=gto)
-    believed = object_status(readout, GO)
+    believed = watching(readout).object_status(readout)
     assert believed is (obj if gto and pre == GO.position else messages.ObjectStatus.MOVING)
-    assert object_status(readout, None) is (obj if gto else messages.ObjectStatus.UNKNOWN)
+    assert watching(readout, sent=None).object_status(readout) is (obj if gto else messages.ObjectStatus.UNKNOWN)
+
+
+@given(OBJECTS, st.integers(0, 255), st.booleans())
+def test_once_a_move_is_taken_up_the_object_status_counts_for_whoever_moves_the_fingers(obj, pre, gto):
+    readout = replace(ACTIVE, obj=obj, pre=pre, gto=gto)
+    watch = watching(ACTIVE, TAKEN_UP, readout)
+    assert watch.object_status(readout) is (obj if gto else messages.ObjectStatus.UNKNOWN)
+    assert watch.others == (pre != GO.position)
+    assert watch.overtaken == (pre != GO.position)
+    # The next move of our own is awaited again, and nobody else's.
+    watch.on_move(replace(GO, position=(pre + 1) % 256), S)
+    assert watch.object_status(readout) is messages.ObjectStatus.MOVING
+    watch.take(readout, S + S // 10)
+    assert watch.others == (pre != GO.position)
+    assert not watch.overtaken
+
+
+def test_a_move_that_is_never_taken_up_leaves_the_object_status_to_the_gripper():
+    """Another program's request right behind it: ours is never echoed."""
+    held = replace(ACTIVE, obj=messages.ObjectStatus.CONTACT_CLOSING)
+    watch = watching(held)
+    assert watch.object_status(held) is messages.ObjectStatus.MOVING
+    watch.take(held, ECHOED_WITHIN_NS + 1)
+    assert watch.object_status(held) is messages.ObjectStatus.CONTACT_CLOSING
+
+
+def test_a_request_of_our_own_that_changes_the_echo_is_nobody_elses():
+    watch = watching(ACTIVE, TAKEN_UP)
+    watch.on_action(S)
+    watch.take(TAKEN_UP, S + 1)
+    watch.take(ACTIVE, S + 2)
+    watch.take(RESET, 5 * S)
+    watch.take(replace(ACTIVE, pre=3), 6 * S)
+    assert watch.others == 0
+    watch.on_connection()
+    watch.take(replace(ACTIVE, pre=3), 7 * S)
+    assert watch.others == 0
+    watch.on_connection()
+    watch.take(replace(ACTIVE, pre=7), 8 * S)
+    assert watch.others == 1, "while the connection was lost"
 
 
 @pytest.mark.parametrize(
@@ -96,9 +151,10 @@ def test_object_status_counts_only_for_the_last_target(obj, pre, gto):
 def test_inactive_gripper_holds_nothing(sta):
     """After a power failure the fingers stay in place without force."""
     held = replace(ACTIVE, obj=messages.ObjectStatus.CONTACT_CLOSING, pre=GO.position, gto=True)
-    for last in (GO, None):
-        assert object_status(held, last) is messages.ObjectStatus.CONTACT_CLOSING
-        assert object_status(replace(held, sta=sta), last) is messages.ObjectStatus.UNKNOWN
+    for sent in (GO, None):
+        watch = watching(held, sent=sent)
+        assert watch.object_status(held) is messages.ObjectStatus.CONTACT_CLOSING
+        assert watch.object_status(replace(held, sta=sta)) is messages.ObjectStatus.UNKNOWN
 
 
 @pytest.mark.parametrize("obj", [messages.ObjectStatus.CONTACT_CLOSING, messages.ObjectStatus.AT_TARGET])

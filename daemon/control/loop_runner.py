@@ -65,6 +65,8 @@ class ControlLoopRunner:
         self.states = StatePublisher(publisher, control_loop)
         self._running = False
         self._stopped = True
+        # The latest experiment whose stop has a timeline.
+        self._timed: Experiment | None = None
         self._decided_ns = 0
         # Counts the stops, also while an experiment starts.
         self._stop_count = 0
@@ -128,13 +130,13 @@ class ControlLoopRunner:
         self._control_loop.stop(reason, fault)
 
     def decide_now(self) -> None:
-        """Decide without a new state, at the daemon's end."""
+        """Decide without a new state: at the daemon's end, and before a stop is acknowledged."""
         if not self._running:
             return
         try:
             self._decide()
         except Exception:  # noqa: BLE001 - the worker stops the arm as it ends
-            structlog.get_logger().exception("the loop crashed at its last decision")
+            structlog.get_logger().exception("the loop crashed at a decision without a new state")
 
     @property
     def stop_count(self) -> int:
@@ -231,6 +233,8 @@ class ControlLoopRunner:
         """
         if (reason := self.unlock_refusal()) is not None:
             return reason
+        # A stop since the latest state is carried out and published as the stop that it is.
+        self.decide_now()
         try:
             await self.actions.unlock(confirmed=confirmed)
         except (ActionError, DriverError) as error:
@@ -313,11 +317,17 @@ class ControlLoopRunner:
         self.states.publish_stop(self._timeline.update(self._robot.state, now_ns))
 
     def _stop(self, output: ControlOutput, now_ns: int) -> None:
-        if not self._stopped:
+        experiment, status = self._control_loop.experiment, self._control_loop.status
+        is_new = (
+            experiment is not None and experiment is not self._timed and experiment.phase is ExperimentPhase.STOPPED
+        )
+        if experiment is not None and is_new:
+            self._timed = experiment
+            # The stop before may still wait for its standstill.
+            self.states.publish_stop(self._timeline.end())
+            self._timeline.begin(experiment.file.name, status.activity, status.decision, now_ns)
+        if is_new or not self._stopped:
             self._stopped = True
-            experiment, status = self._control_loop.experiment, self._control_loop.status
-            if experiment is not None and experiment.phase is ExperimentPhase.STOPPED:
-                self._timeline.begin(experiment.file.name, status.activity, status.decision, now_ns)
             self.actions.cancel()
             self._sender.stop()
         if output.release:

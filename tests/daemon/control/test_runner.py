@@ -343,6 +343,47 @@ async def test_cause_of_a_requested_stop_is_the_request():
         assert stop.decided_after_s <= 0.02
 
 
+@pytest.mark.parametrize("cycles", [0, 1, 60])
+async def test_a_stop_that_is_unlocked_at_once_says_its_own_cause(cycles):
+    """A script sends both within 2 ms, so that no state of the robot lies between them."""
+    async with driven(TWIST, cycles=50) as cell:
+        assert cell.runner.stop() == "test"
+        await cell.cycles(cycles)
+        assert await cell.runner.unlock() is None
+        await cell.cycles(60)
+        (stop,) = stops(cell)
+        assert (stop.cause, stop.response) == ("the operator stopped it", "stop and keep grip")
+        assert stop.faults == FaultCode.OPERATOR_STOP.text
+        assert stop.stands_after_s > 0
+
+
+async def test_a_failure_that_is_unlocked_at_once_says_its_own_cause():
+    async with driven(MOVE, cycles=5) as cell:
+        cell.control_loop.on_action_ended("it met something")
+        assert await cell.runner.unlock() is None
+        await cell.cycles(60)
+        (stop,) = stops(cell)
+        assert "it met something" in stop.cause
+        assert stop.faults == FaultCode.STEP_FAILED.text
+
+
+async def test_each_of_two_stops_is_published_though_the_second_follows_at_once():
+    """The second experiment is stopped before the loop has decided anything for it, and the arm still brakes."""
+    async with driven(TWIST, cycles=50) as cell:
+        cell.runner.stop()
+        await cell.runner.unlock()
+        now_ns = cell.robot.bench.now_ns
+        assert cell.control_loop.start(experiment(TWIST, name="second"), now_ns) is None
+        cell.runner.stop()
+        await cell.cycles(100)
+        first, second = stops(cell)
+        assert (first.experiment, second.experiment) == ("test", "second")
+        for stop in (first, second):
+            assert (stop.cause, stop.faults) == ("the operator stopped it", FaultCode.OPERATOR_STOP.text)
+        assert second.stands_after_s is not None
+        assert cell.state.rests
+
+
 async def test_stop_that_a_blocked_robot_refuses_tells_since_when_it_is_blocked_and_stands():
     async with driven(TWIST, cycles=50) as cell:
         cell.robot.bench.arm.accepts = False

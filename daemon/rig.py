@@ -218,7 +218,8 @@ class Rig:
         robot = self.experiments.robot
         limits = robot.settings.limits if robot is not None else None
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)
-        text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.", tuple(plan.sentences())
+        note = self.control_loop.activation_note(file)
+        text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
         # The plan depends on the rig's limits, too.
         return Question(text, digest_of(experiment.data, text, *sentences), sentences)
 

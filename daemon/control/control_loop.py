@@ -19,6 +19,7 @@ from shearloop.daemon.control.experiment_schema import (
     IdentifyStep,
     Speeds,
     TareStep,
+    first_gripper_step,
     first_motion_before_grip,
 )
 from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
@@ -282,7 +283,7 @@ class ControlLoop:
         gripper = self.inputs.gripper
         width = f"its fingers are {gripper.width_mm:.1f} mm apart" if gripper is not None else "its width is unknown"
         what = self.held or f"{width}, and it does not say that it holds something"
-        renewed = "; after its fault the fingers open and close once" if gripper is not None and gripper.fault else ""
+        renewed = "; it is activated first: the fingers open and close once" if self._activates() else ""
         return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
 
     def unlock_question(self) -> str:
@@ -294,9 +295,30 @@ class ControlLoop:
 
     def release_stakes(self) -> tuple[str, ...]:
         """Return what a confirmation of `release_question` depends on; a width that wavers is not part of it."""
-        gripper = self.inputs.gripper
         held = "held" if self.held is not None else "nothing held"
-        return held, "renewed" if gripper is not None and gripper.fault else "as it is"
+        return held, "renewed" if self._activates() else "as it is"
+
+    def _activates(self) -> bool:
+        """Whether the gripper is activated before its next motion, as after a fault or a loss of power."""
+        gripper = self.inputs.gripper
+        return gripper is not None and (bool(gripper.fault) or gripper.inactive)
+
+    def activation_note(self, file: ExperimentFile) -> str:
+        """Return what the first step with the gripper does besides, for the operator who starts; or an empty string."""
+        first = first_gripper_step(file)
+        if first is None or not self._activates() or not self.may_hold():
+            return ""
+        return f" Before step {first[0]} the gripper is activated: its fingers open and close once, and a tool drops."
+
+    def _why_no_activation(self, file: ExperimentFile) -> str | None:
+        """Return why an experiment must not activate the gripper, or None: its grip would drop what is held."""
+        first, held = first_gripper_step(file), self.may_still_hold
+        if first is None or not isinstance(first[1], GripStep) or not self._activates() or held is None:
+            return None
+        return (
+            f"{held}; step {first[0]} (grip) would activate the gripper first, which opens its fingers, and the tool "
+            "drops: take it out with `shearloop command release --yes`, or put a `release` before it"
+        )
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
@@ -362,6 +384,8 @@ class ControlLoop:
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
             return " ".join(refusals)
+        if (dropped := self._why_no_activation(file)) is not None:
+            return dropped
         number, uncertain = first_motion_before_grip(file), self._why_uncertain()
         if number is not None:
             step = file.steps[number - 1]

@@ -258,6 +258,11 @@ def first_motion_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
+def first_gripper_step(file: ExperimentFile) -> tuple[int, GripperStep] | None:
+    """Return the first step that moves the fingers, with its number from 1, or None."""
+    return next(((n, step) for n, step in enumerate(file.steps, 1) if isinstance(step, GripperStep)), None)
+
+
 def opens_to_mm(step: ReleaseStep, gripper: GripperModel | None) -> float:
     """Return the width to which a step opens the fingers of a gripper; as it is written where none is known."""
     return step.width_mm if gripper is None else min(step.width_mm, gripper.stroke_mm)

@@ -16,7 +16,7 @@ from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
-from shearloop.drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
+from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand, GripperState, ObjectStatus
 from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM
 from shearloop.errors import ActionError
 from shearloop.estimation import Measured, combine
@@ -176,4 +176,5 @@ def status_of(state: GripperState) -> GripperStatus:
         uncertain=state.object is ObjectStatus.UNKNOWN,
         requested_counts=state.requested_counts,
         others_requests=state.others_requests,
+        inactive=state.activation is not ActivationStatus.ACTIVE,
     )

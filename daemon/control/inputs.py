@@ -32,7 +32,8 @@ class GripperStatus:
 
     `uncertain`: the gripper cannot say whether it holds an object, because it is inactive, lost its power, or was
     stopped on its way. `requested_counts`: the position that it was last asked for, by anybody. `others_requests`: how
-    many requests of other programs were seen.
+    many requests of other programs were seen. `inactive`: it activates before its next motion, which opens and closes
+    the fingers once.
     """
 
     t_ns: int
@@ -43,6 +44,7 @@ class GripperStatus:
     uncertain: bool = False
     requested_counts: int | None = None
     others_requests: int = 0
+    inactive: bool = False
 
     @property
     def fingers(self) -> str:

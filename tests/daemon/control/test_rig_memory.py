@@ -229,6 +229,21 @@ def test_a_soft_tool_that_gives_way_slowly_is_the_same(restarted):
     assert rig.control_loop.grip.width_mm == rig.width_mm
 
 
+@pytest.mark.parametrize("steps", [[GRIP], [{"do": "release"}, GRIP]])
+def test_a_gripper_that_lost_its_power_opens_on_no_tool_unsaid(steps, restarted):
+    """Its next motion activates it, which opens and closes the fingers."""
+    rig = restarted.rig
+    rig.force_n = 0.0
+    rig.hand = replace(rig.hand, uncertain=True, inactive=True, requested_counts=0)
+    rig.run(0.6)
+    file = ExperimentFile.model_validate({"name": "next", "steps": steps})
+    assert "Before step 1 the gripper is activated" in rig.control_loop.activation_note(file)
+    refused = rig.control_loop.start(file, rig.t_ns)
+    assert (refused is None) == (len(steps) == 2)
+    assert refused is None or "release --yes`, or put a `release` before it" in refused
+    assert "it is activated first" in rig.control_loop.release_question()
+
+
 def test_a_tool_that_was_exchanged_while_the_gripper_was_away_is_another_one(restarted):
     rig = restarted.rig
     rig.run(0.1)

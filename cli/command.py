@@ -94,9 +94,13 @@ def run(args: argparse.Namespace) -> int:
         print(with_connection("\n".join(_lines(args.name, reply)), args, addresses.COMMAND_ADDRESS))
     else:
         reason = with_connection(str(reply.get("reason")), args, addresses.COMMAND_ADDRESS)
+        if args.experiment is not None and not (addresses.needs_keys(address) or args.experiment.exists()):
+            # The daemon does not say it: it may see more than this user.
+            reason = f"there is no file {args.experiment} on this computer; {reason}"
         print(f"shearloop command: {args.name} was refused: {reason}", file=sys.stderr)
         if reply.get("invalid") and args.experiment is not None:
-            print(mistakes_of(args.experiment), file=sys.stderr, end="")
+            others = (line for line in mistakes_of(args.experiment.resolve()).splitlines() if line not in reason)
+            print(*(f"{line}\n" for line in others), sep="", end="", file=sys.stderr)
     return 0 if accepted else 1
 
 

@@ -6,9 +6,10 @@ they are. So a request names only files in the configured folders, and the reply
 
 import asyncio
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 from typing import TypeVar
@@ -17,7 +18,7 @@ import structlog
 
 from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.control.experiment_check import check_devices, check_steps, experiment_mistakes
+from shearloop.daemon.control.experiment_check import check_steps, experiment_mistakes
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.torques import TorqueSource
@@ -25,12 +26,14 @@ from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.errors import UserError
 from shearloop.files import read_file
 from shearloop.mistakes import shown
+from shearloop.words import counted
 from shearloop.yaml_files import MOST_BYTES, Document
 
 # A file on a network drive may never answer.
 READ_WITHIN_S = 5.0
-# Of a path in a message.
+# Of a path, and of a mistake, in a message.
 _LONGEST_NAME = 300
+_LONGEST_MISTAKE = 500
 # Files of a folder that are looked at for the list.
 MOST_LISTED = 500
 Found = TypeVar("Found")
@@ -38,7 +41,8 @@ Found = TypeVar("Found")
 
 def read_experiment(path: Path) -> ExperimentFile:
     """Return the experiment of a file; raises UserError for an invalid one, or one beyond its limits."""
-    return _checked(read_document(path), None, None)
+    document = read_document(path)
+    return without_mistakes(document, check_steps(outline(document.content)))
 
 
 def check_experiment(
@@ -53,13 +57,6 @@ def check_experiment(
         return None
     document = read_document(path)
     return without_mistakes(document, experiment_mistakes(document.content, config, sources, robot))
-
-
-def _checked(document: Document, robot: Commissioning | None, gripper: GripperModel | None) -> ExperimentFile:
-    """Return the experiment of a document; raises UserError for one that is invalid, or that these do not allow."""
-    file = outline(document.content)
-    limits, cap = (robot.settings.limits, robot.cap) if robot is not None else (None, None)
-    return without_mistakes(document, [*check_steps(file), *check_devices(file, limits, gripper, cap)])
 
 
 def read_document(path: Path) -> Document:
@@ -93,13 +90,19 @@ class ReadExperiment:
 class ExperimentFiles:
     """The experiments that a request may name: regular files of at most 128 kB in `folders`, or below them.
 
-    They stay within what `robot` and `gripper` allow, where these are given.
+    Each can run on the rig of `config`, where it is given: with its torque `sources`, but the robot's, and its `robot`.
     """
 
     folders: tuple[Path, ...]
+    config: DaemonConfig | None = None
+    sources: Mapping[str, TorqueSource] = field(default_factory=dict)
     robot: Commissioning | None = None
-    gripper: GripperModel | None = None
     _reading: threading.Thread | None = field(default=None, init=False)
+
+    @property
+    def gripper(self) -> GripperModel | None:
+        """The rig's gripper, if one is known."""
+        return self.config.gripper_model if self.config is not None else None
 
     async def read(self, path: Path) -> ReadExperiment:
         """Return the experiment of a file; raises UserError without the file's content, at the latest after 5 s."""
@@ -134,17 +137,32 @@ class ExperimentFiles:
 
     def _list(self) -> dict[str, str]:
         found: dict[str, str] = {}
+        for path in self._paths():
+            # Configurations share the folder with experiments. The list has only the files that `start` accepts.
+            with suppress(UserError, OSError):
+                document = Document.parse(path, read_file(path, MOST_BYTES), UserError, ExperimentFile.what)
+                if isinstance(document.content, dict) and "steps" in document.content:
+                    found[str(path)] = without_mistakes(document, self._mistakes(document)).name
+        return found
+
+    def _paths(self) -> Iterator[Path]:
+        """Yield the YAML files of the folders."""
         for folder in self.folders:
             own = folder.resolve()
             # A link may lead elsewhere.
             paths = (path for path in own.rglob("*.yaml") if path.is_file() and path.resolve().is_relative_to(own))
-            for path in sorted(islice(paths, MOST_LISTED)):
-                # Configurations share the folder with experiments. The list has only the files that `start` accepts.
-                with suppress(UserError, OSError):
-                    document = Document.parse(path, read_file(path, MOST_BYTES), UserError, ExperimentFile.what)
-                    if isinstance(document.content, dict) and "steps" in document.content:
-                        found[str(path)] = _checked(document, self.robot, self.gripper).name
-        return found
+            yield from sorted(islice(paths, MOST_LISTED))
+
+    def _mistakes(self, document: Document) -> Sequence[Mistake]:
+        """Return what the experiment's own limits, or the rig where it is known, do not allow."""
+        if self.config is None:
+            return check_steps(outline(document.content))
+        return experiment_mistakes(document.content, self.config, self.sources, self.robot)
+
+    def _meant(self, named: Path) -> str:
+        """Return which file of the folders was probably meant, or an empty text."""
+        known = {path.name: path for path in self._paths()}
+        return "".join(f"; did you mean {known[name]}?" for name in get_close_matches(named.name, known, 1))
 
     def _read(self, named: Path) -> ReadExperiment:
         name = str(named) if len(str(named)) <= _LONGEST_NAME else shown(str(named))
@@ -152,22 +170,32 @@ class ExperimentFiles:
             path = named.resolve()
             if not any(path.is_relative_to(folder.resolve()) for folder in self.folders):
                 folders = " and ".join(map(str, self.folders)) or "no folder"
-                raise UserError(
-                    f"{name} is in none of the folders of experiments ({folders}); copy it there, or name its folder "
-                    "under `experiments` in the configuration"
+                # Whether there is such a file is not told: the daemon may see more than who asks.
+                cure = self._meant(named) or (
+                    "; copy it there, or name its folder under `experiments` in the configuration"
                 )
+                raise UserError(f"{name} is in none of the folders of experiments ({folders}){cure}")
             data = read_file(path, MOST_BYTES)
         except (OSError, ValueError, RuntimeError) as error:
             reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise UserError(f"{name}: the experiment cannot be read: {reason}") from error
+            meant = self._meant(named) if isinstance(error, FileNotFoundError) else ""
+            raise UserError(f"{name}: the experiment cannot be read: {reason}{meant}") from error
         try:
             document = Document.parse(path, data, UserError, ExperimentFile.what)
-            file = _checked(document, self.robot, self.gripper)
+            file = document.model(ExperimentFile)
         except UserError as error:
             structlog.get_logger().warning("the experiment is not valid", mistakes=str(error))
             raise InvalidExperimentError(
                 f"{name} is not a valid experiment; the daemon's log names each mistake"
             ) from error
+        if mistakes := document.located(self._mistakes(document)):
+            # The file is an experiment, whose plan `start` shows to everybody: the first mistake may be told.
+            structlog.get_logger().warning("the rig cannot run the experiment", mistakes="\n".join(mistakes))
+            first = mistakes[0] if len(mistakes[0]) <= _LONGEST_MISTAKE else f"{mistakes[0][:_LONGEST_MISTAKE]} …"
+            others = (
+                f" (and {counted(len(mistakes) - 1, 'more mistake')}: see the daemon's log)" if mistakes[1:] else ""
+            )
+            raise InvalidExperimentError(f"{first}{others}")
         return ReadExperiment(path, file, data)
 
 

@@ -260,7 +260,7 @@ def build_rig(
     )
     robot.holds = loop.may_hold
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
-    experiments = ExperimentFiles(config.experiment_folders, commissioning, config.gripper_model)
+    experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning)
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
     # Devices that this process emulates end with it, and with them every grip and stop.
     ends_with_us = config.autostart or (config.emulated and bool(config.emulators))

@@ -1,5 +1,6 @@
 """The rehearsal: `check` prints an experiment's plan, and what the configured devices do not allow."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -7,10 +8,11 @@ import yaml
 
 from shearloop.cli import main
 from shearloop.daemon.commissioning import Commissioning
+from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
-from shearloop.drivers.robotiq.models import MODELS
+from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.drivers.ur.settings import UrLimits, read_settings
 from tests.fixtures.daemons import collector, running_daemon, shearloop
 
@@ -121,9 +123,9 @@ async def test_what_lies_outside_the_devices_is_refused_by_check_and_by_start(st
     assert f"REFUSED: {said}" in out, "the plan shows where"
     assert f"steps[1]: {said}" in err
     # As `command start` does, before the experiment begins.
-    robot = Commissioning(read_settings(ROBOT), None, emulated=True)
-    with pytest.raises(InvalidExperimentError):
-        await ExperimentFiles((tmp_path,), robot, MODELS["2F-140"]).read(path)
+    config, robot = load_daemon_config(rig(tmp_path)), Commissioning(read_settings(ROBOT), None, emulated=True)
+    with pytest.raises(InvalidExperimentError, match=rf"experiment\.yaml:\d+: steps\[1\]: {re.escape(said)}"):
+        await ExperimentFiles((tmp_path,), config, torque_sources(config, {}, None), robot).read(path)
 
 
 @pytest.mark.parametrize(

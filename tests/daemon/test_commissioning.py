@@ -232,7 +232,7 @@ async def test_a_running_daemon_refuses_it_too(tmp_path):
     content = {"name": "one", "limits": {"torque_nm": 0.3}, "steps": [BEYOND[0][0]]}
     path.write_text(yaml.safe_dump(content))
     config = load_daemon_config(write_rig(tmp_path))
-    files = ExperimentFiles((tmp_path,), commissioning_of(config, read_settings(config.robot), NOW))
+    files = ExperimentFiles((tmp_path,), config, {}, commissioning_of(config, read_settings(config.robot), NOW))
     with pytest.raises(InvalidExperimentError):
         await files.read(path)
 

@@ -15,9 +15,11 @@ from shearloop.cli import command, main
 from shearloop.daemon import experiment_files
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.experiment_files import ExperimentFiles
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.rig import Rig
+from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.errors import UserError
 from tests.fixtures.daemons import deadline
 
@@ -58,6 +60,53 @@ async def test_the_list_has_the_valid_experiments_of_the_folders_alone(folder):
     write(folder / "broken.yaml", "name: [")
     (folder / "link.yaml").symlink_to(write(folder.parent / "secret.yaml", VALID))
     assert await ExperimentFiles((folder,)).list() == {str(valid): "one"}
+
+
+HOLD = [{"do": "grip"}, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.05}]
+RIG = {
+    "robot": "ur.yaml",
+    "load_cell": {"device": {"path": "load"}},
+    "fingertips": {"right": {"device": {"path": "eit"}}},
+}
+
+
+@pytest.mark.parametrize(
+    ("content", "gripper", "said"),
+    [
+        ({"torque_source": "combined", "steps": HOLD}, True, "`combined` is not a measured torque"),
+        ({"torque_source": "skin", "steps": HOLD}, True, "`skin` is not a measured torque"),
+        ({"torque_source": "right", "steps": HOLD}, True, "`right` is a fingertip without a calibration"),
+        (
+            {"torque_source": "load_cell", "steps": [*HOLD, {"do": "adapt", "fingertip": "right"}]},
+            True,
+            "no calibration",
+        ),
+        ({"torque_source": "load_cell", "steps": HOLD}, False, "grip needs a gripper, and none is configured"),
+        ({"torque_source": "load_cell", "steps": HOLD}, True, ""),
+    ],
+)
+async def test_the_list_has_only_what_start_accepts_on_this_rig(content, gripper, said, folder):
+    path = write(folder / "one.yaml", {"name": "one", **content})
+    more = {"gripper": {"model": "2F-85", "socket": {"host": "192.168.1.10"}}} if gripper else {}
+    config = load_daemon_config(write(folder.parent / "rig.yaml", {**RIG, **more}))
+    files = ExperimentFiles((folder,), config, torque_sources(config, {}, None))
+    if not said:
+        assert (await files.read(path)).file.name == "one"
+    else:
+        with pytest.raises(InvalidExperimentError, match=said):
+            await files.read(path)
+    assert await files.list() == ({} if said else {str(path): "one"})
+
+
+async def test_the_file_of_a_folder_that_was_probably_meant_is_named(folder):
+    path = write(folder / "mine.yaml", VALID)
+    write(folder.parent / "secret.yaml", VALID)
+    for wrong in (folder.parent / "mine.yaml", folder / "mine2.yaml", folder / "more" / "mine.yaml"):
+        assert (await refusal(folder, wrong)).endswith(f"; did you mean {path}?")
+    assert "did you mean" not in await refusal(folder, folder.parent / "secret2.yaml")
+    # Nobody learns from the daemon which files there are elsewhere.
+    there, absent = [await refusal(folder, folder.parent / name) for name in ("secret.yaml", "absent.yaml")]
+    assert there.replace("secret", "absent") == absent
 
 
 def linked(folder: Path) -> Path:
@@ -244,4 +293,9 @@ def test_the_mistakes_are_shown_to_the_person_whose_file_it_is(tmp_path, monkeyp
     path = write(tmp_path / "one.yaml", {**VALID, "speed": 3})
     assert main(["command", "start", "--experiment", str(path)]) == 1
     assert "one.yaml:2: speed: is not a known key" in capsys.readouterr().err
+    assert main(["command", "start", "--experiment", str(tmp_path / "two.yaml")]) == 1
+    assert (
+        f"start was refused: there is no file {tmp_path}/two.yaml on this computer; one.yaml is not"
+        in capsys.readouterr().err
+    )
     assert command.mistakes_of(tmp_path / "elsewhere.yaml").startswith(str(tmp_path))

@@ -63,7 +63,8 @@ def turns(file: ExperimentFile) -> Iterator[Turn]:
                 high_rad += step.until_angle_rad if direction == "counterclockwise" else 0.0
             case HoldTorqueStep(signed_torque_nm=torque_nm):
                 begins = leaves = direction_of(torque_nm)
-                low_rad, high_rad = -math.inf, math.inf
+                # The tool lies on the side of its torque, however far.
+                low_rad, high_rad = (-math.inf if torque_nm <= 0 else 0.0), (math.inf if torque_nm >= 0 else 0.0)
             case TwistStep(absolute=False, angles_rad=angles_rad):
                 begins = _turn_to(angles_rad[0], low_rad, high_rad)
                 if not step.return_to_start:

@@ -159,7 +159,7 @@ def plan_of(
                 step.force_n if isinstance(step, steps.GripStep) else 0.0,
                 step.timeout_s,
                 number in back,
-                _turns_back(step),
+                _turns_back(step, turn.begins),
                 tuple(notes),
                 (refused or {}).get(number - 1, ()),
             )
@@ -214,8 +214,11 @@ def _twist(step: steps.TwistStep) -> str:
     return f"twists to {places} {since}{way}, {then}{times}, at {step.speed_rad_per_s:g} rad/s"
 
 
-def _turns_back(step: Step) -> bool:
-    """Return whether a step turns the tool both ways; `hold_torque` does so only to correct."""
+def _turns_back(step: Step, begins: steps.Direction | None) -> bool:
+    """Return whether a step turns the tool both ways; `hold_torque` does so only to correct.
+
+    `begins` is the direction of its first turn, where that is known.
+    """
     match step:
         case steps.IdentifyStep():
             return True
@@ -223,7 +226,8 @@ def _turns_back(step: Step) -> bool:
             return True
         case steps.TwistStep(angles_rad=angles_rad):
             rounds = angles_rad * min(step.repeats, 2)
-            return len({later > earlier for earlier, later in pairwise(rounds) if later != earlier}) > 1
+            ways = {begins} | {steps.direction_of(later - earlier) for earlier, later in pairwise(rounds)}
+            return len(ways - {None}) > 1
     return False
 
 

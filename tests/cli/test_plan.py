@@ -68,12 +68,25 @@ def test_a_reversal_is_pointed_out_at_its_step(tmp_path, result_of, ran):
     assert "1 reversal of a held tool" in ran("check", path).out
 
 
+def test_a_twist_to_the_other_side_of_a_held_torque_is_a_reversal(tmp_path, result_of):
+    hold, twist = {"do": "hold_torque", "torque_nm": 0.1}, {"do": "twist", "angles_rad": [-0.05]}
+    path = written(tmp_path, GRIP, {"do": "identify"}, hold, twist, hold)
+    planned = result_of("check", path)["plan"]["steps"]
+    assert [step["reverses"] for step in planned] == [False, False, False, True, False]
+    same_side = written(tmp_path, GRIP, {"do": "identify"}, hold, {"do": "twist", "angles_rad": [0.05]})
+    assert not any(step["reverses"] for step in result_of("check", same_side)["plan"]["steps"]), (
+        "it may turn either way"
+    )
+
+
 @pytest.mark.parametrize(
     ("twist", "turns_back"),
     [
         ({"angles_rad": "-0.25:0.25:5"}, True),
         ({"angles_rad": [0.1, 0.2], "return_to_start": False}, False),
         ({"angles_rad": [0.2, 0.1, 0.3], "return_to_start": False}, True),
+        ({"angles_rad": [0.3, 0.2, 0.1], "return_to_start": False}, True),
+        ({"angles_rad": [-0.1, -0.2, -0.2], "return_to_start": False}, False),
         ({"angles_rad": [0.1, 0.2], "return_to_start": False, "repeats": 2}, True),
     ],
 )

@@ -43,7 +43,7 @@ _MEANINGS = {
     "interval_nm": "median width of these intervals, N·m",
     "winkler_nm": "mean width plus 40 times the distance of a known value outside; less is better",
     "valid_fraction": "share of the frames with an estimate",
-    "gain": "mean estimate over mean known torque",
+    "gain": "mean estimate along the known torque over the mean of its size",
     "r": "correlation of estimated and known torque",
     "latency_ms_p50": "time of an estimate, ms, median",
     "latency_ms_p99": "time of an estimate, ms, 99th percentile",

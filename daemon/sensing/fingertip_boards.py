@@ -11,7 +11,7 @@ import structlog
 from shearloop.bank.arrays import BoolArray
 from shearloop.bank.channels import ChannelTable
 from shearloop.daemon.messaging.messages import EitHeatmap
-from shearloop.daemon.sensing.fingertip_messages import frame_message
+from shearloop.daemon.sensing.fingertip_messages import frame_message, heatmap_message
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.supervisor import TaskFacts
@@ -113,7 +113,9 @@ class BoardTask(FingertipTask):
         self.publisher.publish(frame_message(self.name, frame))
         self.dead_electrodes.update(self.name, self.session.calibration.table, frame.dead)
         if self.always_heatmap or self.publisher.has_subscriber(EitHeatmap.topic):
-            await self._publish_heatmap(frame)
+            heatmap = await heatmap_message(self.name, frame, self.session)
+            if heatmap is not None:
+                self.publisher.publish(heatmap)
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
@@ -125,22 +127,3 @@ class BoardTask(FingertipTask):
             "error": "; ".join(filter(None, errors)) if board["connected"] else board["last_loss"],
             "estimates": self.count,
         }
-
-    async def _publish_heatmap(self, frame: Frame) -> None:
-        scores = await asyncio.to_thread(self.session.heatmap)
-        search = self.session.search
-        if scores is None or search is None:
-            return
-        self.publisher.publish(
-            EitHeatmap(
-                source=self.name,
-                t_mono_ns=frame.t_mid_ns,
-                scores=scores,
-                k_low=float(search.k_grid[0]),
-                k_high=float(search.k_grid[-1]),
-                sigma_low=float(search.sigma_grid[0]),
-                sigma_high=float(search.sigma_grid[-1]),
-                model=search.model,
-                frame=frame.seq,
-            )
-        )

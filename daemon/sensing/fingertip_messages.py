@@ -1,14 +1,15 @@
 """Messages and recorded inputs of the EIT fingertips."""
 
+import asyncio
 from dataclasses import asdict
 from operator import attrgetter
 
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame
+from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.drivers.eit_kit import Frame
-from shearloop.estimation import Adaptation, Estimate, Measured
+from shearloop.estimation import Adaptation, Estimate, Measured, Session
 
 _GIVEN_UP = " given up"
 
@@ -25,6 +26,24 @@ def frame_message(name: str, frame: Frame) -> EitFrame:
         saturated=int(np.count_nonzero(frame.saturated)),
         dead=int(np.count_nonzero(frame.dead)),
         repeated=frame.repeated,
+    )
+
+
+async def heatmap_message(name: str, frame: Frame, session: Session) -> EitHeatmap | None:
+    """Return the message of a frame that the session has just taken, None without a bank; a thread computes it."""
+    scores, search = await asyncio.to_thread(session.heatmap), session.search
+    if scores is None or search is None:
+        return None
+    return EitHeatmap(
+        source=name,
+        t_mono_ns=frame.t_mid_ns,
+        scores=scores,
+        k_low=float(search.k_grid[0]),
+        k_high=float(search.k_grid[-1]),
+        sigma_low=float(search.sigma_grid[0]),
+        sigma_high=float(search.sigma_grid[-1]),
+        model=search.model,
+        frame=frame.seq,
     )
 
 

@@ -29,6 +29,7 @@ from shearloop.daemon.sensing.fingertip_messages import (
     adapted_message,
     estimate_message,
     frame_message,
+    heatmap_message,
     moved_from_bytes,
     tare_from_bytes,
     tool_from_bytes,
@@ -349,6 +350,8 @@ class Replay:
             for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
+                if self._publisher.has_subscriber(messages.EitHeatmap.topic):
+                    await self._publish_heatmap(source, frame)
                 if self._pairing is None or COMBINED in self.comparison.awaited:
                     continue
                 if (pair := self._pairing.add(source, frame)) is not None:
@@ -426,6 +429,11 @@ class Replay:
         # The replayed latency is 0; the recording holds the live one.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)
         self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))
+
+    async def _publish_heatmap(self, source: str, frame: Frame) -> None:
+        heatmap = await heatmap_message(source, frame, self._sessions[source])
+        if heatmap is not None:
+            self._publisher.publish(heatmap)
 
     def _adapt(self, source: str, frames: tuple[Frame, ...], reference: str, torque_nm: FloatArray) -> None:
         session = self._sessions[source]

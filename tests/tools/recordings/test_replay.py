@@ -21,7 +21,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
-from shearloop.daemon.messaging.messages import EitEstimate, wire_map, with_packed_arrays
+from shearloop.daemon.messaging.messages import EitEstimate, EitHeatmap, wire_map, with_packed_arrays
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.schema import message_json, recorded_topic
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
@@ -146,7 +146,7 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, ran: Callabl
     assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in errors
 
 
-def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path):
+def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path, monkeypatch):
     """Guards parser, frame clock, baseline and matching. Renew: run with SHEARLOOP_RENEW=1, and say why it changed."""
     path = tmp_path / "stream.mcap"
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
@@ -154,9 +154,12 @@ def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path):
     configured = load_daemon_config(config())
     averaging = {"right": configured.fingertips["right"].model_copy(update={"average_frames": 5})}
     configured = configured.model_copy(update={"fingertips": averaging})
+    monkeypatch.setattr(Publisher, "has_subscriber", lambda _, topic: topic == EitHeatmap.topic)
     messages, _ = asyncio.run(replayed(path, math.inf, configured))
+    scores = {content["frame"]: content["scores"] for topic, content in messages if topic == EitHeatmap.topic}
     estimates = [content for topic, content in messages if topic == "eit.estimate"]
     assert [content["frame"] for content in estimates] == list(range(832))
+    assert len(scores) > 800, "a page sees the heatmaps of a replay"
     torques = [content for topic, content in messages if topic == "load.torque"]
     assert len(torques) == 4882
     seen = {

@@ -159,7 +159,9 @@ def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path, m
     scores = {content["frame"]: content["scores"] for topic, content in messages if topic == EitHeatmap.topic}
     estimates = [content for topic, content in messages if topic == "eit.estimate"]
     assert [content["frame"] for content in estimates] == list(range(832))
-    assert len(scores) > 800, "a page sees the heatmaps of a replay"
+    matched = {content["frame"] for content in estimates if content["valid"]}
+    assert len(matched) > 600
+    assert scores.keys() >= matched, "a page sees the heatmaps of a replay"
     torques = [content for topic, content in messages if topic == "load.torque"]
     assert len(torques) == 4882
     seen = {

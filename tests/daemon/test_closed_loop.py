@@ -19,6 +19,7 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.run_summary import RunSummary
+from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperCommand
 from shearloop.drivers.robotiq.socket_client import SocketClient
@@ -262,6 +263,51 @@ async def test_an_unlock_after_a_fault_of_the_gripper_asks_before_it_drops_the_t
         while not reply["ok"]:
             reply = await command("unlock", confirmed=True)
         assert watcher.seen["gripper.state"][-1]["width_mm"] > held_mm + 50
+
+
+async def pendant(*lines: str) -> None:
+    """Command the gripper as the robot's own program does, over a connection of its own."""
+    reader, writer = await asyncio.open_connection(HOST, URCAP_PORT)
+    for line in lines:
+        writer.write(f"{line}\n".encode())
+        assert await reader.readexactly(3) == b"ack"
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_a_pendant_that_commands_the_gripper_stops_the_twist_and_its_grips_are_seen(
+    rig_config, tiny_bank, tmp_path
+):
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
+        await started(command, experiment(tmp_path, SLOW_TWIST))
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
+        await pendant("SET POS 250")
+        state = await watcher.until("loop.state", lambda state: state["phase"] == "stopped")
+        assert state["cause"].startswith(FaultCode.GRIPPER_COMMANDED.value.kind)
+        assert "nothing between them" not in state["reasons"]
+        await watcher.until("loop.state", lambda state: FaultCode.TOOL_GRIPPED.text in state["faults"])
+        stop = await watcher.until("loop.stop", lambda _: True)
+        assert stop["faults"] == FaultCode.GRIPPER_COMMANDED.text
+        reply = await command("release", ask=True)
+        while not reply["ok"]:
+            reply = await command("release", ask=True)
+        question = reply["question"]
+        assert "its fingers hold something 19." in question or "its fingers hold something 20." in question
+        assert "with an unknown force" in question
+        assert (await command("unlock"))["ok"]
+        for position, status in ((0, "at target"), (240, "contact closing")):
+            last = watcher.seen["gripper.state"][-1]["seq"]
+            await pendant(f"SET POS {position}")
+            # The state after the request may be from before it.
+            moving = await watcher.until(
+                "gripper.state", lambda state, last=last: state["seq"] > last and state["object"] == "moving"
+            )
+            stands = await watcher.until(
+                "gripper.state", lambda state, last=moving["seq"]: state["seq"] > last and state["object"] != "moving"
+            )
+            assert stands["object"] == status
+        assert stands["diameter_mm"] == pytest.approx(20.0, abs=1.0)
+        assert "its fingers hold something" in (await command("tare", confirmed=True))["reason"]
 
 
 async def test_a_board_that_is_unplugged_holds_the_wrist(rig_config, tiny_bank, tmp_path):

@@ -225,7 +225,7 @@ def _take_robot(config: DaemonConfig, opened: contextlib.ExitStack) -> "tuple[Ur
     if settings is None:
         return None
     files = RobotFiles.of(settings.host)
-    opened.enter_context(lock_robot(files, config.commands))
+    opened.enter_context(lock_robot(files, config.commands, config.gripper_address))
     return settings, files
 
 

@@ -362,6 +362,12 @@ class DaemonConfig(ConfigModel):
                 raise ValueError(f"{why}: add `robot: ur.yaml`, or take `{key}` out")
         return self
 
+    @property
+    def gripper_address(self) -> tuple[str, int] | None:
+        """Host and port of the gripper's socket, None without one."""
+        socket = self.gripper.socket if self.gripper is not None else None
+        return (socket.host, socket.port) if socket is not None else None
+
     def _real_devices(self) -> Iterator[tuple[str, str]]:
         """Yield the key and the name of each device that no emulator plays."""
         for key, section in self.walk():

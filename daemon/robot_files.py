@@ -91,8 +91,8 @@ def memory_path(spelling: str) -> Path:
     return _file(spelling, ".json")
 
 
-def _file(spelling: str, suffix: str) -> Path:
-    return state_folder() / f"robot-{re.sub(r'[^A-Za-z0-9.-]', '_', spelling)}{suffix}"
+def _file(spelling: str, suffix: str, of: str = "robot") -> Path:
+    return state_folder() / f"{of}-{re.sub(r'[^A-Za-z0-9.-]', '_', spelling)}{suffix}"
 
 
 def _stored_spellings() -> tuple[str, ...]:
@@ -117,20 +117,26 @@ def _last_addresses(name: str) -> frozenset[str]:
 
 
 @contextlib.contextmanager
-def lock_robot(files: RobotFiles, commands: str = "") -> Iterator[None]:
-    """Keep other daemons of this user away from a robot; raises UserError if one of them has it.
+def lock_robot(files: RobotFiles, commands: str = "", gripper: tuple[str, int] | None = None) -> Iterator[None]:
+    """Keep other daemons of this user away from a robot and its gripper; raises UserError if one of them has either.
 
-    `commands` is the command address of this process, if it has one, which the sentence to another one names.
+    `commands` is the command address of this process, if it has one, which the sentence to another one names. `gripper`
+    has the address and port of its socket, which may be another robot's by mistake, and serves any number of programs.
     Two daemons would share the robot's memory, and neither would know of the other's stops and grips. The lock ends
     with the process, however that ends. Where the file cannot be made, no experiment starts, and nothing is locked.
     """
     with contextlib.ExitStack() as opened:
         for path in files.locks:
-            _lock(path, files.host, commands, opened)
+            _lock(path, f"robot at {files.host}", commands, opened)
+        if gripper is not None:
+            host, port = gripper
+            for address in sorted(addresses_of((host,))[host]) or [one_spelling(host)]:
+                path = _file(f"{address}-{port}", ".lock", of="gripper")
+                _lock(path, f"gripper at {host}:{port}", commands, opened)
         yield
 
 
-def _lock(path: Path, host: str, commands: str, opened: contextlib.ExitStack) -> None:
+def _lock(path: Path, what: str, commands: str, opened: contextlib.ExitStack) -> None:
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = opened.enter_context(path.open("a+", encoding="utf-8"))
@@ -141,8 +147,8 @@ def _lock(path: Path, host: str, commands: str, opened: contextlib.ExitStack) ->
             process, _, address = file.read().partition(" ")
             stop = f"with `shearloop command stop --connect {address}`" if address else "with Ctrl-C in its terminal"
             raise UserError(
-                f"the robot at {host} is driven by another program of this computer (process {process}): "
-                f"stop that one first, {stop}, or name another robot in the configuration"
+                f"the {what} is driven by another program of this computer (process {process}): "
+                f"stop that one first, {stop}, or name another {what.split(maxsplit=1)[0]} in the configuration"
             ) from None
         file.truncate(0)
         file.write(f"{os.getpid()} {commands}".rstrip())

@@ -159,6 +159,18 @@ def test_one_daemon_at_a_time_drives_a_robot():
         pass
 
 
+@pytest.mark.usefixtures("names")
+def test_a_gripper_is_not_driven_with_two_robots():
+    """Its socket serves any number of programs."""
+    one, other = RobotFiles.of("ur.lab"), RobotFiles.of("other.lab")
+    with lock_robot(one, gripper=("ur.lab", 63352)):
+        taken = r"the gripper at 192\.168\.1\.10:63352 is driven by another program .* name another gripper"
+        with pytest.raises(UserError, match=taken):
+            lock_robot(other, gripper=("192.168.1.10", 63352)).__enter__()
+        with lock_robot(other, gripper=("192.168.1.10", 63353)):
+            pass
+
+
 def test_a_robot_whose_lock_cannot_be_written_can_be_watched(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))

@@ -57,7 +57,7 @@ def commission(
     _open_files(config)
     with ExitStack() as opened:
         # A daemon would drive the robot at the same time.
-        opened.enter_context(lock_robot(RobotFiles.of(settings.host)))
+        opened.enter_context(lock_robot(RobotFiles.of(settings.host), gripper=config.gripper_address))
         devices = rig or ConnectedRig(config, settings)
         controller = devices.controller()
         report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)

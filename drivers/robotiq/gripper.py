@@ -44,6 +44,8 @@ RESET_DEADLINE_NS = 3_000_000_000
 ACTIVATION_DEADLINE_NS = 15_000_000_000
 # The full stroke at the slowest speed takes 4.7 s.
 MOTION_DEADLINE_NS = 10_000_000_000
+# Of the nominal counts per millimetre: more means diameters in another unit, or another model.
+_STEEPEST = 2.5
 _OVER_TEMPERATURE, _NO_COMMUNICATION = 8, 9
 
 
@@ -122,6 +124,12 @@ class WidthCalibration(CalibrationModel):
             raise DeviceCalibrationError(
                 "The fingers did not stop further closed on the smaller objects: were they measured in the order "
                 "given, and did the fingers hold each of them?"
+            )
+        times = -counts_per_mm * model.stroke_mm / COUNTS_MAX
+        if times > _STEEPEST:
+            raise DeviceCalibrationError(
+                f"Between the objects the fingers moved {times:.1f} times as far as a {model.name} does for these "
+                "diameters: give the diameters in mm, and the model with --model."
             )
         residuals = (counts - (closed_counts + counts_per_mm * widths)) / counts_per_mm
         scatter_mm = math.sqrt(float(residuals @ residuals) / (len(counts) - 2)) if len(counts) > 2 else 0.0

@@ -158,6 +158,12 @@ def test_an_object_that_does_not_fit_between_the_fingers_is_refused():
         WidthCalibration.of_gauges([(100.0, 20.0), (3.0, 60.0)], "Hand-E")
 
 
+def test_diameters_in_centimetres_are_refused():
+    gauges = [(round(Fingers(MODELS["2F-140"]).counts(width)), width / 10) for width in (10.0, 20.0, 30.0)]
+    with pytest.raises(DeviceCalibrationError, match=r"moved 9\.\d times as far as a 2F-140 does"):
+        WidthCalibration.of_gauges(gauges)
+
+
 @pytest.mark.parametrize("model", sorted(MODELS))
 def test_counts_of_speed_and_force_are_those_of_the_model(model):
     own, gripper = MODELS[model], RobotiqGripper(SocketClient("localhost"), WidthCalibration.nominal(model))

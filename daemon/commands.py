@@ -184,14 +184,18 @@ class Commands:
         """Stop what moves or is about to, else the daemon; return what was stopped."""
         # A word that is not known may be a misspelt `spare_daemon`.
         spare_daemon = bool(request.get("spare_daemon") or request.keys() - {"command", "by", "spare_daemon"})
-        stopped = self.rig.runner.stop(also_idle=spare_daemon) if self.rig is not None else None
+        held = self.rig.control_loop.may_still_hold if self.rig is not None else None
+        stopped = None
+        if self.rig is not None:
+            # Where something may be held, a stop keeps the daemon, and the next start waits.
+            stopped = self.rig.runner.stop(also_idle=spare_daemon or held is not None)
         waiting = self.experiment.call_off() if self.experiment is not None else None
         if stopped is not None:
             return {"stopped": stopped}
         if spare_daemon:
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
-        if self.rig is not None and (held := self.rig.control_loop.may_still_hold) is not None:
+        if held is not None:
             # Somebody who presses twice must still be able to open the gripper.
             return {"stopped": "", "held": held}
         # Nothing moves, so the daemon itself stops, once the reply is sent.

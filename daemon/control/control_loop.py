@@ -128,6 +128,8 @@ class ControlLoop:
         self._gripped = _GrippedTool()
         # The causes of the latest stop, once it is acknowledged, until the next start.
         self._acknowledged = ""
+        # Of a stop after the experiment's end.
+        self._later_stop = ""
         # Awaits the gripper's first state that shows whether a grip of an earlier process is the present one.
         self._on_judged: OnJudged | None = None
         # Faults that were reported since the latest tick.
@@ -417,7 +419,7 @@ class ControlLoop:
             expected=expected,
             release_error=before.release_error,
         )
-        self._acknowledged = ""
+        self._acknowledged = self._later_stop = ""
         self.runs += 1
         # Until the first tick, the status must not show the end of the previous run.
         phase, activity = self.experiment.phase.value, self.experiment.command.activity
@@ -435,12 +437,15 @@ class ControlLoop:
     def stop(self, reason: str, fault: Fault) -> None:
         """End the experiment, if one runs, and stand still until the operator acknowledges the stop."""
         self.safety.stop(fault)
-        if self.experiment is not None:
+        if self.running is None:
+            self._later_stop = reason
+        elif self.experiment is not None:
             self.experiment.stop(reason)
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command."""
         self._gripped.release_error = None
+        self._later_stop = ""
         if self.safety.stopped:
             causes = "; ".join(fault.cause for fault in self.safety.stop_faults)
             self._acknowledged = f"the stop is acknowledged; its cause was: {causes}"
@@ -586,7 +591,9 @@ class ControlLoop:
         experiment = self.experiment
         phase = experiment.phase.value if experiment is not None else "idle"
         reason = experiment.stop_reason if experiment is not None else ""
-        if experiment is not None and experiment.phase is ExperimentPhase.STOPPED and not self.safety.stopped:
+        if self._later_stop:
+            reason = self._later_stop
+        elif experiment is not None and experiment.phase is ExperimentPhase.STOPPED and not self.safety.stopped:
             reason = self._acknowledged or reason
         self.status = LoopStatus(phase, reason, WristCommand(), decision)
         release = decision.response is Response.STOP_AND_RELEASE and not self._gripped.released

@@ -137,6 +137,8 @@ async def ask(
                 return decode(await socket.recv())
         except TimeoutError as error:
             late = ". One that runs may still carry it out: see `shearloop command status`" if may_act else ""
+            if content.get("command") == "stop":
+                late = ". Nothing says that the arm stands: use the emergency stop"
             raise UserError(
                 f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
                 f"or give the address of its `commands` key with --connect{keys_hint(keys)}{late}"

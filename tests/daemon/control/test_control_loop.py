@@ -11,7 +11,7 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, TareStep
 from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.inputs import GripperStatus
-from shearloop.daemon.control.safety import FaultCode, Response
+from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.torques import TorqueSample
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, started, stop
@@ -404,6 +404,21 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged():
     assert FaultCode.PROTECTIVE_STOP.value.kind in refused
     rig.control_loop.acknowledge()
     assert rig.control_loop.start(file, rig.t_ns) is None
+
+
+def test_a_stop_after_the_end_has_a_reason_of_its_own():
+    rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 60})
+    loop = rig.control_loop
+    loop.stop("the first operator stopped it", Fault(FaultCode.OPERATOR_STOP, "one"))
+    rig.run(0.1)
+    assert loop.status.activity == "the first operator stopped it"
+    loop.acknowledge()
+    loop.stop("the second operator stopped it", Fault(FaultCode.OPERATOR_STOP, "two"))
+    rig.run(0.1)
+    assert loop.status.activity == "the second operator stopped it"
+    loop.acknowledge()
+    rig.run(0.1)
+    assert "second" not in loop.status.activity
 
 
 def test_after_the_acknowledgement_the_state_asks_for_nothing_and_still_names_the_cause():

@@ -377,6 +377,7 @@ async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
         for _ in range(2):
             reply = await stop_command({})
         assert reply["held"] == "its fingers hold something 30.0 mm wide, with an unknown force"
+        assert cell.control_loop.safety.stopped, "the next start waits for `unlock`, as after the page's stop"
         cell.holding = False
         await cell.cycles(2)
         assert "ended" not in await stop_command({"command": "stop", "spare_deamon": True}), (

@@ -4,6 +4,7 @@ There is a file for each robot.
 """
 
 import asyncio
+import errno
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -20,12 +21,14 @@ from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import Six
-from shearloop.files import replace_file
+from shearloop.files import read_file, replace_file
 from shearloop.mistakes import validated
 
 VERSION = 1
 # The file is written at this interval, and at the start of each experiment.
 FOLLOWS_S = 0.1
+# A state takes some hundred bytes.
+_MOST_BYTES = 1 << 16
 # A name that had no address at the start is looked up again at this interval.
 LOOK_UP_S = 10.0
 
@@ -183,7 +186,7 @@ class RigMemory:
 def read_memory(path: Path) -> Remembered:
     """Return the state in a file; one that cannot be read counts as a stop, a missing one as none."""
     try:
-        content: Any = json.loads(path.read_text(encoding="utf-8"))
+        content: Any = json.loads(read_file(path, _MOST_BYTES))
         if content.pop("version") != VERSION:
             raise ValueError("it has another version")
         return validated(content, Remembered, str(path), ValueError)
@@ -230,5 +233,8 @@ def write_memories(files: RobotFiles, state: Remembered) -> None:
 def write_memory(path: Path, state: Remembered) -> None:
     """Replace the file as a whole, on the disk when this returns; raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists() and not path.is_file():
+        # The opening of a pipe would wait for a reader.
+        raise OSError(errno.EINVAL, "it is a folder, a device or a pipe")
     with replace_file(path) as file:
         file.write(json.dumps({"version": VERSION, **asdict(state)}).encode())

@@ -10,10 +10,11 @@ from pathlib import Path
 
 from shearloop.drivers.hosts import addresses_of, is_address, one_spelling
 from shearloop.errors import UserError
-from shearloop.files import replace_file
+from shearloop.files import read_file, replace_file
 
 # The addresses that a name had when it was last looked up.
 ADDRESSES_SUFFIX = ".addresses"
+_MOST_BYTES = 1 << 16
 SUFFIXES = (".json", ".lock", ADDRESSES_SUFFIX)
 
 
@@ -111,7 +112,7 @@ def _stored_spellings() -> tuple[str, ...]:
 def _last_addresses(name: str) -> frozenset[str]:
     """Return the addresses that a name had when it was last looked up; none where it never was."""
     try:
-        return frozenset(_file(name, ADDRESSES_SUFFIX).read_text(encoding="utf-8").split())
+        return frozenset(read_file(_file(name, ADDRESSES_SUFFIX), _MOST_BYTES).decode().split())
     except (OSError, UnicodeError):
         return frozenset()
 

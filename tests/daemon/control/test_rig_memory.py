@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 from collections.abc import Iterator, MutableMapping
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -320,6 +321,14 @@ def test_a_state_that_cannot_be_read_counts_as_a_stop(content, tmp_path):
     ((code, detail),) = read_memory(path).stop
     assert code == "DAEMON_ENDED"
     assert str(path) in detail
+
+
+def test_a_pipe_in_the_place_of_the_state_counts_as_a_stop_and_keeps_nobody_waiting(tmp_path):
+    path = tmp_path / "robot.json"
+    os.mkfifo(path)
+    assert "it is a device or a pipe" in read_memory(path).stop[0][1]
+    with pytest.raises(OSError, match="a device or a pipe"):
+        write_memory(path, Remembered())
 
 
 def test_a_fault_of_another_version_is_a_stop_all_the_same():

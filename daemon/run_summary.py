@@ -30,7 +30,8 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 # The name of the emulated tool's torque, which no sensor measures.
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
-# Emulated devices have these faults on command, or because their computer is too busy for them.
+# Emulated devices have these faults on command, or because their computer is too busy for them. A step's own time may
+# be too short for it, and a blocked robot names its reason: neither is blamed on the computer.
 _LATE_FAULTS = frozenset(
     code.text
     for code in (
@@ -38,10 +39,9 @@ _LATE_FAULTS = frozenset(
         FaultCode.STATE_STALE,
         FaultCode.DEVICE_LOST,
         FaultCode.ROBOT_LOST,
-        FaultCode.ROBOT_BLOCKED,
+        FaultCode.ROBOT_UNCONTROLLED,
         FaultCode.DAEMON_PAUSED,
         FaultCode.LOOP_LATE,
-        FaultCode.STEP_OVERDUE,
     )
 )
 _TOO_BUSY = "This computer was too busy for the emulated rig: close other programs and run it again."
@@ -150,7 +150,7 @@ class RunSummary:
             self.ended_as_asked = phase == "done" or _was_asked_for(content)
             rig = self._emulated
             lines = list(_lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent))
-            if rig is not None and phase != "done" and _LATE_FAULTS.intersection(_codes(content)):
+            if rig is not None and phase != "done" and _may_be_late(content):
                 lines.insert(0, _TOO_BUSY)
             if self._heading:
                 lines.insert(0, self._heading)
@@ -167,6 +167,14 @@ class RunSummary:
 def _was_asked_for(content: Mapping[str, Any]) -> bool:
     """Return whether a person stopped the experiment of a `loop.state`."""
     return bool(_ASKED_FOR.intersection(_codes(content)[:1]))
+
+
+def _may_be_late(content: Mapping[str, Any]) -> bool:
+    """Return whether a busy computer can be the cause of a stop; what followed from another cause tells nothing."""
+    codes = _codes(content)
+    # Several holds together have no cause among them.
+    causes = codes if FaultCode.HELD_TOO_LONG.text in codes[:1] else codes[:1]
+    return bool(_LATE_FAULTS.intersection(causes))
 
 
 def _codes(content: Mapping[str, Any]) -> list[str]:

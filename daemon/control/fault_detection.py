@@ -193,7 +193,8 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
             starting = "safety, power and control program are made ready"
             found.append(Fault(FaultCode.ROBOT_STARTING, starting, t_ns=arm.t_ns))
         elif arm.blocked:
-            found.append(Fault(FaultCode.ROBOT_BLOCKED, arm.blocked, t_ns=arm.t_ns))
+            code = FaultCode.ROBOT_UNCONTROLLED if arm.late else FaultCode.ROBOT_BLOCKED
+            found.append(Fault(code, arm.blocked, t_ns=arm.t_ns))
     if gripper is not None and has_gripper:
         found += _gripper_faults(gripper, watched, t_ns)
     for name, reason in lost.items():

@@ -22,6 +22,8 @@ class ArmStatus:
     blocked: str = ""
     # The robot is being unlocked, powered or started.
     starting: bool = False
+    # Messages that came late can be why it is blocked.
+    late: bool = False
     # Nothing but the start of an experiment is missing: it enables the arm.
     enabled_by_start: bool = False
 

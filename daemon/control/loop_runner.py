@@ -286,6 +286,7 @@ class ControlLoopRunner:
                 emergency_stop=state.emergency_stop,
                 blocked=state.blocked,
                 starting=state.recovering,
+                late=state.late,
                 enabled_by_start=state.awaits_enable,
             )
         )

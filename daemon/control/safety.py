@@ -157,6 +157,12 @@ class FaultCode(Enum):
         "the robot does not move: {detail}.",
         "Clear the cause and `shearloop command unlock`, then the experiment can begin.",
     )
+    ROBOT_UNCONTROLLED = Rule(
+        _KEEP,
+        "the daemon has lost control of the robot: {detail}.",
+        "If nobody stopped it at the pendant, check its cable, and whether this computer is overloaded; then "
+        "`shearloop command unlock`, and the experiment can begin.",
+    )
     TASK_DIED = Rule(
         _KEEP,
         "a task of the daemon crashed and restarts: {detail}.",

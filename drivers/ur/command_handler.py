@@ -29,7 +29,7 @@ from shearloop.drivers.ur.messages import (
     WristSpeed,
     ZeroForceTorque,
 )
-from shearloop.drivers.ur.motion import MotionExecutor, is_recent, why_unfit
+from shearloop.drivers.ur.motion import MotionExecutor, is_recent, may_be_late, why_unfit
 from shearloop.drivers.ur.settings import UrSettings
 
 if TYPE_CHECKING:
@@ -182,6 +182,8 @@ class CommandHandler:
         self._executor = MotionExecutor(settings, arm, now_ns)
         self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s)
         self._disabled_reason = NOT_ENABLED
+        # Whether messages that came late can be that reason.
+        self._disabled_late = False
         self._daemon_alive_ns = now_ns
         # Whether the gripper holds something, as the daemon says.
         self._held_tool = False
@@ -293,6 +295,8 @@ class CommandHandler:
         if unfit:
             # Nothing can be sent. The arm stops by itself, or by its watchdog, which is not fed now.
             self._disabled_reason = unfit
+            if why_unfit(sample, self._settings):
+                self._disabled_late = may_be_late(sample, self._settings)
             if not self.at_rest:
                 # The program may turn the wrist on, also when it is resumed.
                 self._executor.leave_to_watchdog(unfit)
@@ -302,6 +306,7 @@ class CommandHandler:
         beyond = self._executor.violation(sample)
         if beyond:
             self._disabled_reason = beyond
+            self._disabled_late = False
             self._executor.stop(sample, now_ns, beyond)
         elif now_ns - self._daemon_alive_ns > self._settings.silence_timeout_s * 1e9:
             silent = f"the daemon was silent for {self._settings.silence_timeout_s:g} s"
@@ -316,6 +321,7 @@ class CommandHandler:
             **sample.__dict__,
             blocked=blocked,
             awaits_enable=blocked == NOT_ENABLED,
+            late=bool(blocked) and self._may_be_late(sample),
             recovering=self.recovering,
             motion=executor.motion,
             motion_id=executor.motion_id,
@@ -335,6 +341,13 @@ class CommandHandler:
         if self._recovery is not None:
             return BEING_MADE_READY
         return self._why_unfit(sample) or self._executor.violation(sample) or self._disabled_reason
+
+    def _may_be_late(self, sample: RtdeSample) -> bool:
+        """Return whether messages that came late can be why motion is refused."""
+        if why_unfit(sample, self._settings):
+            return may_be_late(sample, self._settings)
+        is_beyond = not self._executor.disabled_reason and self._executor.violation(sample) != ""
+        return self._recovery is None and not is_beyond and self._disabled_late
 
     def _end_recovery(self, recovery: Recovery) -> tuple[int, CommandReply] | None:
         self._recovery = None

@@ -302,6 +302,8 @@ class RobotState(RtdeSample):
     blocked: str
     # Whether motion is refused for want of `Enable` alone.
     awaits_enable: bool
+    # Whether messages that came late can be why motion is refused.
+    late: bool
     # Whether the robot is being unlocked, powered or started.
     recovering: bool
     motion: MotionKind

@@ -429,6 +429,15 @@ def why_unfit(sample: RtdeSample, settings: UrSettings) -> str:
     return ""
 
 
+def may_be_late(sample: RtdeSample, settings: UrSettings) -> bool:
+    """Return whether messages that came late can be why a sample is unfit; not where the robot says another reason."""
+    if not sample.connected or not is_recent(sample, settings):
+        return True
+    is_ready = sample.safety_mode in (SAFETY_NORMAL, SAFETY_REDUCED) and sample.robot_mode == ROBOT_MODE_RUNNING
+    # The watchdog ends the program when commands come late.
+    return is_ready and not sample.program_paused and not sample.program_running
+
+
 _SAFETY = {
     4: "The robot is in recovery mode: move it back within its safety limits at the teach pendant.",
     5: "A safeguard stop holds the robot: close the safeguard, then unlock.",

@@ -188,7 +188,9 @@ def test_where_a_screw_ended_and_what_it_took_is_told():
     [
         (FaultCode.STATE_STALE, "the robot last reported its state 0.31 s ago", True),
         (FaultCode.ESTIMATE_STALE, "the last torque of right came 3.4 s ago", True),
-        (FaultCode.ROBOT_BLOCKED, "The control program on the robot does not run.", True),
+        (FaultCode.ROBOT_UNCONTROLLED, "The control program on the robot does not run.", True),
+        (FaultCode.ROBOT_BLOCKED, "Torque is 6.81 N m, beyond the hard limit of 6.5 N m.", False),
+        (FaultCode.STEP_OVERDUE, "step 3 (twist) has taken 5.0 s of at most 5 s", False),
         (FaultCode.TORQUE_LIMIT, "right measured +0.300 N·m, the limit is 0.25 N·m", False),
     ],
 )
@@ -203,6 +205,20 @@ def test_a_late_stop_of_an_emulated_rig_names_the_busy_computer(code, detail, sh
     for content in (loop_state(0), stopped):
         on_a_rig("loop.state", content)
     assert "too busy" not in out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("codes", "shown"),
+    [
+        ((FaultCode.HELD_TOO_LONG, FaultCode.ESTIMATE_INVALID, FaultCode.LOOP_LATE), True),
+        ((FaultCode.HELD_TOO_LONG, FaultCode.ESTIMATE_INVALID), False),
+        ((FaultCode.TORQUE_LIMIT, FaultCode.STATE_STALE), False),
+    ],
+)
+def test_what_followed_from_another_cause_is_not_blamed_on_the_computer(codes, shown):
+    faults = ", ".join(code.text for code in codes)
+    stopped = loop_state(5, phase="stopped", cause="it stopped", activity="it stopped", faults=faults)
+    assert ("too busy" in summary_of(loop_state(0), stopped)) is shown
 
 
 @pytest.mark.parametrize("code", [FaultCode.OPERATOR_STOP, FaultCode.DAEMON_ENDED])

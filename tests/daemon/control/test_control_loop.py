@@ -470,6 +470,7 @@ def test_a_stop_of_the_robot_itself_waits_for_the_operator_also_where_nothing_mo
         ("arm", {"protective_stop": True}, FaultCode.PROTECTIVE_STOP),
         ("arm", {"emergency_stop": True}, FaultCode.EMERGENCY_STOP),
         ("arm", {"blocked": "the worker was started again"}, FaultCode.ROBOT_BLOCKED),
+        ("arm", {"blocked": "the control program does not run", "late": True}, FaultCode.ROBOT_UNCONTROLLED),
         ("hand", {"fault": "the motor is overheated"}, FaultCode.GRIPPER_FAULT),
     ],
 )

@@ -145,6 +145,37 @@ def test_hard_limit_stops_until_enabled_again():
 
 
 @pytest.mark.parametrize(
+    ("changes", "late"),
+    [
+        ({"age_ns": 300_000_000}, True),
+        ({"connected": False}, True),
+        ({"runtime_state": 1}, True),
+        ({"wrench": (0.0, 0.0, 0.0, 0.0, 0.0, 6.5)}, False),
+        ({"speed_slider": 0.5}, False),
+        ({"safety_mode": 3}, False),
+        ({"safety_mode": 5, "runtime_state": 1}, False),
+        ({"robot_mode": 3, "runtime_state": 1}, False),
+        ({"runtime_state": 4}, False),
+    ],
+)
+def test_only_what_late_messages_can_block_is_said_to_be_late(changes, late):
+    bench = turning()
+    bench.arm.be(**changes)
+    bench.run(10)
+    assert (bench.state.blocked != "", bench.state.late) == (True, late)
+
+
+def test_a_limit_stays_a_limit_after_the_arm_has_come_back_within_it():
+    bench = turning()
+    for changes, late in (({"wrench": (0.0, 0.0, 0.0, 0.0, 0.0, 6.5)}, False), ({"age_ns": 300_000_000}, True)):
+        bench.arm.be(**changes)
+        bench.run(10)
+        bench.arm.be(wrench=(0.0,) * 6, age_ns=0)
+        bench.run(2)
+        assert (bench.state.blocked != "", bench.state.late) == (True, late)
+
+
+@pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({"speed_slider": 0.5}, "The speed slider is at 50 %"),

@@ -26,17 +26,23 @@ class EventLog:
         if topic not in _EVENTS_OF:
             return
         before = self._before.get(topic, {})
+        # What the first state shows began earlier, at a time that nobody here knows.
+        earlier = " (since before this time)" if topic in _STATES and not before else ""
         if topic != DaemonEnd.topic:
             self._before.pop(DaemonEnd.topic, None)
         self._before[topic] = content
         for kind, text in _EVENTS_OF[topic](before, content):
-            self.events.append({"number": number, "timestamp": content["timestamp"], "kind": kind, "text": text})
+            self.events.append(
+                {"number": number, "timestamp": content["timestamp"], "kind": kind, "text": f"{text}{earlier}"}
+            )
 
     def after(self, number: int) -> list[dict[str, Any]]:
         """Return the events of messages numbered after `number`, oldest first."""
         return [event for event in self.events if event["number"] > number]
 
 
+# Topics that repeat a state, which has begun before the first message of it.
+_STATES = frozenset({"loop.state", "health", "robot.state", "gripper.state"})
 # Kind and text of each event.
 Events = Iterator[tuple[str, str]]
 

@@ -69,6 +69,8 @@ def test_faults_of_tasks_and_devices_and_the_end_are_told():
         ("health", {"tasks": {"loop": alive, "right": alive}}),
         ("health", {"tasks": {"loop": dead, "right": {**alive, "error": "look at the cable"}}}),
         ("health", {"tasks": {"loop": alive, "right": alive}}),
+        ("robot.state", {"blocked": ""}),
+        ("gripper.state", {"fault_text": ""}),
         ("robot.state", {"blocked": "it is in a protective stop"}),
         ("gripper.state", {"fault_text": "no current"}),
         ("loop.stop", times),
@@ -82,6 +84,25 @@ def test_faults_of_tasks_and_devices_and_the_end_are_told():
         ("stop", "the stop, from its cause: decided after 0.004 s, sent after 0.006 s, no standstill measured"),
         ("stop", "the daemon has ended"),
     ]
+
+
+def test_what_began_before_the_viewer_is_not_dated_at_its_start():
+    since = " (since before this time)"
+    assert lines(
+        loop("running", 2),
+        loop("running", 3),
+        ("health", {"tasks": {"loop": {"alive": False, "last_error": "a bug"}}}),
+        ("robot.state", {"blocked": "it is in a protective stop"}),
+        ("gripper.state", {"fault_text": "no current"}),
+    ) == [
+        ("step", f"hold runs{since}"),
+        ("step", f"step 2 of 3: grip{since}"),
+        ("step", "step 3 of 3: grip"),
+        ("fault", f"loop is dead: a bug{since}"),
+        ("fault", f"it is in a protective stop{since}"),
+        ("fault", f"no current{since}"),
+    ]
+    assert lines(loop("stopped", cause="the torque is old.", response="stop and keep grip"))[0][1].endswith(since)
 
 
 def test_a_stop_that_was_not_sent_tells_why():

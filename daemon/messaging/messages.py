@@ -83,7 +83,9 @@ class EitEstimate(Message):
     diameter_mm: float | None = column("mm", "diameter of the tool, from the fingertip alone")
     diameter_low_mm: float | None = column("mm", "lower end of its 95 % interval")
     diameter_high_mm: float | None = column("mm", "upper end of its 95 % interval")
-    k: float | None = column("cm or rad/cm", "k of the best-matching cell; in rad/cm for modulated_gaussian")
+    k: float | None = column(
+        "", "k of the best-matching cell, in cm; in rad/cm with the basis model modulated_gaussian"
+    )
     sigma: float | None = column("cm", "σ of the best-matching cell")
     score: float | None = column("", "normalised cross-correlation of the best cell, 0 to 1")
     runner_up: float | None = column("", "score of the best cell away from the best one")
@@ -116,8 +118,8 @@ class EitHeatmap(Message):
     """The scores of all cells for one frame, NaN for invalid cells; sent while there is a subscriber, or always."""
 
     scores: NDArray[np.floating] = column("", "score of each cell, k by sigma")
-    k_low: float = column("cm or rad/cm", "first k of the grid; in rad/cm for modulated_gaussian")
-    k_high: float = column("cm or rad/cm", "last k of the grid")
+    k_low: float = column("", "first k of the grid, in cm; in rad/cm with the basis model modulated_gaussian")
+    k_high: float = column("", "last k of the grid, in the same unit")
     sigma_low: float = column("cm", "first sigma of the grid")
     sigma_high: float = column("cm", "last sigma of the grid")
     model: str = column("", "basis model of the bank, which defines k and sigma")

@@ -474,7 +474,7 @@ def test_messages_are_readable():
     message = sample(EitEstimate, torque_nm=0.05, torque_low_nm=0.02, torque_high_nm=0.08, **values)
     content = decode(encode(wire_map(message, timestamp=0.0, seq=1)))
     line = message_line("eit.estimate", content)
-    assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500 cm or rad/cm   " in line
+    assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500   " in line
     assert line.endswith("sigma 1.500 cm   score 0.750")
     assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
     robot = decode(encode(wire_map(sample(RobotStateMessage, blocked=""), timestamp=0.0, seq=1)))

@@ -132,7 +132,7 @@ export class FingertipPanel {
     put(this.part("score"), number(said.score, 4));
     put(this.part("runner-up"), number(said.runner_up, 4));
     // The bank's model, which the heatmap names, decides between the units of k.
-    put(this.part("k"), number(said.k, 3, heatmap?.k_unit || link.unit("eit.estimate", "k")));
+    put(this.part("k"), number(said.k, 3, heatmap?.k_unit ?? ""));
     put(this.part("sigma"), link.number(estimate, "sigma", 3));
     put(this.part("frame"), said.frame === undefined ? "–" : String(said.frame));
     put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));

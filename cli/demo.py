@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -47,33 +48,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Prepare the folder, then run the daemon and its page."""
     folder = args.folder / "config"
-    files = init.packaged_files()
-    init.write_files(folder, {path: content for path, content in files.items() if not (folder / path).exists()})
     if args.prepare:
+        _write_missing(folder)
         try:
             _prepare(folder, args.folder / "run", calibrated=args.play is None)
         except KeyboardInterrupt as interrupt:
             # The demo that has started and ended this process says so.
             return interrupt_status(interrupt)
         return 0
-    from shearloop.daemon.config import load_daemon_config
-    from shearloop.daemon.rig import open_settings
-
     name = "demo.yaml" if args.play is None else "fingertip_demo.yaml"
     played = [] if args.play is None else ["--play", str(args.play)]
-    config = load_daemon_config(folder / name)
-    # Mistakes, and another daemon, are found before anything is built and served.
+    # Mistakes, and another daemon, are found before anything is written, built and served.
     if args.play is not None:
         from shearloop.tools.recordings.matlab_import import read_lines
 
         read_lines(args.play)
-    settings = open_settings(config)
-    check_ports(config, settings.host if settings is not None else None)
-    port = args.port
-    if port is None:
-        port = PAGE_PORT if is_free(HOST, PAGE_PORT) else 0
-    if port and not is_free(HOST, port):
-        raise UserError(f"the page cannot be served on {HOST}:{port}, which is taken; give another --port")
+    port = _page_port(args.port)
+    if not (folder / name).exists():
+        with TemporaryDirectory() as temporary:
+            init.write_files(Path(temporary), init.packaged_files())
+            _config_of_free_ports(Path(temporary) / name)
+    _write_missing(folder)
+    config = _config_of_free_ports(folder / name)
     if args.play is None and not config.autostart:
         raise UserError(
             f"{folder / name} starts nothing by itself: it needs `emulated: true` and `autostart: true`; remove it, "
@@ -86,9 +82,35 @@ def run(args: argparse.Namespace) -> int:
     if status:
         return status
     # Half a minute has passed.
-    check_ports(config, settings.host if settings is not None else None)
+    _config_of_free_ports(folder / name)
     with page(config, port):
         return _call(run_command, str(folder / name), "--show", *played)
+
+
+def _write_missing(folder: Path) -> None:
+    """Write the files of the demo that are not there yet."""
+    files = init.packaged_files()
+    init.write_files(folder, {path: content for path, content in files.items() if not (folder / path).exists()})
+
+
+def _page_port(asked: int | None) -> int:
+    """Return the page's port, 0 for any; raises UserError for one that was asked for and is taken."""
+    if asked is None:
+        return PAGE_PORT if is_free(HOST, PAGE_PORT) else 0
+    if asked and not is_free(HOST, asked):
+        raise UserError(f"the page cannot be served on {HOST}:{asked}, which is taken; give another --port")
+    return asked
+
+
+def _config_of_free_ports(path: Path) -> "DaemonConfig":
+    """Return the configuration of a file; raises UserError if its addresses are taken."""
+    from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.rig import open_settings
+
+    config = load_daemon_config(path)
+    settings = open_settings(config)
+    check_ports(config, settings.host if settings is not None else None)
+    return config
 
 
 def check_ports(config: "DaemonConfig", robot: str | None) -> None:

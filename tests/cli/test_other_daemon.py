@@ -31,6 +31,12 @@ def test_a_second_demo_is_refused_by_name(monkeypatch):
         demo.check_ports(DaemonConfig(load_cell={"device": {"path": "load"}}), None)
 
 
+def test_a_demo_that_is_refused_leaves_no_folder_behind(monkeypatch, tmp_path, mistake):
+    answering(monkeypatch, {"ok": True, "tasks": {}, "daemon": RUNNING})
+    assert "process 4711 (demo)" in mistake("demo", "--folder", tmp_path / "demo")
+    assert not (tmp_path / "demo").exists()
+
+
 @pytest.mark.parametrize("emulators", [[], [{"device": "hx711", "arguments": ["--link", "load"]}]])
 def test_a_second_run_is_refused_by_name(config, monkeypatch, mistake, emulators):
     answering(monkeypatch, {"ok": True, "tasks": {}, "daemon": RUNNING})

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -169,6 +170,12 @@ def test_a_commissioning_is_rehearsed_on_emulated_devices_and_every_line_says_so
     page = out.with_suffix(".html").read_text()
     assert "EMULATED: commissioning" in page
     assert "raises no limit of a real robot" in page
+    # The live page's colours, by day and by night.
+    live = (Path(__file__).parents[3] / "daemon" / "web" / "assets" / "view.css").read_text()
+    for colour in re.findall(r"--(?:ink|line|paper|alarm):#[0-9a-f]{6}", page):
+        assert colour.replace(":", ": ") in live
+    assert page.count("--paper:") == 2
+    assert "prefers-color-scheme:dark" in page
 
 
 def test_what_cannot_be_rehearsed_is_refused_before_anything_is_played(tmp_path, mistake):

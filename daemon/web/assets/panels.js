@@ -202,7 +202,7 @@ export function robotPanel(link) {
   warn(byId("robot-blocked"), stops.filter(Boolean).join(": "));
   put(byId("wrist"), link.number(message, "wrist_rad", 3, SIGNED));
   put(byId("wrist-speed"), link.number(message, "wrist_speed_rad_per_s", 3, SIGNED));
-  put(byId("wrist-torque"), link.number(message, "wrist_torque_nm", 3, SIGNED));
+  put(byId("wrist-torque"), number(wrenchTorque(link).value, 3, link.unit(message.topic, "wrist_torque_nm"), SIGNED));
   put(byId("robot-mode"), mode(ROBOT_MODES, said.robot_mode));
   put(byId("safety-mode"), mode(SAFETY_MODES, said.safety_mode));
   put(byId("speed-scaling"), `${number(100 * said.speed_scaling, 0)} %`);

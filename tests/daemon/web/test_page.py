@@ -82,7 +82,7 @@ def test_the_page_shows_the_messages_numbers(browsed):
         "#wrist-speed": f"{signed(robot['wrist_speed_rad_per_s'], 3)} rad/s",
         "#speed-sent": f"{signed(said['loop']['speed_sent_rad_per_s'], 3)} rad/s",
         "#speed-command": f"requested {signed(said['loop']['speed_command_rad_per_s'], 3)}",
-        "#wrist-torque": f"{signed(robot['wrist_torque_nm'], 3)} N·m",
+        "#wrist-torque": f"{signed(-robot['wrist_torque_nm'], 3)} N·m",
         "#robot-mode": "running (7)",
         "#safety-mode": "normal (1)",
         "#speed-scaling": "75 %",

@@ -185,8 +185,8 @@ class Rig:
     async def start(self, path: Path, digest: str | None = None) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file.
 
-        `digest` is of the question that a person has confirmed, if one was asked; raises QuestionChangedError where the
-        file has another content.
+        `digest` is of the question that a person has confirmed, if one was asked; raises QuestionChangedError where
+        another one would be asked now.
         """
         # While something moves, no file is read.
         if (reason := self.runner.start_refusal()) is not None:
@@ -194,8 +194,8 @@ class Rig:
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
         if digest is not None and digest != (question := self._question_of(experiment)).digest:
-            changed = f"{path}: the file has changed since its plan was shown; look at the plan again"
-            raise QuestionChangedError(changed, question)
+            changed = "the file, or what its start does to a held tool, has changed since its plan was shown"
+            raise QuestionChangedError(f"{path}: {changed}; look at the plan again", question)
         try:
             if self.memory is not None and (reason := await self.memory.begins(experiment.file.name)) is not None:
                 return reason
@@ -220,7 +220,7 @@ class Rig:
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)
         note = self.control_loop.activation_note(file)
         text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
-        # The plan depends on the rig's limits, too.
+        # The question depends on the gripper's state, and the plan on the rig's limits.
         return Question(text, digest_of(experiment.data, text, *sentences), sentences)
 
     def state(self) -> Mapping[str, Any]:

@@ -234,7 +234,13 @@ class Runner:
 
 
 def rig(folder: Path, runner: Runner) -> Rig:
-    return Rig(SimpleNamespace(warm_up_s=0.0, runs=1), runner, {}, ExperimentFiles((folder,)), None)
+    return Rig(
+        SimpleNamespace(warm_up_s=0.0, runs=1, activation_note=lambda _: ""),
+        runner,
+        {},
+        ExperimentFiles((folder,)),
+        None,
+    )
 
 
 async def test_no_file_is_read_while_none_can_start(folder, monkeypatch):
@@ -254,12 +260,16 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
     # The same name and the same sentences: only the bytes differ.
     for other in (before + b"# faster\n", write(path, {**VALID, "name": "two"}).read_bytes()):
         path.write_bytes(other)
-        with pytest.raises(CommandRefusedError, match="the file has changed since its plan was shown") as refused:
+        with pytest.raises(CommandRefusedError, match="has changed since its plan was shown") as refused:
             await start({"experiment": str(path), "digest": asked["digest"]})
         assert refused.value.facts == await start({"experiment": str(path), "ask": True})
     assert runner.started == []
     await start({"experiment": str(path), "digest": refused.value.facts["digest"]})
     path.write_bytes(before)
+    subject.control_loop.activation_note = lambda _: " Before step 1 the gripper is activated."
+    with pytest.raises(CommandRefusedError, match="what its start does to a held tool"):
+        await start({"experiment": str(path), "digest": asked["digest"]})
+    subject.control_loop.activation_note = lambda _: ""
     await start({"experiment": str(path), "digest": asked["digest"]})
     # Who asks nothing names the file as it is.
     await start({"experiment": str(path)})

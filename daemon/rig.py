@@ -15,7 +15,7 @@ from shearloop.daemon.control.experiment_schema import first_motion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_runner import ControlLoopRunner, wrench_source
-from shearloop.daemon.control.plan import plan_of
+from shearloop.daemon.control.plan import plan_of, speeds_of
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment, check_experiment
 from shearloop.daemon.logs import LinkReporter
@@ -214,9 +214,9 @@ class Rig:
 
     def _question_of(self, experiment: ReadExperiment) -> Question:
         file = experiment.file
-        motion = first_motion(file, self.experiments.gripper)
         robot = self.experiments.robot
         limits = robot.settings.limits if robot is not None else None
+        motion = first_motion(file, self.experiments.gripper, speeds_of(limits))
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)
         note = self.control_loop.activation_note(file)
         text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())

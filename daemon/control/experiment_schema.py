@@ -248,6 +248,24 @@ class ExperimentFile(ConfigModel):
         return ExperimentLimits.model_construct(torque_nm=torque_nm, angle_rad=angle_rad)
 
 
+class Speeds(NamedTuple):
+    """The largest speeds that a rig allows; a step that asks for more moves with these."""
+
+    wrist_rad_per_s: float = math.inf
+    linear_m_per_s: float = math.inf
+
+    def turning(self, asked_rad_per_s: float) -> str:
+        """Return in words how fast a step turns the wrist."""
+        return f"at {min(asked_rad_per_s, self.wrist_rad_per_s):g} rad/s"
+
+    def moving(self, asked_m_per_s: float) -> str:
+        """Return in words how fast a step moves the tool centre."""
+        return f"at {min(asked_m_per_s, self.linear_m_per_s):g} m/s"
+
+
+AS_ASKED: Final = Speeds()
+
+
 def first_motion_before_grip(file: ExperimentFile) -> int | None:
     """Return the number, from 1, of the first step that moves the arm before any grip or release, or None."""
     for number, step in enumerate(file.steps, 1):
@@ -268,36 +286,38 @@ def opens_to_mm(step: ReleaseStep, gripper: GripperModel | None) -> float:
     return step.width_mm if gripper is None else min(step.width_mm, gripper.stroke_mm)
 
 
-def first_motion(file: ExperimentFile, gripper: GripperModel | None = None) -> str:
+def first_motion(file: ExperimentFile, gripper: GripperModel | None = None, speeds: Speeds = AS_ASKED) -> str:
     """Return the first motion of an experiment as a sentence, for the operator who starts it."""
     for number, step in enumerate(file.steps, 1):
-        if (motion := motion_of(step, gripper)) is not None:
+        if (motion := motion_of(step, gripper, speeds)) is not None:
             return f"the first motion is step {number} of {len(file.steps)} ({step.do}): {motion}"
     return "no step moves anything"
 
 
-def motion_of(step: Step, gripper: GripperModel | None = None) -> str | None:
+def motion_of(step: Step, gripper: GripperModel | None, speeds: Speeds) -> str | None:
     """Return what moves in a step, as a sentence, or None."""
     match step:
         case ApproachStep(along_tool_m=float(distance_m)):
-            return f"the arm moves {1e3 * distance_m:+.0f} mm along the tool's axis, at {step.speed_m_per_s:g} m/s"
+            return (
+                f"the arm moves {1e3 * distance_m:+.0f} mm along the tool's axis, {speeds.moving(step.speed_m_per_s)}"
+            )
         case ApproachStep(pose_m_rad=tuple(pose)):
             x, y, z = (f"{1e3 * value:.0f}" for value in pose[:3])
-            return f"the arm moves to x {x}, y {y}, z {z} mm, at {step.speed_m_per_s:g} m/s"
+            return f"the arm moves to x {x}, y {y}, z {z} mm, {speeds.moving(step.speed_m_per_s)}"
         case GripStep():
             return f"the fingers close to {step.width_mm:g} mm, or onto a tool with at most {step.force_n:g} N"
         case ReleaseStep():
             return f"the fingers open to {opens_to_mm(step, gripper):g} mm, and a tool in them drops"
         case TurnToStep():
-            return f"the wrist turns to {step.angle_rad:g} rad, at {step.speed_rad_per_s:g} rad/s"
+            return f"the wrist turns to {step.angle_rad:g} rad, {speeds.turning(step.speed_rad_per_s)}"
         case TwistStep():
-            return f"the wrist twists to {step.angles_rad[0]:g} rad, at {step.speed_rad_per_s:g} rad/s"
+            return f"the wrist twists to {step.angles_rad[0]:g} rad, {speeds.turning(step.speed_rad_per_s)}"
         case IdentifyStep():
             return f"the wrist turns to and fro, by at most {step.amplitude_rad:g} rad"
         case HoldTorqueStep():
             return f"the wrist turns until the torque is {step.signed_torque_nm:+g} N·m"
         case TightenStep():
-            return f"the wrist turns {step.direction}, at {step.speed_rad_per_s:g} rad/s"
+            return f"the wrist turns {step.direction}, {speeds.turning(step.speed_rad_per_s)}"
         case _:
             return None
 
@@ -356,14 +376,6 @@ class Demand(NamedTuple):
         return self.stands_s + self.moves_s
 
 
-class Speeds(NamedTuple):
-    """The largest speeds that a rig allows; a step that asks for more moves with these."""
-
-    wrist_rad_per_s: float = math.inf
-    linear_m_per_s: float = math.inf
-
-
-AS_ASKED: Final = Speeds()
 # The wrist slows down as it comes near an angle: to a hundredth of 0.2 rad in a second, at the default bandwidth.
 SETTLES_S: Final = 1.0
 

@@ -113,6 +113,13 @@ class Plan:
             yield f"  {self.unknown}"
 
 
+def speeds_of(robot: UrLimits | None) -> Speeds:
+    """Return the largest speeds within the robot's limits; as asked where these are not known."""
+    if robot is None:
+        return AS_ASKED
+    return Speeds(robot.wrist_speed_rad_per_s.inner, robot.linear_speed_m_per_s.inner)
+
+
 def plan_of(
     file: ExperimentFile,
     robot: UrLimits | None = None,
@@ -124,9 +131,7 @@ def plan_of(
 
     `refused` has the reasons against each step by its index; `warm_up_s` passes after a grip until the first torque.
     """
-    speeds = AS_ASKED
-    if robot is not None:
-        speeds = Speeds(robot.wrist_speed_rad_per_s.inner, robot.linear_speed_m_per_s.inner)
+    speeds = speeds_of(robot)
     back = {one.number: one.sentence(file) for one in reversals(file)}
     planned: list[StepPlan] = []
     # Whether the next step that twists waits for the first torques of a grip or a tare.

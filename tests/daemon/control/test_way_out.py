@@ -16,7 +16,7 @@ from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
 from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, first_motion
 from shearloop.daemon.control.loop_runner import wrench_source
-from shearloop.daemon.control.plan import plan_of
+from shearloop.daemon.control.plan import plan_of, speeds_of
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
@@ -345,6 +345,19 @@ def test_the_first_motion_opens_no_further_than_the_configured_gripper(step, mod
     gripper = MODELS[model] if model is not None else None
     assert f"the fingers open to {opens_mm} mm, and" in first_motion(file, gripper)
     assert f"opens the fingers to {opens_mm} mm:" in "\n".join(plan_of(file, gripper=gripper).sentences())
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        ({"do": "turn_to", "angle_rad": 1, "speed_rad_per_s": 3}, "at 0.8 rad/s"),
+        ({"do": "turn_to", "angle_rad": 1, "speed_rad_per_s": 0.2}, "at 0.2 rad/s"),
+        ({"do": "approach", "along_tool_m": 0.1, "speed_m_per_s": 0.5}, "at 0.1 m/s"),
+    ],
+)
+def test_the_first_motion_has_the_speed_that_the_robots_limits_leave(step, said):
+    file = ExperimentFile.model_validate({"name": "test", "steps": [step]})
+    assert first_motion(file, None, speeds_of(SETTINGS.limits)).endswith(said)
 
 
 def test_a_noisy_source_supervises_beyond_its_noise_and_drives_nothing_gentle():

@@ -55,7 +55,8 @@ class RequestWatch:
                 # It was not taken up, or another one came right behind it.
                 self._awaits_echo, self._echo = False, readout.pre
             return
-        ours_may_change_it = self.sent is None and is_recent
+        # A late echo of our move is ours.
+        ours_may_change_it = (self.sent is None and is_recent) or self.carries_out(readout)
         if self._echo not in (None, readout.pre) and not ours_may_change_it:
             self.others += 1
         self._echo = readout.pre

@@ -127,6 +127,12 @@ def test_a_move_that_is_never_taken_up_leaves_the_object_status_to_the_gripper()
     assert watch.object_status(held) is messages.ObjectStatus.MOVING
     watch.take(held, ECHOED_WITHIN_NS + 1)
     assert watch.object_status(held) is messages.ObjectStatus.CONTACT_CLOSING
+    assert watch.others == 0
+    # A late echo, as after a pause of this process, is nobody else's.
+    watch.take(TAKEN_UP, ECHOED_WITHIN_NS + 2)
+    assert watch.others == 0
+    watch.take(held, ECHOED_WITHIN_NS + 3)
+    assert watch.others == 1
 
 
 def test_a_request_of_our_own_that_changes_the_echo_is_nobody_elses():

@@ -109,7 +109,7 @@ class ExperimentFiles:
         return await self._in_thread(lambda: self._read(path), str(path))
 
     async def list(self) -> dict[str, str]:
-        """Return the names of the valid experiments in `folders` and below them, by path; raises UserError."""
+        """Return the names of the experiments of `folders` that `read` accepts, by path; raises UserError."""
         return await self._in_thread(self._list, "the folders of experiments")
 
     async def _in_thread(self, work: Callable[[], Found], what: str) -> Found:

@@ -159,7 +159,7 @@ def too_few_frames(n_idle: int, n_gripped: int) -> str:
         return ""
     return (
         f"{n_idle} idle and {n_gripped} gripped frames are too few to detect a grip; start the recording some seconds "
-        "before gripping"
+        "before gripping, and let the gripped tool rest for some seconds before its first twist"
     )
 
 

@@ -81,7 +81,7 @@ _STYLE = (
     ":root{color-scheme:light dark;--ink:#10212e;--line:#c3ccd3;--paper:#f3f5f7;--alarm:#fbdcd8;--passed:#d3efd3}"
     "@media (prefers-color-scheme:dark){"
     ":root{--ink:#e6edf2;--line:#40505c;--paper:#0e161c;--alarm:#4d1712;--passed:#12402a}}"
-    "body{font-family:sans-serif;max-width:70em;margin:2em auto;color:var(--ink);background:var(--paper)}"
+    "body{font-family:sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:var(--ink);background:var(--paper)}"
     "table{border-collapse:collapse}td,th{border:1px solid var(--line);padding:.3em .6em;text-align:left}"
     ".failed{background:var(--alarm)}.passed{background:var(--passed)}"
 )

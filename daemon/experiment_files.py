@@ -171,10 +171,12 @@ class ExperimentFiles:
             if not any(path.is_relative_to(folder.resolve()) for folder in self.folders):
                 folders = " and ".join(map(str, self.folders)) or "no folder"
                 # Whether there is such a file is not told: the daemon may see more than who asks.
-                cure = self._meant(named) or (
-                    "; copy it there, or name its folder under `experiments` in the configuration"
+                meant = self._meant(named)
+                cure = f"{meant} Otherwise copy" if meant else "; copy"
+                raise UserError(
+                    f"{name} is in none of the folders of experiments ({folders}){cure} it there, or name its folder "
+                    "under `experiments` in the configuration"
                 )
-                raise UserError(f"{name} is in none of the folders of experiments ({folders}){cure}")
             data = read_file(path, MOST_BYTES)
         except (OSError, ValueError, RuntimeError) as error:
             reason = error.strerror if isinstance(error, OSError) else str(error)

@@ -101,11 +101,15 @@ class GripStep(_Step):
     expect_object: bool = Field(True, description="closing on nothing is an error")
 
 
-def opening(width_mm: float, speed_mm_per_s: float) -> GripStep:
+class Opening(GripStep):
+    """A motion of the fingers that may only open them."""
+
+
+def opening(width_mm: float, speed_mm_per_s: float) -> Opening:
     """Return the step that opens the gripper, with its least force."""
     least_n = FORCES_N[0]
     content = {"width_mm": width_mm, "speed_mm_per_s": speed_mm_per_s, "force_n": least_n, "expect_object": False}
-    return GripStep.model_validate({"do": "grip", **content})
+    return Opening.model_validate({"do": "grip", **content})
 
 
 class TareStep(_Step):
@@ -197,7 +201,9 @@ class ReleaseStep(_Step):
     """Open the gripper."""
 
     do: Literal["release"]
-    width_mm: FingerWidth = Field(LARGEST_STROKE_MM, description="width to open to; a smaller gripper opens fully")
+    width_mm: FingerWidth = Field(
+        LARGEST_STROKE_MM, description="least width to open to; a smaller gripper opens fully"
+    )
 
 
 class WaitStep(_Step):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, activation_sentence
-from shearloop.daemon.control.experiment_schema import GripStep, opening
+from shearloop.daemon.control.experiment_schema import GripStep, Opening, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.finger_motion import FingerMotion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
@@ -57,6 +57,8 @@ class GripperTask:
         """Move to a width and wait for the end; raises DriverError and ActionError."""
         with self._motion.commanded(self.clock.now_ns()):
             await self.gripper.activate()
+            if isinstance(target, Opening) and await self._is_open(target.width_mm):
+                return
             sent = await self.gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
             state = await self.gripper.finish(sent)
         widest_mm = min(target.width_mm, self.gripper.model.stroke_mm)
@@ -68,6 +70,24 @@ class GripperTask:
         if target.expect_object and state.diameter_mm is None:
             closed = f"the fingers closed to {state.width_mm:.1f} mm and met nothing"
             raise ActionError(f"{closed}; put the tool between them, or correct `width_mm`")
+
+    async def _is_open(self, width_mm: float) -> bool:
+        """Return whether the fingers are that far open, with nothing between them: to move would close them.
+
+        Raises DriverError, and ActionError where they hold something that a motion to this width would not let go.
+        """
+        if width_mm > self.gripper.model.stroke_mm - OPEN_WITHIN_MM:
+            return False
+        state = await self.gripper.read()
+        if state.width_mm < width_mm:
+            return False
+        if state.object is not ObjectStatus.AT_TARGET:
+            raise ActionError(
+                f"the fingers are {state.width_mm:.1f} mm apart and may hold something, and a release to {width_mm:g} "
+                "mm would close them; give a larger `width_mm`, or leave it out"
+            )
+        self._take(state)
+        return True
 
     async def release(self) -> None:
         """Open wide; raises DriverError and ActionError."""

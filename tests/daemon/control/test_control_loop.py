@@ -8,7 +8,7 @@ import pytest
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
-from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, TareStep
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, Opening, TareStep
 from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
@@ -31,7 +31,7 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     )
     rig.run(200)
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
-    assert [type(action) for action in rig.begun] == [ApproachStep, TareStep, GripStep, GripStep]
+    assert [type(action) for action in rig.begun] == [ApproachStep, TareStep, GripStep, Opening]
     held = np.array(rig.true_nm)[-round(15 / TICK_S) - 110 : -110]
     assert held.mean() == pytest.approx(0.1, abs=0.008)
     assert held.std() < 0.006

@@ -81,7 +81,7 @@ def test_the_steps_are_carried_out_in_order_to_the_end():
         )
     )
     bench.run()
-    assert bench.begun == ["ApproachStep", "GripStep", "TareStep", "GripStep", "RetreatStep"]
+    assert bench.begun == ["ApproachStep", "GripStep", "TareStep", "Opening", "RetreatStep"]
     assert bench.machine.progress == 1.0
     holds = [wish for wish in bench.seen if wish.activity.startswith("holding 0.200 rad")]
     assert len(holds) * TICK_NS / 1e9 == pytest.approx(2 * 1.0, abs=0.05)

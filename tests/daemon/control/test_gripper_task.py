@@ -11,7 +11,7 @@ import pytest
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control import gripper_task
-from shearloop.daemon.control.experiment_schema import GripStep
+from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
@@ -138,6 +138,23 @@ async def test_fingers_that_meet_something_as_they_open_are_not_released(way, tm
             await task.release()
         rig.model.widest_mm = 139.0
         await task.release()
+
+
+@WAYS
+async def test_a_release_never_closes_the_fingers(way, tmp_path):
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        rig.model.object_mm = 40.0
+        task = task_of(rig)
+        await task.grip(GRIP)
+        held_mm = rig.model.width_mm
+        with pytest.raises(ActionError, match=r"40\.\d mm apart and may hold something, and a release to 10 mm would"):
+            await task.grip(opening(10.0, 60.0))
+        assert rig.model.width_mm == held_mm
+        rig.model.object_mm = None
+        await task.grip(opening(80.0, 60.0))
+        open_mm = rig.model.width_mm
+        await task.grip(opening(10.0, 60.0))
+        assert rig.model.width_mm == open_mm > 79
 
 
 @WAYS

@@ -9,7 +9,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.inputs import GripperStatus, LatestInputs
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.messaging.messages import stale_after_s
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
 from shearloop.daemon.torques import TorqueSample, TorqueSource
 
 # 2.5 periods of their topics.
@@ -157,7 +157,14 @@ def _disagreement(
     times_ns, torques_nm = inputs.history.get(fast.name, ([], []))
     first, end = bisect_left(times_ns, latest.t_mid_ns - half_ns), bisect_right(times_ns, latest.t_mid_ns + half_ns)
     if end == first:
-        return []
+        # A late or a lost sample must not lift a disagreement: the nearest one counts, unless more are missing.
+        near = [at for at in (first - 1, first) if 0 <= at < len(times_ns)]
+        if not near:
+            return []
+        first = min(near, key=lambda at: abs(times_ns[at] - latest.t_mid_ns))
+        end = first + 1
+        if abs(times_ns[first] - latest.t_mid_ns) > half_ns + STALE_AFTER_PERIODS * fast.period_s * 1e9:
+            return []
     other_nm = sum(torques_nm[first:end]) / (end - first)
     apart_nm = abs(fast.as_read_nm(latest.torque_nm) - slow.as_read_nm(other_nm))
     allowed_nm = config.disagreement_nm + slow.noise_nm + fast.noise_nm

@@ -92,7 +92,8 @@ def mistake_lines(
             key += "." + details["ctx"]["discriminator"].strip("'")
         subject = f"{key}: " if key else ""
         sentence = _sentence(details, schema, _written(location, content, root, key=wrong_key))
-        if wrong_key and root is not None and not _written(location, content, root, key=False):
+        is_number = wrong_key and str(location[-1]).isdecimal()
+        if is_number and root is not None and not _written(location, content, root, key=False):
             # In braces, YAML reads the part behind a comma as a key without a value.
             sentence += _POINT
         found[f"{where}{f':{line}' if root is not None else ''}: {subject}{sentence}"] = line

@@ -90,6 +90,18 @@ def test_a_torque_that_a_one_sided_calibration_reads_as_none_is_no_disagreement(
     assert FaultCode.TORQUES_DISAGREE in events, "it reads a torque where there is one of the other sign"
 
 
+@pytest.mark.parametrize("wrench_came_s", [0.0, 0.05, 0.1])
+def test_a_disagreement_lasts_where_no_torque_is_of_the_same_moment(wrench_came_s):
+    """Two sensors never measure at once: a hold that blinked let the wrist turn in its gaps, and a step end in one."""
+    load, wrench = torque(LOAD, 0.15, came_s=0.03), torque(WRENCH, 0.0, came_s=wrench_came_s)
+    assert FaultCode.TORQUES_DISAGREE in found(load, wrench, driving=LOAD, supervising=(WRENCH,))
+
+
+def test_torques_of_other_moments_are_not_compared():
+    load, wrench = torque(LOAD, 0.15), torque(WRENCH, 0.0, came_s=0.5)
+    assert FaultCode.TORQUES_DISAGREE not in found(load, wrench, driving=LOAD, supervising=(WRENCH,))
+
+
 def test_the_wrench_is_watched_with_the_state_that_it_comes_with():
     assert found(torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, None)) == {}
 

@@ -131,9 +131,12 @@ def test_the_calibration_decides_the_estimator(files):
 def test_check_shows_the_assumptions(calibration, files, tmp_path):
     path, tips = tmp_path / "combined.cal", {"right": fingertip(), "left": fingertip()}
     replace(calibration, assumptions=("load timing",)).save(path)
-    ends = ", assuming that the load cell's delay is as given (--load-cell-delay-s)"
-    for file, said in ((path, f"with torque{ends}"), (files["combined"], "with torque")):
-        assert _torque(open_combined(CombinedConfig(calibration=file), tips).calibration) == said
+    one_way = "no torque is negative, because its recordings have positive torques alone"
+    delay = "the load cell's delay is as given (--load-cell-delay-s)"
+    for file, said in ((path, f"{delay} and {one_way}"), (files["combined"], one_way)):
+        assert _torque(open_combined(CombinedConfig(calibration=file), tips).calibration) == (
+            f"with torque, assuming that {said}"
+        )
 
 
 def test_check_and_log_say_where_the_strength_of_a_grip_is_not_checked(calibration, tmp_path):

@@ -124,16 +124,17 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, allowed_s: float, t_ns
         return Fault(FaultCode.SENSOR_LOST, f"{source.name} is {gone}: {inputs.lost[source.name]}")
     if latest is None:
         return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
+    what = "torque" if source.measures_torque else "frame"
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
     if came_s > allowed_s:
-        silent = f"the last torque of {source.name} came {came_s:.1f} s ago, {allowed_s:.1f} s are allowed"
+        silent = f"the last {what} of {source.name} came {came_s:.1f} s ago, {allowed_s:.1f} s are allowed"
         return Fault(FaultCode.ESTIMATE_STALE, silent, t_ns=latest.t_ns)
     # A torque is half its acquisition old at its end. The rest of its age is transport: a board or an estimator that
     # falls behind sends on time, but old torques.
     oldest_s = allowed_s + 0.5 * max(source.window_s, source.period_s)
     if measured_s > oldest_s:
         late = (
-            f"the last torque of {source.name} was measured {measured_s:.1f} s ago, {oldest_s:.1f} s are allowed; "
+            f"the last {what} of {source.name} was measured {measured_s:.1f} s ago, {oldest_s:.1f} s are allowed; "
             f"it took {measured_s - came_s:.1f} s to come"
         )
         return Fault(FaultCode.ESTIMATE_STALE, late, t_ns=latest.t_mid_ns)

@@ -468,12 +468,14 @@ class ControlLoop:
             grasp = Grasp.HELD if gripped.expected else Grasp.NONE
             grasp = Grasp.CHANGING if isinstance(command.action, GripStep) else grasp
             needed = grasp is Grasp.HELD and _turns(command) and not self._awaited_torques(running, t_ns)
+            runs = running.phase is ExperimentPhase.RUNNING
             watched = replace(
                 watched,
                 grasp=grasp,
-                torque_needed=needed and running.phase is ExperimentPhase.RUNNING,
+                torque_needed=needed and runs,
                 twisted_rad=0.0 if arm is None or origin_rad is None else arm.wrist_rad - origin_rad,
                 expected_nm=controller.torque_nm if controller is not None else None,
+                not_following=controller.filter.not_following if controller is not None and runs else "",
                 overdue=running.overdue,
                 others_requests=self._others_requests,
             )

@@ -46,6 +46,8 @@ class Watched:
     grasp: Grasp = Grasp.NONE
     twisted_rad: float = 0.0
     expected_nm: float | None = None
+    # How the torque has moved without the wrist, where that is too much.
+    not_following: str = ""
     overdue: str | None = None
     # Requests of other programs to the gripper before the experiment; None while none runs.
     others_requests: int | None = None
@@ -88,6 +90,8 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
         found.append(Fault(FaultCode.LOOP_LATE, f"the loop ran {inputs.late_s * 1e3:.0f} ms late"))
     if inputs.recording_error:
         found.append(Fault(FaultCode.RECORDING_FAILED, inputs.recording_error))
+    if watched.not_following:
+        found.append(Fault(FaultCode.NOT_FOLLOWING, watched.not_following, t_ns=t_ns))
     if watched.overdue is not None:
         found.append(Fault(FaultCode.STEP_OVERDUE, watched.overdue))
     return found

@@ -80,6 +80,13 @@ class FaultCode(Enum):
         "Check whether the tool slipped or the screw broke loose.",
         hold_at_most_s=5.0,
     )
+    NOT_FOLLOWING = Rule(
+        _HOLD,
+        "the torque no longer follows the wrist: {detail}.",
+        "The grip slips, or the screw broke loose or stripped: look at the tool, then `shearloop command unlock`. "
+        "`loop.max_offset_drift_nm` is the limit.",
+        hold_at_most_s=5.0,
+    )
     TORQUE_LIMIT = Rule(
         _RELEASE,
         "the torque is beyond its limit: {detail}.",

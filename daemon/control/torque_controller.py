@@ -200,6 +200,14 @@ class TorqueFilter:
         from_noise_nm = math.sqrt(variance) * self._settings.noise_nm
         return math.hypot(from_noise_nm, self._settings.stiffness_std_nm_per_rad * (angle_rad - mean_rad))
 
+    @property
+    def not_following(self) -> str:
+        """By how much the torque at a fixed angle has moved since the reference, where that is too much; else empty."""
+        if not self.slipped:
+            return ""
+        moved_nm, limit_nm = self.offset_nm - self._reference_nm, self._settings.offset_limit_nm
+        return f"at one angle it moved by {moved_nm:+.3f} N·m, and {limit_nm:g} are allowed"
+
     def restart(self) -> None:
         """Take the present offset as the reference: a grip that slipped may slip as far again before the next hold."""
         self._reference_nm, self.slipped = self.offset_nm, False

@@ -1,6 +1,7 @@
 """The control loop when all is well: whole experiments, and what an operator may ask of one."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,27 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     held = np.array(rig.true_nm)[-round(15 / TICK_S) - 110 : -110]
     assert held.mean() == pytest.approx(0.1, abs=0.008)
     assert held.std() < 0.006
+
+
+@pytest.mark.parametrize("drive", ["right", "load_cell"])
+def test_a_tool_that_slips_while_a_torque_is_held_ends_in_a_stop_and_not_as_done(drive):
+    hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 20}
+    rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, hold, {"do": "release"}, torque_source=drive)
+    while not rig.control_loop.experiment.command.hold_number:
+        rig.step()
+    rig.run(5)
+    turned, begun_s = rig.twin.step, rig.tick * TICK_S
+
+    def slipping(step_s: float, wrist_rad: float, force_n: float) -> Any:
+        """Leave the tool behind the fingers, by more and more."""
+        return turned(step_s, wrist_rad - min(0.35, 0.1 * (rig.tick * TICK_S - begun_s)), force_n)
+
+    rig.twin = SimpleNamespace(step=slipping)
+    rig.run(60)
+    assert phase(rig) is ExperimentPhase.STOPPED
+    assert "the torque no longer follows the wrist: at one angle it moved by -0." in rig.control_loop.status.activity
+    assert rig.control_loop.safety.stop_faults[0].code is FaultCode.NOT_FOLLOWING
+    assert rig.true_nm[-1] < 0.05
 
 
 def test_each_message_tells_the_step_and_its_own_activity():

@@ -17,6 +17,7 @@ from shearloop.daemon.control.experiment_schema import (
     ExperimentLimits,
     GripStep,
     IdentifyStep,
+    Opening,
     Speeds,
     TareStep,
     first_gripper_step,
@@ -72,6 +73,8 @@ class _GrippedTool:
     unmeasured_since_ns: int | None = None
     # Whether a tool should be between the fingers.
     expected: bool = False
+    # Whether the fingers close tighter on what they hold already: the grip and its angle stay.
+    tightens: bool = False
     # A stop has opened the gripper, or why it did not open, until the operator acknowledges it.
     released: bool = False
     release_error: str | None = None
@@ -222,8 +225,9 @@ class ControlLoop:
         gripped.unmeasured_since_ns = arm.t_ns if arm is not None else None
         if isinstance(action, GripStep):
             gripper = self.inputs.gripper
-            origin_rad = arm.wrist_rad if arm is not None else None
-            gripped.grip = replace(gripped.grip, origin_rad=origin_rad, force_n=action.force_n)
+            if not gripped.tightens:
+                origin_rad = arm.wrist_rad if arm is not None else None
+                gripped.grip = replace(gripped.grip, origin_rad=origin_rad, force_n=action.force_n)
             # An unexpected object is watched as well.
             gripped.expected = action.expect_object or (gripper is not None and gripper.holding)
 
@@ -541,6 +545,8 @@ class ControlLoop:
             # A process that dies while the fingers close leaves this force behind.
             force_n = max(gripped.grip.force_n or 0.0, action.force_n)
             gripped.grip, gripped.another = Grip(origin_rad, force_n), ""
+            gripper = self.inputs.gripper
+            gripped.tightens = gripper is not None and gripper.holding and not isinstance(action, Opening)
         if isinstance(action, IdentifyStep):
             wrist.begin_identification(action, limit_nm)
             action = None

@@ -57,7 +57,9 @@ class GripperTask:
         """Move to a width and wait for the end; raises DriverError and ActionError."""
         with self._motion.commanded(self.clock.now_ns()):
             await self.gripper.activate()
-            if isinstance(target, Opening) and await self._is_open(target.width_mm):
+            if not isinstance(target, Opening):
+                await self._check_no_drop(target.width_mm)
+            elif await self._is_open(target.width_mm):
                 return
             sent = await self.gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
             state = await self.gripper.finish(sent)
@@ -70,6 +72,15 @@ class GripperTask:
         if target.expect_object and state.diameter_mm is None:
             closed = f"the fingers closed to {state.width_mm:.1f} mm and met nothing"
             raise ActionError(f"{closed}; put the tool between them, or correct `width_mm`")
+
+    async def _check_no_drop(self, width_mm: float) -> None:
+        """Raise ActionError where a grip to this width would open fingers that hold something; raises DriverError."""
+        state = await self.gripper.read()
+        if state.diameter_mm is not None and width_mm > state.width_mm:
+            raise ActionError(
+                f"the fingers hold something {state.width_mm:.1f} mm wide, and a grip to {width_mm:g} mm would open "
+                "them and drop it; put a `release` before it, or correct `width_mm`"
+            )
 
     async def _is_open(self, width_mm: float) -> bool:
         """Return whether the fingers are that far open, with nothing between them: to move would close them.

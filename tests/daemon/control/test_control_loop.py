@@ -59,6 +59,20 @@ def test_a_tool_that_slips_while_a_torque_is_held_ends_in_a_stop_and_not_as_done
     assert rig.true_nm[-1] < 0.05
 
 
+def test_a_tighter_grip_of_the_same_tool_keeps_the_angle_of_the_grip():
+    twist = {"do": "twist", "angles_rad": [0.13], "return_to_start": False, "hold_s": 0.5}
+    limits = {"torque_nm": 1.0, "angle_rad": 0.2}
+    again = {**twist, "angles_rad": [0.19]}
+    rig = started(
+        Rig(new_loop()), GRIP, twist, {**GRIP, "force_n": 100.0}, again, torque_source="load_cell", limits=limits
+    )
+    begun_rad = rig.wrist_rad
+    rig.run(60)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    assert rig.wrist_rad - begun_rad == pytest.approx(0.19, abs=0.01), "the second twist counts from the same grip"
+    assert rig.control_loop.grip.force_n == 100.0
+
+
 def test_each_message_tells_the_step_and_its_own_activity():
     """The end of a measurement begins the next step within the same decision."""
     hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 1}

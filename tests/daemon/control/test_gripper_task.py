@@ -140,6 +140,10 @@ async def test_fingers_that_meet_something_as_they_open_are_not_released(way, tm
         await task.release()
 
 
+def replace_step(step: GripStep, **changes: float) -> GripStep:
+    return step.model_copy(update=changes)
+
+
 @WAYS
 async def test_a_release_never_closes_the_fingers(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
@@ -155,6 +159,22 @@ async def test_a_release_never_closes_the_fingers(way, tmp_path):
         open_mm = rig.model.width_mm
         await task.grip(opening(10.0, 60.0))
         assert rig.model.width_mm == open_mm > 79
+
+
+@WAYS
+async def test_a_grip_never_drops_what_is_held(way, tmp_path):
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        rig.model.object_mm = 40.0
+        task = task_of(rig)
+        await task.grip(GRIP)
+        held_mm = rig.model.width_mm
+        for target in (replace_step(GRIP, width_mm=60.0), replace_step(GRIP, width_mm=60.0, expect_object=False)):
+            with pytest.raises(
+                ActionError, match=r"hold something 40\.\d mm wide, and a grip to 60 mm would open them"
+            ):
+                await task.grip(target)
+            assert rig.model.width_mm == held_mm
+        await task.grip(replace_step(GRIP, force_n=100.0))
 
 
 @WAYS

@@ -62,6 +62,8 @@ class Calibration:
     tools: ToolLaw | None = None
     profile: TorqueProfile | None = None
     learned: LearnedFrames = UNKNOWN_FRAMES
+    # Whether a recording behind it is of emulated devices: it says nothing about a real fingertip.
+    emulated: bool = False
 
     def for_tool(self, tool: Measured | None) -> Self:
         """Return the calibration for a tool, itself where it is made for that tool; else raises CalibrationError.

@@ -76,6 +76,7 @@ def fit(
         validators=material.validators,
         profile=TorqueProfile.fit(chosen),
         learned=LearnedFrames.of(one.channels for one in chosen),
+        emulated=any(one.emulated for one in recordings),
     )
     fitted = _fit_outputs(blank, chosen, physics, timing.uncertainty_s)
     return fitted if timing.references else replace(fitted, assumptions=("load timing",))

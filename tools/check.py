@@ -53,7 +53,7 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
     """Return what each part of the configuration in this file is; opens every file that it names."""
     from shearloop.daemon.control.experiment_check import experiment_mistakes
     from shearloop.daemon.experiment_files import check_experiment, read_document
-    from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, torque_sources
+    from shearloop.daemon.sensing.sessions import COMBINED, check_devices, open_combined, open_session, torque_sources
     from shearloop.daemon.torques import WRENCH, TorqueSource
 
     parts, sessions, combined = Parts(), {}, None
@@ -62,6 +62,8 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
     if config.curve is not None:
         with parts.of("keys"):
             parts.texts["keys"] = f"{_clients(config.curve)} may connect"
+    with parts.of("calibrations"):
+        check_devices(config)
     for name, fingertip in config.fingertips.items():
         with parts.of(name):
             session = sessions[name] = open_session(fingertip, name)

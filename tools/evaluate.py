@@ -137,6 +137,7 @@ def evaluate_recordings(
             for (path, _), one in zip(named, parts, strict=True)
             if one.left_out
         ],
+        list(dict.fromkeys(path.name for (path, _), one in zip(named, parts, strict=True) if one.emulated)),
     )
 
 

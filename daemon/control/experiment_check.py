@@ -222,7 +222,8 @@ def _beyond_cap(file: ExperimentFile, step: Step, cap: MotionCap | None) -> str:
     if isinstance(step, TwistingStep):
         asked.append(("limits.torque_nm", file.limits_of(step).torque_nm, cap.torque_nm, "N·m"))
     for key, value, most, unit in asked:
-        if value > most + _ROUNDING:
+        # An infinite value stands for one that could not be read.
+        if most + _ROUNDING < value < math.inf:
             return f"has {key} {value:g} {unit}: write {most:g} or less, because {cap.sentence}"
     return ""
 

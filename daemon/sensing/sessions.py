@@ -92,6 +92,19 @@ def open_session(config: FingertipConfig, name: str) -> Session:
     return _session(Calibration.uncalibrated(bank.identity, bank.table), config)
 
 
+def check_devices(config: DaemonConfig) -> None:
+    """Raise UserError for a calibration on emulated devices in a configuration of real ones."""
+    if config.emulated:
+        return
+    named = [one.calibration for one in (*config.fingertips.values(), config.combined) if one is not None]
+    for path in dict.fromkeys(path for path in named if path is not None and os.path.exists(path)):
+        if Calibration.load(path).emulated:
+            raise UserError(
+                f"{path} was made from recordings of emulated devices, and says nothing about your fingertips: "
+                "calibrate on recordings of this rig"
+            )
+
+
 def _without_bank(estimator: str, name: str) -> UserError:
     return UserError(f"the estimator `{estimator}` needs a bank; add `bank:` to the fingertip {name}")
 

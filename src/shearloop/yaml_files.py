@@ -214,7 +214,11 @@ def _meant(path: Path) -> str:
         names = sorted(one.name for one in folder.iterdir() if one.suffix in _SUFFIXES)
     except OSError:
         return ""
-    near = names if folder is path else get_close_matches(path.name, names, 1)
+    if folder is path:
+        # A folder of `init` has its configuration under this name.
+        near = ["rig.yaml"] if "rig.yaml" in names else names
+    else:
+        near = get_close_matches(path.name, names, 1)
     return f"; did you mean {folder / near[0]}?" if near else ""
 
 

@@ -236,6 +236,13 @@ def test_a_file_that_was_probably_meant_is_named(given, meant, tmp_path):
         load_yaml_model(tmp_path / given, Outer)
 
 
+def test_the_configuration_of_a_folder_is_named_by_its_usual_name(tmp_path):
+    for name in ("emulated.yaml", "rig.yaml"):
+        (tmp_path / name).touch()
+    with pytest.raises(UserError, match=r"did you mean .*rig\.yaml\?$"):
+        load_yaml_model(tmp_path, Outer)
+
+
 def test_files_that_cannot_be_read_are_named(tmp_path):
     with pytest.raises(UserError, match=r"none\.yaml: the configuration cannot be read: No such file"):
         load_yaml_model(tmp_path / "none.yaml", Outer)

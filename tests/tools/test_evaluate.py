@@ -1,15 +1,24 @@
 import csv
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.estimation import Estimate, FrameSeries, fit
+from shearloop.estimation import TRUSTED, Estimate, FrameSeries, fit
 from shearloop.estimation.session import FINGERS_MOVED
-from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, write_estimates
+from shearloop.tools.evaluate import (
+    EstimateTrack,
+    estimate_series,
+    evaluate_recordings,
+    figures_by_load,
+    figures_of,
+    write_estimates,
+)
+from shearloop.tools.parallel import SerialExecutor
 from tests.estimation.conftest import twisting
 
 torques = st.floats(-0.2, 0.2).map(lambda one: round(one, 4))
@@ -123,3 +132,13 @@ def test_the_table_of_estimates_says_why_a_valid_frame_has_no_torque(tmp_path):
     write_estimates([told], ["a.mcap"], tmp_path / "e.csv")
     with (tmp_path / "e.csv").open(newline="") as file:
         assert [row["reason"] for row in csv.DictReader(file)] == ["the tool has 10 mm", "no grip; dead"]
+
+
+def test_recordings_of_emulated_devices_are_named():
+    recorded = twisting(cycles=1)
+    calibration = fit("motion_regression", [recorded], "twists", timing=TRUSTED)
+    real, emulated = twisting(cycles=1, seed=2), replace(twisting(cycles=1, seed=3), emulated=True)
+    named = [(Path("real.mcap"), real), (Path("emulated.mcap"), emulated)]
+    assert evaluate_recordings(calibration, named, None, (0.0, 1.0), SerialExecutor()).emulated == ["emulated.mcap"]
+    assert not calibration.emulated
+    assert fit("motion_regression", [emulated], "twists", timing=TRUSTED).emulated

@@ -55,7 +55,8 @@ def page_of(report: Report, unmeasured: Sequence[str] = ()) -> str:
     rig = report.rig
     title = f"{'EMULATED: ' if rig.emulated else ''}commissioning"
     parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
+        "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
+        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
         f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>",
         "<p>Every device was emulated: this report raises no limit of a real robot.</p>" if rig.emulated else "",
         "<p>A record of measurements, not a safety function: only the pendant's safety configuration is rated.</p>",

@@ -57,13 +57,11 @@ class GripperTask:
         """Move to a width and wait for the end; raises DriverError and ActionError."""
         with self._motion.commanded(self.clock.now_ns()):
             await self.gripper.activate()
-            if not isinstance(target, Opening):
-                await self._check_no_drop(target.width_mm)
-            elif await self._is_open(target.width_mm):
+            if (width_mm := await self._width_of(target)) is None:
                 return
-            sent = await self.gripper.move(GripperCommand(target.width_mm, target.speed_mm_per_s, target.force_n))
+            sent = await self.gripper.move(GripperCommand(width_mm, target.speed_mm_per_s, target.force_n))
             state = await self.gripper.finish(sent)
-        widest_mm = min(target.width_mm, self.gripper.model.stroke_mm)
+        widest_mm = min(width_mm, self.gripper.model.stroke_mm)
         # The loop needs the state before the end of the action.
         self._take(state)
         if state.object is ObjectStatus.CONTACT_OPENING and state.width_mm < widest_mm - OPEN_WITHIN_MM:
@@ -73,32 +71,24 @@ class GripperTask:
             closed = f"the fingers closed to {state.width_mm:.1f} mm and met nothing"
             raise ActionError(f"{closed}; put the tool between them, or correct `width_mm`")
 
-    async def _check_no_drop(self, width_mm: float) -> None:
-        """Raise ActionError where a grip to this width would open fingers that hold something; raises DriverError."""
-        state = await self.gripper.read()
-        if state.diameter_mm is not None and width_mm > state.width_mm:
-            raise ActionError(
-                f"the fingers hold something {state.width_mm:.1f} mm wide, and a grip to {width_mm:g} mm would open "
-                "them and drop it; put a `release` before it, or correct `width_mm`"
-            )
+    async def _width_of(self, target: GripStep) -> float | None:
+        """Return the width that the fingers have to move to, None where they are open already; raises DriverError.
 
-    async def _is_open(self, width_mm: float) -> bool:
-        """Return whether the fingers are that far open, with nothing between them: to move would close them.
-
-        Raises DriverError, and ActionError where they hold something that a motion to this width would not let go.
+        A release never closes them: where fingers that are further apart may hold something, they open fully. A grip
+        never opens them: raises ActionError where something would drop.
         """
-        if width_mm > self.gripper.model.stroke_mm - OPEN_WITHIN_MM:
-            return False
         state = await self.gripper.read()
-        if state.width_mm < width_mm:
-            return False
-        if state.object is not ObjectStatus.AT_TARGET:
+        if isinstance(target, Opening) and state.width_mm >= target.width_mm:
+            if state.object is not ObjectStatus.AT_TARGET:
+                return LARGEST_STROKE_MM
+            self._take(state)
+            return None
+        if not isinstance(target, Opening) and state.diameter_mm is not None and target.width_mm > state.width_mm:
             raise ActionError(
-                f"the fingers are {state.width_mm:.1f} mm apart and may hold something, and a release to {width_mm:g} "
-                "mm would close them; give a larger `width_mm`, or leave it out"
+                f"the fingers hold something {state.width_mm:.1f} mm wide, and a grip to {target.width_mm:g} mm would "
+                "open them and drop it; put a `release` before it, or correct `width_mm`"
             )
-        self._take(state)
-        return True
+        return target.width_mm
 
     async def release(self) -> None:
         """Open wide; raises DriverError and ActionError."""

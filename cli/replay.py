@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from shearloop.tools.recordings.replay import RecordedRun, ReplayComparison
 
 
-# A port that nobody is told: a comparison needs no subscriber, and a daemon may have the usual address.
+# A free port: a comparison needs no subscriber, and a daemon may have the usual address.
 UNPUBLISHED = "tcp://127.0.0.1:*"
 
 

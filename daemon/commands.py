@@ -111,7 +111,8 @@ class Commands:
         try:
             if request.get("ask"):
                 _refuse_if(rig.runner.start_refusal())
-                return {**(await rig.start_question(Path(path))).facts}
+                question = await rig.start_question(Path(path))
+                return dict(question.facts)
             _refuse_if(await rig.start(Path(path), request.get("digest")))
         except QuestionChangedError as error:
             raise CommandRefusedError(str(error), **error.question.facts) from error
@@ -150,7 +151,7 @@ class Commands:
         sentence = rig.control_loop.release_question()
         question = Question(f"Release? {_capital(sentence)}.", digest_of(*rig.control_loop.release_stakes()))
         if request.get("ask"):
-            return {**question.facts}
+            return dict(question.facts)
         if not request.get("confirmed"):
             raise CommandRefusedError(f"{sentence}; confirm it with `shearloop command release --yes`")
         _refuse_if_changed(question, sentence, request)
@@ -177,7 +178,7 @@ class Commands:
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}
 
     async def _stop(self, request: Request) -> Reply:
-        # The process tells a page that showed another daemon.
+        # By the process a page finds out that it showed another daemon.
         return {**self._stopped(request), "process": os.getpid()}
 
     def _stopped(self, request: Request) -> Reply:

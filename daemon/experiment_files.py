@@ -170,7 +170,7 @@ class ExperimentFiles:
             path = named.resolve()
             if not any(path.is_relative_to(folder.resolve()) for folder in self.folders):
                 folders = " and ".join(map(str, self.folders)) or "no folder"
-                # Whether there is such a file is not told: the daemon may see more than who asks.
+                # The answer does not say whether the file exists: the daemon may see more than the person who asks.
                 meant = self._meant(named)
                 cure = f"{meant} Otherwise copy" if meant else "; copy"
                 raise UserError(
@@ -191,7 +191,7 @@ class ExperimentFiles:
                 f"{name} is not a valid experiment; the daemon's log names each mistake"
             ) from error
         if mistakes := document.located(self._mistakes(document)):
-            # The file is an experiment, whose plan `start` shows to everybody: the first mistake may be told.
+            # The file is an experiment, whose plan `start` shows to every user: its first mistake may be named.
             structlog.get_logger().warning("the rig cannot run the experiment", mistakes="\n".join(mistakes))
             first = mistakes[0] if len(mistakes[0]) <= _LONGEST_MISTAKE else f"{mistakes[0][:_LONGEST_MISTAKE]} …"
             others = (

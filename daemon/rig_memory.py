@@ -200,7 +200,7 @@ def read_memory(path: Path) -> Remembered:
 def read_memories(files: RobotFiles) -> Remembered:
     """Return the state in the files of one robot: of its stops none is missed, and of its grips the latest counts.
 
-    Where nobody knows which robot a name means, the state under its address is not found: this counts as a stop.
+    Where a name has no known address, the state under that address is not found: this counts as a stop.
     """
     found = [(_written_ns(path), read_memory(path)) for path in (*files.states, *files.other_states)]
     newest_first = [state for _, state in sorted(found, key=lambda one: one[0], reverse=True)]

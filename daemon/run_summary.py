@@ -170,7 +170,7 @@ def _was_asked_for(content: Mapping[str, Any]) -> bool:
 
 
 def _may_be_late(content: Mapping[str, Any]) -> bool:
-    """Return whether a busy computer can be the cause of a stop; what followed from another cause tells nothing."""
+    """Return whether a busy computer can be the cause of a stop; a consequence of another fault does not count."""
     codes = _codes(content)
     # Several holds together have no cause among them.
     causes = codes if FaultCode.HELD_TOO_LONG.text in codes[:1] else codes[:1]

@@ -383,8 +383,10 @@ class ControlLoop:
         driving = self._sources[file.torque_source]
         if driving.noise_nm >= file.tightest_nm:
             return too_noisy(driving.name, driving.noise_nm, file.tightest_nm)
-        for place, unmeasured in not_measured(file, driving):
-            return f"step {place + 1}: {unmeasured}"
+        unmeasured = next(not_measured(file, driving), None)
+        if unmeasured is not None:
+            place, why_not = unmeasured
+            return f"step {place + 1}: {why_not}"
         watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
         faults = detect_faults(self.inputs, watched, self.config, t_ns)
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
@@ -405,7 +407,7 @@ class ControlLoop:
         self.experiment, self._watched = Experiment(file, t_ns, speeds), watched
         self.wrist = self._wrists[file.torque_source]
         if self._on_judged is not None:
-            # No state of the gripper has shown it, and the experiment may grip anew.
+            # No state of the gripper has shown it, and the experiment may grip again.
             self._on_judged("an experiment began while its fingers moved")
             self._on_judged = None
         # What the last experiment knew of the tool may be wrong by now.

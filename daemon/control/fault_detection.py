@@ -158,19 +158,9 @@ def _disagreement(
     latest = inputs.torques.get(slow.name)
     if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > slow.fresh_s(config) * 1e9:
         return []
-    half_ns = round(max(slow.window_s, fast.period_s) * 0.5e9)
-    times_ns, torques_nm = inputs.history.get(fast.name, ([], []))
-    first, end = bisect_left(times_ns, latest.t_mid_ns - half_ns), bisect_right(times_ns, latest.t_mid_ns + half_ns)
-    if end == first:
-        # A late or a lost sample must not lift a disagreement: the nearest one counts, unless more are missing.
-        near = [at for at in (first - 1, first) if 0 <= at < len(times_ns)]
-        if not near:
-            return []
-        first = min(near, key=lambda at: abs(times_ns[at] - latest.t_mid_ns))
-        end = first + 1
-        if abs(times_ns[first] - latest.t_mid_ns) > half_ns + STALE_AFTER_PERIODS * fast.period_s * 1e9:
-            return []
-    other_nm = sum(torques_nm[first:end]) / (end - first)
+    other_nm = _torque_at(inputs, fast, latest.t_mid_ns, 0.5 * max(slow.window_s, fast.period_s))
+    if other_nm is None:
+        return []
     apart_nm = abs(fast.as_read_nm(latest.torque_nm) - slow.as_read_nm(other_nm))
     allowed_nm = config.disagreement_nm + slow.noise_nm + fast.noise_nm
     if apart_nm <= allowed_nm:
@@ -180,6 +170,24 @@ def _disagreement(
         f"{apart_nm:.3f} N·m apart where {allowed_nm:g} are allowed"
     )
     return [Fault(FaultCode.TORQUES_DISAGREE, apart, t_ns=latest.t_mid_ns)]
+
+
+def _torque_at(inputs: LatestInputs, source: TorqueSource, t_ns: int, half_s: float) -> float | None:
+    """Return a source's mean torque within `half_s` of a time, else its nearest one; None where that is too far away.
+
+    A sample that is late or lost must not lift a disagreement.
+    """
+    times_ns, torques_nm = inputs.history.get(source.name, ([], []))
+    half_ns = round(half_s * 1e9)
+    first, end = bisect_left(times_ns, t_ns - half_ns), bisect_right(times_ns, t_ns + half_ns)
+    if end > first:
+        return sum(torques_nm[first:end]) / (end - first)
+    neighbours = [at for at in (first - 1, first) if 0 <= at < len(times_ns)]
+    if not neighbours:
+        return None
+    nearest = min(neighbours, key=lambda at: abs(times_ns[at] - t_ns))
+    farthest_ns = half_ns + STALE_AFTER_PERIODS * source.period_s * 1e9
+    return torques_nm[nearest] if abs(times_ns[nearest] - t_ns) <= farthest_ns else None
 
 
 def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fault]:

@@ -51,7 +51,7 @@ class FingerMotion:
                 self._over.append((self._under_way[0], min(state.t_ns, self._ends_ns)))
                 self._under_way = None
         elif before is not None and _differ(before, state):
-            # The whole motion lies between two states: the fingers lost the tool, met one, or gripped it anew.
+            # The whole motion lies between two states: the fingers lost the tool, met one, or gripped it again.
             self._over.append((before.t_ns, state.t_ns))
 
     def moved_between(self, from_ns: int, to_ns: int) -> bool:

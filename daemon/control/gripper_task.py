@@ -83,10 +83,13 @@ class GripperTask:
                 return LARGEST_STROKE_MM
             self._take(state)
             return None
-        if not isinstance(target, Opening) and state.diameter_mm is not None and target.width_mm > state.width_mm:
+        # Fingers that are nearly open hold nothing.
+        may_hold = state.object is not ObjectStatus.AT_TARGET
+        may_hold = may_hold and state.width_mm < self.gripper.model.stroke_mm - OPEN_WITHIN_MM
+        if not isinstance(target, Opening) and may_hold and target.width_mm > state.width_mm:
             raise ActionError(
-                f"the fingers hold something {state.width_mm:.1f} mm wide, and a grip to {target.width_mm:g} mm would "
-                "open them and drop it; put a `release` before it, or correct `width_mm`"
+                f"the fingers are {state.width_mm:.1f} mm apart and hold something, or may hold it, and a grip to "
+                f"{target.width_mm:g} mm would open them and drop it; put a `release` before it, or correct `width_mm`"
             )
         return target.width_mm
 

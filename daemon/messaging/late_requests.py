@@ -1,4 +1,4 @@
-"""Requests that have waited while the daemon's process stood still: nobody knows how long ago they were sent.
+"""Requests that have waited while the daemon's process stood still: when they were sent is not known.
 
 A client gives up after some seconds. Its request stays in the socket of a daemon that hangs, and would be carried out
 when the daemon returns, long after the person has walked up to the robot.

@@ -26,7 +26,7 @@ class EventLog:
         if topic not in _EVENTS_OF:
             return
         before = self._before.get(topic, {})
-        # What the first state shows began earlier, at a time that nobody here knows.
+        # What the first state shows began earlier, at an unknown time.
         earlier = " (since before this time)" if topic in _STATES and not before else ""
         if topic != DaemonEnd.topic:
             self._before.pop(DaemonEnd.topic, None)

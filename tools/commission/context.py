@@ -94,7 +94,7 @@ class Context:
     def confirm(self) -> Seen:
         """Have the operator confirm the pose about which motions are allowed, once; return a sample of it.
 
-        An arm that was moved between the question and the answer stands in a pose that nobody has confirmed: the
+        An arm that was moved between the question and the answer stands in a pose that is not confirmed: the
         question comes again.
         """
         while self._confirmed is None:

@@ -168,12 +168,14 @@ async def test_a_grip_never_drops_what_is_held(way, tmp_path):
         await task.grip(GRIP)
         held_mm = rig.model.width_mm
         for target in (replace_step(GRIP, width_mm=60.0), replace_step(GRIP, width_mm=60.0, expect_object=False)):
-            with pytest.raises(
-                ActionError, match=r"hold something 40\.\d mm wide, and a grip to 60 mm would open them"
-            ):
+            with pytest.raises(ActionError, match=r"40\.\d mm apart and hold .*, and a grip to 60 mm would"):
                 await task.grip(target)
             assert rig.model.width_mm == held_mm
         await task.grip(replace_step(GRIP, force_n=100.0))
+        await task.halt()
+        with pytest.raises(ActionError, match="or may hold it"):
+            await task.grip(replace_step(GRIP, width_mm=60.0))
+        assert rig.model.width_mm == held_mm, "after a halt the gripper does not say what it holds"
 
 
 @WAYS

@@ -105,6 +105,8 @@ class UrRobot:
 
     def forget_wrench_zero(self) -> None:
         """Take the restored zero back, as if there had been none: what is held is not what it was measured with."""
+        if not any(self._restored_zero):
+            return
         pairs = zip(self._wrench_zero, self._restored_zero, strict=True)
         zero = cast(Six, tuple(now - restored for now, restored in pairs))
         self._wrench_zero, self._restored_zero = zero, (0.0,) * 6
@@ -137,7 +139,14 @@ class UrRobot:
             self._number += 1
             self._replies[self._number] = replied
             self._connection.send(command, self._number)
+        if isinstance(command, messages.ZeroForceTorque):
+            replied.add_done_callback(self._note_zeroed)
         return replied
+
+    def _note_zeroed(self, replied: asyncio.Future[messages.CommandReply]) -> None:
+        if not replied.cancelled() and not replied.result().refusal:
+            # Nothing of the restored zero is in the new one.
+            self._restored_zero = (0.0,) * 6
 
     def _tell_held(self, connection: "WorkerConnection") -> None:
         """Tell the worker of a change of what is held, before any command that follows from it."""
@@ -188,6 +197,9 @@ class UrRobot:
             case messages.RobotState():
                 before, self.state = self.state, message
                 self._wrench_zero = message.wrench_zero
+                if not any(message.wrench_zero):
+                    # A tare, or the start of a program without a load, has ended the restored zero.
+                    self._restored_zero = (0.0,) * 6
                 self.states += 1
                 if self._connection is not None:
                     self._tell_held(self._connection)

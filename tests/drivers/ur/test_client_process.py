@@ -8,10 +8,13 @@ from dataclasses import replace
 import pytest
 
 from shearloop.drivers.ur.client import LAST_WORDS_BYTES, UrRobot, WorkerConnection
-from shearloop.drivers.ur.messages import Held, RobotLostError, Stop
+from shearloop.drivers.ur.messages import CommandReply, Held, RobotLostError, Stop, ZeroForceTorque
 from tests import running as tasks
 from tests.drivers.ur.handler_bench import HandlerBench
 from tests.drivers.ur.robots import ROOT, running, settings_for
+from tests.fixtures.daemons import DEADLINE_S
+
+RESTORED = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5)
 
 
 async def test_absent_controller_is_explained(link):
@@ -139,33 +142,59 @@ def told(monkeypatch) -> list[Held]:
     return messages
 
 
+async def worker_told(told: list[Held]) -> None:
+    """Wait for the first message to the worker, whose start is no event."""
+    async with asyncio.timeout(DEADLINE_S):
+        while not told:  # noqa: ASYNC110 - the worker's start is no event
+            await asyncio.sleep(0)
+
+
 async def test_a_worker_is_told_what_is_held_at_its_start_and_at_each_change(play, told):
     play("exec cat")
-    zero, holds = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5), [True]
+    holds = [True]
     robot = UrRobot(settings_for("127.0.0.254"))
-    robot.restore_wrench_zero(zero)
+    robot.restore_wrench_zero(RESTORED)
     robot.holds = lambda: holds[0]
     bench = HandlerBench()
     async with tasks.running(robot.run()):
-        while not told:  # noqa: ASYNC110 - the worker's start is no event
-            await asyncio.sleep(0)
+        await worker_told(told)
         for now in (True, False, False, True):
             holds[0] = now
             robot.handle_message(0, bench.state)
             await asyncio.sleep(0)
-    assert told == [Held(held=True, wrench_zero=zero), Held(held=False), Held(held=True)]
+    assert told == [Held(held=True, wrench_zero=RESTORED), Held(held=False), Held(held=True)]
 
 
 async def test_a_restored_zero_that_is_taken_back_leaves_what_the_program_has_added(play, told):
     play("exec cat")
     robot = UrRobot(settings_for("127.0.0.254"))
-    robot.restore_wrench_zero((0.0, 0.0, 0.0, 0.0, 0.0, 0.5))
+    robot.restore_wrench_zero(RESTORED)
     robot.holds = lambda: True
     async with tasks.running(robot.run()):
-        while not told:  # noqa: ASYNC110 - the worker's start is no event
-            await asyncio.sleep(0)
+        await worker_told(told)
         # The start of its program made it another one.
         robot.handle_message(0, replace(HandlerBench().state, wrench_zero=(0.0, 0.0, 0.0, 0.0, 0.0, 0.75)))
         robot.forget_wrench_zero()
     assert robot.wrench_zero == (0.0, 0.0, 0.0, 0.0, 0.0, 0.25)
     assert told[-1] == Held(held=True, wrench_zero=robot.wrench_zero)
+
+
+@pytest.mark.parametrize("tared", [True, False], ids=["by a tare", "by a program's start without a load"])
+async def test_a_restored_zero_that_has_ended_is_not_taken_back(play, told, tared):
+    play("exec cat")
+    # After a tare, the zero of a controller that cannot zero its own wrench is any value.
+    new_zero = (0.0, 0.0, 0.0, 0.0, 0.0, 1.5 if tared else 0.0)
+    robot = UrRobot(settings_for("127.0.0.254"))
+    robot.restore_wrench_zero(RESTORED)
+    robot.holds = lambda: True
+    async with tasks.running(robot.run()):
+        await worker_told(told)
+        robot.handle_message(0, replace(HandlerBench().state, wrench_zero=RESTORED))
+        if tared:
+            reply = robot.send(ZeroForceTorque())
+            robot.handle_message(1, CommandReply())
+            await reply
+            await asyncio.sleep(0)
+        robot.handle_message(0, replace(HandlerBench().state, wrench_zero=new_zero))
+        robot.forget_wrench_zero()
+    assert robot.wrench_zero == new_zero

@@ -26,6 +26,8 @@ from shearloop.estimation.confidence import TWO_SIDED_95
 OPENING = opening(LARGEST_STROKE_MM, 100.0)
 # The fingers' own stop may lie this far before the widest target.
 OPEN_WITHIN_MM = 10.0
+# A release that opens the fingers by less may not let go: about three of the gripper's positions.
+LEAST_OPENING_MM = 2.0
 # A release or halt is retried for longer than a reconnection takes.
 TRIED_FOR_S, TRIED_AGAIN_S = 5.0, 0.1
 
@@ -74,19 +76,21 @@ class GripperTask:
     async def _width_of(self, target: GripStep) -> float | None:
         """Return the width that the fingers have to move to, None where they are open already; raises DriverError.
 
-        A release never closes them: where fingers that are further apart may hold something, they open fully. A grip
-        never opens them: raises ActionError where something would drop.
+        A release never closes them, and lets go: fingers that may hold something open fully where the width is not well
+        above the present one. A grip never opens them: raises ActionError where something would drop.
         """
         state = await self.gripper.read()
-        if isinstance(target, Opening) and state.width_mm >= target.width_mm:
+        if isinstance(target, Opening):
             if state.object is not ObjectStatus.AT_TARGET:
-                return LARGEST_STROKE_MM
-            self._take(state)
-            return None
+                return target.width_mm if target.width_mm > state.width_mm + LEAST_OPENING_MM else LARGEST_STROKE_MM
+            if state.width_mm >= target.width_mm:
+                self._take(state)
+                return None
+            return target.width_mm
         # Fingers that are nearly open hold nothing.
         may_hold = state.object is not ObjectStatus.AT_TARGET
         may_hold = may_hold and state.width_mm < self.gripper.model.stroke_mm - OPEN_WITHIN_MM
-        if not isinstance(target, Opening) and may_hold and target.width_mm > state.width_mm:
+        if may_hold and target.width_mm > state.width_mm:
             raise ActionError(
                 f"the fingers are {state.width_mm:.1f} mm apart and hold something, or may hold it, and a grip to "
                 f"{target.width_mm:g} mm would open them and drop it; put a `release` before it, or correct `width_mm`"

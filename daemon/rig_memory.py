@@ -91,8 +91,10 @@ class RigMemory:
     starting: str = ""
     # None: the files have to be written, whatever the state.
     _written: Remembered | None = None
-    # The load cell's zero by its calibration, and whether the wrench has the zero of the grip before.
+    # The load cell's zero by its calibration, and the restored one.
     _calibrated_zero: float | None = None
+    _load_restored: float | None = None
+    # Whether the wrench has the zero of the grip before.
     _wrench_restored: bool = False
     _writing: asyncio.Lock = field(default_factory=asyncio.Lock)
 
@@ -105,7 +107,7 @@ class RigMemory:
         # Until the gripper answers, its grip counts as the one before.
         cell, zero = self.load_cell, remembered.load_zero
         if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:
-            self._calibrated_zero = cell.calibration.tare_counts
+            self._calibrated_zero, self._load_restored = cell.calibration.tare_counts, zero
             cell.tare(zero)
         if self.robot is not None and remembered.wrench_zero is not None:
             self._wrench_restored = True
@@ -129,8 +131,14 @@ class RigMemory:
             zeros=zeros,
             cure="look what it holds; `shearloop command release --yes` opens it, and then `shearloop command tare`",
         )
-        if self.load_cell is not None and self._calibrated_zero is not None:
-            self.load_cell.tare(self._calibrated_zero)
+        cell = self.load_cell
+        # A tare since then has a zero of its own.
+        if (
+            cell is not None
+            and self._calibrated_zero is not None
+            and cell.calibration.tare_counts == self._load_restored
+        ):
+            cell.tare(self._calibrated_zero)
         if self.robot is not None and self._wrench_restored:
             self.robot.forget_wrench_zero()
 

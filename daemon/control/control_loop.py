@@ -269,7 +269,7 @@ class ControlLoop:
             return False
         gripper = self.inputs.gripper
         if gripper is None:
-            return self._gripped.grip.force_n is not None
+            return self._on_judged is not None or self._gripped.grip.force_n is not None
         return gripper.holding or gripper.moving or gripper.uncertain
 
     def release_refusal(self) -> str | None:
@@ -408,7 +408,7 @@ class ControlLoop:
         self.wrist = self._wrists[file.torque_source]
         if self._on_judged is not None:
             # No state of the gripper has shown it, and the experiment may grip again.
-            self._on_judged("an experiment began while its fingers moved")
+            self._on_judged("an experiment began before its state was known")
             self._on_judged = None
         # What the last experiment knew of the tool may be wrong by now.
         self.wrist.reset()

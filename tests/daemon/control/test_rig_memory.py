@@ -185,6 +185,19 @@ def test_a_grip_that_changed_while_no_daemon_ran_is_one_that_nobody_knows(how, r
         assert FaultCode.GRIP_UNKNOWN.value.kind not in restarted.told
 
 
+def test_a_load_cell_that_was_tared_since_the_restart_keeps_that_zero(restarted):
+    restarted.cell.tare(7000.0)
+    exchange(restarted.rig, "nothing held")
+    restarted.rig.run(0.1)
+    assert restarted.zeros == (7000.0, 0.0)
+
+
+def test_a_grip_of_unknown_force_may_hold_until_the_gripper_answers():
+    loop = new_loop()
+    Remembered(wrench_zero=Restarted.WRENCH_ZERO).restore(loop)
+    assert loop.may_hold()
+
+
 def test_a_twist_of_a_tool_that_was_exchanged_begins_where_the_wrist_is(restarted):
     rig = restarted.rig
     rig.wrist_rad += 0.2

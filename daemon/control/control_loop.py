@@ -302,7 +302,11 @@ class ControlLoop:
     def release_stakes(self) -> tuple[str, ...]:
         """Return what a confirmation of `release_question` depends on; a width that wavers is not part of it."""
         held = "held" if self.held is not None else "nothing held"
-        return held, "renewed" if self._activates() else "as it is"
+        renewed = "renewed" if self._activates() else "as it is"
+        # A tool that was exchanged is held by another request, or from another angle.
+        gripper, grip = self.inputs.gripper, self._gripped.grip
+        requests = f"{gripper.requested_counts}, {gripper.others_requests} of others" if gripper is not None else "none"
+        return held, renewed, requests, f"{grip.force_n} N from {grip.origin_rad} rad"
 
     def _activates(self) -> bool:
         """Whether the gripper is activated before its next motion, as after a fault or a loss of power."""

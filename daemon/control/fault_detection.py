@@ -68,13 +68,14 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
     limit_nm, limit_rad = watched.limits.torque_nm, watched.limits.angle_rad
     for source in (watched.driving, *watched.supervising):
         torque = _largest(inputs, source)
-        largest_nm = limit_nm + source.noise_nm
-        if torque is None or torque.torque_nm is None or abs(torque.torque_nm) <= largest_nm:
+        if torque is None or torque.torque_nm is None or abs(torque.torque_nm) <= limit_nm + source.noise_nm:
             continue
         if watched.grasp is Grasp.CHANGING and source.warm_up_s:
             continue
         if t_ns - torque.t_ns <= source.fresh_s(config) * 1e9:
-            beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {largest_nm:g} N·m"
+            beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
+            if source.noise_nm:
+                beyond += f" and its noise {source.noise_nm:g} N·m"
             found.append(Fault(FaultCode.TORQUE_LIMIT, beyond, t_ns=torque.t_mid_ns))
     if watched.grasp is Grasp.HELD and abs(watched.twisted_rad) > limit_rad:
         turned = f"turned by {watched.twisted_rad:+.3f} rad since the grip, the limit is {limit_rad:g} rad"

@@ -82,6 +82,20 @@ async def test_a_release_whose_question_has_changed_opens_nothing():
         assert cell.gripper.asked == ["open"]
 
 
+@pytest.mark.parametrize("exchanged", [{"others_requests": 2}, {"requested_counts": 120}])
+async def test_a_release_of_another_tool_than_the_one_in_the_question_opens_nothing(exchanged):
+    async with with_gripper() as cell:
+        cell.hand = {"holding": True}
+        await cell.cycles(5)
+        release = commands_of(cell)["release"]
+        asked = await release({"ask": True})
+        cell.hand = {"holding": True, **exchanged}
+        await cell.cycles(5)
+        with pytest.raises(CommandRefusedError, match="changed since the question"):
+            await release({"confirmed": True, "digest": asked["digest"]})
+        assert cell.gripper.asked == []
+
+
 def commands_of(cell: Cell) -> Any:
     rig = SimpleNamespace(runner=cell.runner, control_loop=cell.control_loop)
     return Commands(rig, None, None, None, asyncio.Event()).handlers()
@@ -372,7 +386,10 @@ def test_a_noisy_source_supervises_beyond_its_noise_and_drives_nothing_gentle():
     assert phase(rig) is ExperimentPhase.RUNNING
     loop.on_torque(TorqueSample(WRENCH, 5.5, "", rig.t_ns, rig.t_ns))
     rig.step()
-    assert loop.status.decision.faults[0].code is FaultCode.TORQUE_LIMIT
+    (beyond, *_) = loop.status.decision.faults
+    assert beyond.code is FaultCode.TORQUE_LIMIT
+    assert "wrench measured +5.500 N·m, the limit is 0." in beyond.detail
+    assert beyond.detail.endswith(" N·m and its noise 5 N·m")
     assert phase(rig) is ExperimentPhase.STOPPED
     loop.acknowledge()
     steps = [{"do": "wait", "wait_s": 1}]

@@ -60,6 +60,8 @@ _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 _NEIGHBOURS = 12
 # Of one period: so much higher are the stamps after a frame that is missing. One that is late does not count.
 _LEAST_MISSING = 0.8
+# Fewer frames after a gap, at the end, may all be late.
+_LEAST_AFTER = 4
 # The load cell's board sends a line every 91.6 ms.
 LOAD_PERIOD_S = 0.0916
 _CYLINDER = re.compile(r"(\d+(?:\.\d+)?)mm[_.]")
@@ -400,7 +402,7 @@ def pauses(arrivals_ns: Sequence[int]) -> list[int]:
     """Return the numbers of the frames before which frames are missing, because the board or its program paused.
 
     A late reading raises a stamp above the board's clock for a while, and lets the next ones come at once. After
-    missing frames all stamps stay higher.
+    missing frames all stamps stay higher. The last frames do not show which of the two it was.
     """
     n, t_ns = len(arrivals_ns), np.array(arrivals_ns, dtype=np.int64)
     if n <= 2 * _NEIGHBOURS:
@@ -413,7 +415,8 @@ def pauses(arrivals_ns: Sequence[int]) -> list[int]:
     parts = [(0, n)]
     while parts:
         first, end = parts.pop()
-        risen = [at for at in range(first + 1, end) if _rise(height[first:end], at - first) >= least_ns]
+        latest = min(end - 1, n - _LEAST_AFTER)
+        risen = [at for at in range(first + 1, latest + 1) if _rise(height[first:end], at - first) >= least_ns]
         if risen:
             # The neighbours of a pause rise too. It is where the stamps are the furthest apart.
             at = max(risen, key=lambda one: t_ns[one] - t_ns[one - 1])

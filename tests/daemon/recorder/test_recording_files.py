@@ -345,9 +345,12 @@ def test_a_folder_name_that_is_not_utf8_is_an_error(config):
 PERIOD_S = 0.5408
 
 
-def test_late_frames_get_the_middle_of_their_acquisition(mat_folder, tmp_path):
-    late = [(20, 0.3), (21, 0.12), (40, 1.4), (41, 0.9), (42, 0.35)]
-    import_mat([mat_folder(late=late)], tmp_path / "a.mcap")
+@pytest.mark.parametrize(
+    "late", [[(20, 0.3), (21, 0.12), (40, 1.4), (41, 0.9), (42, 0.35)], [(59, 0.5)], [(57, 1.2), (58, 0.9), (59, 0.5)]]
+)
+def test_late_frames_get_the_middle_of_their_acquisition(late, mat_folder, tmp_path):
+    imported = import_mat([mat_folder(late=late)], tmp_path / "a.mcap")
+    assert "missing" not in " ".join(imported.remarks)
     frames = read_recording(tmp_path / "a.mcap").sides["right"]
     expected = (START_DATENUM - 719529) * 86400 + PERIOD_S * (np.arange(60) + 0.5)
     np.testing.assert_allclose(frames.t_mid_ns / 1e9, expected, rtol=0, atol=0.01)

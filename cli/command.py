@@ -99,8 +99,10 @@ def run(args: argparse.Namespace) -> int:
             reason = f"there is no file {args.experiment} on this computer; {reason}"
         print(f"shearloop command: {args.name} was refused: {reason}", file=sys.stderr)
         if reply.get("invalid") and args.experiment is not None:
-            others = (line for line in mistakes_of(args.experiment.resolve()).splitlines() if line not in reason)
-            print(*(f"{line}\n" for line in others), sep="", end="", file=sys.stderr)
+            for line in mistakes_of(args.experiment.resolve()).splitlines():
+                # The reason has the first one already.
+                if line not in reason:
+                    print(line, file=sys.stderr)
     return 0 if accepted else 1
 
 

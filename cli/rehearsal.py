@@ -141,11 +141,11 @@ class _DeviceReplacer:
         experiment = self._config.experiment
         named = read_document(experiment).content.get("tool_mm") if experiment is not None else None
         tool_mm = str(_TOOL_MM if named is None else named)
-        whence = (
+        reason = (
             f"as `tool_mm` of {experiment} says" if named is not None else "as no `experiment` with `tool_mm` is named"
         )
         self._sentences.append(
-            f"the emulated tool has a diameter of {tool_mm} mm, {whence}; "
+            f"the emulated tool has a diameter of {tool_mm} mm, {reason}; "
             "every experiment that you start grips this tool"
         )
         return tool_mm

@@ -129,7 +129,7 @@ class RigMemory:
             "the gripper does not have the grip of the last daemon, whose angle, force and zeros are not used",
             reason=why_another,
             zeros=zeros,
-            cure="look what it holds; `shearloop command release --yes` opens it, and then `shearloop command tare`",
+            cure="check what it holds; `shearloop command release --yes` opens it, and then `shearloop command tare`",
         )
         cell = self.load_cell
         # A tare since then has a zero of its own.
@@ -143,14 +143,19 @@ class RigMemory:
             self.robot.forget_wrench_zero()
 
     async def run(self) -> None:
-        """Write every change until cancelled."""
-        looked_up_s = asyncio.get_running_loop().time()
+        """Write every change until cancelled, and meanwhile look for the addresses of a name that had none."""
+        async with asyncio.TaskGroup() as group:
+            if not self.files.known:
+                group.create_task(self._look_up())
+            while True:
+                await self.save_present()
+                await asyncio.sleep(FOLLOWS_S)
+
+    async def _look_up(self) -> None:
         while True:
-            await self.save_present()
-            if not self.files.known and asyncio.get_running_loop().time() > looked_up_s + LOOK_UP_S:
-                await asyncio.to_thread(self.files.note_addresses)
-                looked_up_s = asyncio.get_running_loop().time()
-            await asyncio.sleep(FOLLOWS_S)
+            await asyncio.sleep(LOOK_UP_S)
+            if await asyncio.to_thread(self.files.note_addresses):
+                return
 
     async def begins(self, experiment: str) -> str | None:
         """Write that an experiment begins, before anything moves; return None, or why it cannot be written."""

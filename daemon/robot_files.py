@@ -64,8 +64,8 @@ class RobotFiles:
         """The files of its lock; the order is the same for all daemons."""
         return tuple(_file(spelling, ".lock") for spelling in sorted({*self.keys, *self.others}))
 
-    def note_addresses(self) -> None:
-        """Keep the addresses of its name for a start without a network."""
+    def note_addresses(self) -> bool:
+        """Keep the addresses of its name for a start without a network; return whether it has any now."""
         name = one_spelling(self.host)
         found = addresses_of((name,))[name] if not self.known else frozenset(self.keys)
         # A folder that cannot be written keeps experiments from their start, and says so.
@@ -75,6 +75,7 @@ class RobotFiles:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with replace_file(path) as file:
                     file.write("\n".join(sorted(found)).encode())
+        return bool(found)
 
 
 def state_folder() -> Path:

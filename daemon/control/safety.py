@@ -230,8 +230,8 @@ class FaultCode(Enum):
     GRIP_UNKNOWN = Rule(
         Response.NOTE,
         "the gripper holds something else than in the last grip that is known: {detail}.",
-        "Angle, force and zeros of that grip are not used. Look what it holds; `shearloop command release --yes` opens "
-        "the gripper, and the object drops.",
+        "Angle, force and zeros of that grip are not used. Check what it holds; `shearloop command release --yes` "
+        "opens the gripper, and the object drops.",
     )
     DAEMON_ENDED = Rule(
         _KEEP, "the daemon ended: {detail}.", "Look at the rig, then `shearloop command unlock` allows the next start."
@@ -396,12 +396,13 @@ class SafetyMonitor:
         passed_ns = 0 if self._judged_ns is None else t_ns - self._judged_ns
         holding = frozenset(fault.code for fault in active if fault.rule.hold_at_most_s is not None)
         held = self._holding.union(code for code in holding if TABLE[code].is_past)
-        run, needed = ({code.timer for code in codes} for codes in (held, holding))
+        held_timers = {code.timer for code in held}
+        holding_timers = {code.timer for code in holding}
         counted = {
-            timer: _counted(self._held_ns.get(timer, 0), passed_ns, held=timer in run)
-            for timer in (*self._held_ns, *needed)
+            timer: _counted(self._held_ns.get(timer, 0), passed_ns, held=timer in held_timers)
+            for timer in (*self._held_ns, *holding_timers)
         }
-        self._held_ns = {timer: held_ns for timer, held_ns in counted.items() if held_ns or timer in needed}
+        self._held_ns = {timer: held_ns for timer, held_ns in counted.items() if held_ns or timer in holding_timers}
         self._wrist_ns = _counted(self._wrist_ns, passed_ns, held=bool(held))
         if not self._wrist_ns:
             self._share_ns.clear()

@@ -71,7 +71,7 @@ class RequestWatch:
         return self.sent is not None and self.others > self._others_at_sent
 
     def object_status(self, readout: Readout) -> ObjectStatus:
-        """Return what the fingers met in the latest motion requested, by whomever."""
+        """Return what the fingers met in the latest motion, requested by any program."""
         if readout.sta is not ActivationStatus.ACTIVE:
             return ObjectStatus.UNKNOWN
         if self._awaits_echo and not self.carries_out(readout):

@@ -106,8 +106,9 @@ async def test_a_name_that_was_never_found_waits_for_the_operator_until_it_was(n
         lock_robot(RobotFiles.of("UR.lab")).__enter__()
     loop.acknowledge()
     await memory.save_present()
+    assert not memory.files.note_addresses()
     names.update(NAMES)
-    memory.files.note_addresses()
+    assert memory.files.note_addresses()
     names.clear()
     assert read_memories(RobotFiles.of("ur.lab")).stop == ()
 

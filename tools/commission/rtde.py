@@ -75,7 +75,7 @@ def judge_samples(samples: Sequence[Seen], rate_hz: float, limits: TimeLimits) -
 
 
 def _uploads(context: Context) -> list[Line]:
-    """Start the control program anew at several times after the connection, and compare its clock with the robot's."""
+    """Start the control program again at several times after the connection, and compare its clock with the robot's."""
     operator, mover, clock = context.operator, context.mover, context.clock
     started = 0
     reasons: list[str] = []

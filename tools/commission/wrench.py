@@ -62,7 +62,7 @@ def measure(context: Context) -> Measured:
 
 
 def _after_start(context: Context) -> Reading:
-    """Start the control program anew, and read the wrench."""
+    """Start the control program again, and read the wrench."""
     context.ready()
     context.stop_program()
     context.ready()

@@ -118,6 +118,8 @@ def read_stream(path: Path, name: str | None = None, time_format: str = DATENUM)
     """
     table = _table(path, name)
     _check_times(path, table[:, 0], time_format, _SHORTEST_STEP_S if name == "load" else _SHORTEST_FRAME_S)
+    if name != "load":
+        _check_distinct(path, table)
     return Stream(_unix_s(table[:, 0], time_format), np.ascontiguousarray(table[:, 1:]))
 
 
@@ -135,6 +137,16 @@ def _table(path: Path, name: str | None) -> FloatArray:
     if table.shape[1] != width + 1 or len(table) == 0:
         raise UserError(f"{path}: expected rows of one time and {counted(width, 'value')}, found {_size(table)}")
     return table
+
+
+def _check_distinct(path: Path, table: FloatArray) -> None:
+    """Raise UserError for a frame that was copied: the rows (n, 1 + values) after it would seem to come later."""
+    copied = np.flatnonzero((table[1:] == table[:-1]).all(axis=1))
+    if len(copied):
+        raise UserError(
+            f"{path}: row {copied[0] + 2} is a copy of the row above, with its time ({counted(len(copied), 'copy', 'copies')} "
+            "in all): remove the copies"
+        )
 
 
 def _unix_s(times: FloatArray, time_format: str) -> FloatArray:

@@ -434,3 +434,14 @@ def test_files_of_matlab_are_read_like_scipy_does(shared):
         assert found.keys() == expected.keys()
         for key, values in expected.items():
             np.testing.assert_array_equal(found[key], values)
+
+
+@pytest.mark.parametrize("repeats", [2, 6])
+def test_a_frame_that_was_copied_is_refused(repeats, tmp_path):
+    rows = np.repeat(stream_table(30, 1024), np.where(np.arange(30) == 20, repeats, 1), axis=0)
+    savemat(tmp_path / "right.mat", {"Right_Data": rows})
+    number = {2: "1 copy", 6: "5 copies"}[repeats]
+    with pytest.raises(
+        UserError, match=rf"right\.mat: row 22 is a copy of the row above, .* \({number} in all\): remove"
+    ):
+        import_mat([tmp_path / "right.mat"], tmp_path / "a.mcap")

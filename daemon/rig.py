@@ -220,8 +220,9 @@ class Rig:
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)
         note = self.control_loop.activation_note(file)
         text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
-        # The question depends on the gripper's state, and the plan on the rig's limits.
-        return Question(text, digest_of(experiment.data, text, *sentences), sentences)
+        held = self.control_loop.release_stakes() if self.control_loop.may_hold() else ()
+        # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.
+        return Question(text, digest_of(experiment.data, text, *sentences, *held), sentences)
 
     def state(self) -> Mapping[str, Any]:
         """Return what `status` shows of the control loop."""

@@ -235,7 +235,7 @@ class Runner:
 
 def rig(folder: Path, runner: Runner) -> Rig:
     return Rig(
-        SimpleNamespace(warm_up_s=0.0, runs=1, activation_note=lambda _: ""),
+        SimpleNamespace(warm_up_s=0.0, runs=1, activation_note=lambda _: "", may_hold=lambda: False),
         runner,
         {},
         ExperimentFiles((folder,)),
@@ -270,6 +270,13 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
     with pytest.raises(CommandRefusedError, match="what its start does to a held tool"):
         await start({"experiment": str(path), "digest": asked["digest"]})
     subject.control_loop.activation_note = lambda _: ""
+    subject.control_loop.may_hold = lambda: True
+    subject.control_loop.release_stakes = lambda: ("held", "one tool")
+    asked_again = await start({"experiment": str(path), "ask": True})
+    subject.control_loop.release_stakes = lambda: ("held", "another tool")
+    with pytest.raises(CommandRefusedError, match="a held tool"):
+        await start({"experiment": str(path), "digest": asked_again["digest"]})
+    subject.control_loop.may_hold = lambda: False
     await start({"experiment": str(path), "digest": asked["digest"]})
     # Who asks nothing names the file as it is.
     await start({"experiment": str(path)})

@@ -143,9 +143,10 @@ def _check_distinct(path: Path, table: FloatArray) -> None:
     """Raise UserError for a frame that was copied: the rows (n, 1 + values) after it would seem to come later."""
     copied = np.flatnonzero((table[1:] == table[:-1]).all(axis=1))
     if len(copied):
+        copies = counted(len(copied), "copy", "copies")
         raise UserError(
-            f"{path}: row {copied[0] + 2} is a copy of the row above, with its time ({counted(len(copied), 'copy', 'copies')} "
-            "in all): remove the copies"
+            f"{path}: row {copied[0] + 2} is a copy of the row above, with its time ({copies} in all): remove the "
+            "copies"
         )
 
 

@@ -381,6 +381,9 @@ class ControlLoop:
         """Begin an experiment; return None, or why it cannot begin."""
         if (reason := self.start_refusal()) is not None:
             return reason
+        if self.inputs.gripper is not None:
+            # What other programs asked for before the start is no fault of this experiment.
+            self._judge_grip(self.inputs.gripper)
         if file.torque_source not in self._wrists:
             known = ", ".join(self._wrists)
             return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"

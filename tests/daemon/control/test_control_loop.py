@@ -219,6 +219,20 @@ def test_a_gripper_that_another_program_commands_stops_the_twist_and_says_what_i
     assert ("does not say that it holds something" in question) is not note
 
 
+def test_what_another_program_asked_before_a_start_does_not_stop_it_again():
+    """The operator unlocks and starts before the gripper has reported once more."""
+    rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 60})
+    rig.run(1)
+    rig.hand = replace(rig.hand, others_requests=1)
+    rig.step()
+    assert phase(rig) is ExperimentPhase.STOPPED
+    rig.control_loop.acknowledge()
+    again = ExperimentFile.model_validate({"name": "again", "steps": [{"do": "wait", "wait_s": 60}]})
+    assert rig.control_loop.start(again, rig.t_ns) is None
+    rig.run(1)
+    assert phase(rig) is ExperimentPhase.RUNNING
+
+
 @pytest.mark.parametrize("seen_moving", [False, True])
 def test_a_grip_that_another_program_has_changed_has_neither_our_force_nor_our_angle(seen_moving):
     rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 60})

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.build import build_bank
-from shearloop.daemon.recorder.schema import DIAMETER_NOTE
+from shearloop.daemon.recorder.schema import DIAMETER_NOTE, EMULATED
 from shearloop.daemon.recorder.writer import McapFile, new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.emulators.boards import LOAD_PERIOD_S
@@ -126,7 +126,8 @@ def write_recordings(bank: Path, folder: Path, diameters_mm: tuple[float, ...], 
     """Write the recording of each cylinder, and yield its path."""
     frames = RigFrames(bank, seed)
     for number, diameter_mm in enumerate(diameters_mm):
-        path, notes = folder / f"rig-{diameter_mm:g}mm.mcap", {DIAMETER_NOTE: f"{diameter_mm:g}"}
+        path = folder / f"rig-{diameter_mm:g}mm.mcap"
+        notes = {DIAMETER_NOTE: f"{diameter_mm:g}", EMULATED: "every device"}
         with new_recording(path, SOURCE, notes, frames.table) as writer:
             TwistPlayer(frames, diameter_mm, seed + number, writer).run()
         yield path

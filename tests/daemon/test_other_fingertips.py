@@ -56,7 +56,8 @@ async def test_a_fingertip_of_another_kind_gives_its_torque(estimator, bank, twi
     calibration = tmp_path / "right.cal"
     fit(estimator, [series], "emulated twists", Physics(bank=Bank.open(bank))).save(calibration)
     lines = list(read_recording(twists).sides["right"].lines)
-    path = config(right={"bank": str(bank), "calibration": str(calibration), "frame_period_s": FRAME_PERIOD_S / SPEED})
+    right = {"bank": str(bank), "calibration": str(calibration), "frame_period_s": FRAME_PERIOD_S / SPEED}
+    path = config(right=right, emulated=True)
     board = EitKitBoard(map(format_line, cycle(lines)), period_s=FRAME_PERIOD_S / SPEED, link=tmp_path / "eit-right")
     truth_nm, errors_nm = series.torque_at_frames(), []
     async with running(board.run()), running_daemon(path) as daemon:

@@ -39,7 +39,7 @@ from shearloop.daemon.control.loop_runner import ControlLoopRunner
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.ur.client import WorkerConnection
 from shearloop.estimation import Physics
-from shearloop.estimation.estimator_names import DEFAULT
+from shearloop.estimation.estimator_names import DEFAULT, ESTIMATORS
 from shearloop.tools.calibrate import calibrate
 
 SIDE = "right"
@@ -194,8 +194,12 @@ async def trace_calibration(rig: Path, folder: Path) -> Way:
 
 
 def loaded_by_run(*, robot: bool) -> Loaded:
-    """Return the package's modules that `shearloop run` loads, in a separate interpreter."""
-    modules = ["shearloop.cli.run", "shearloop.daemon.app"]
+    """Return the package's modules that `shearloop run` loads, in a separate interpreter.
+
+    The fingertips have a calibration of the default estimator, and no bank.
+    """
+    default, _, _ = ESTIMATORS[DEFAULT].partition(":")
+    modules = ["shearloop.cli.run", "shearloop.daemon.app", default]
     if robot:
         modules += ["shearloop.daemon.rig", "shearloop.daemon.configured_experiment"]
     listing = (

@@ -15,7 +15,7 @@ from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask
 from shearloop.daemon.sensing.fingertip_task import ToolHolder
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
-from shearloop.daemon.sensing.sessions import COMBINED, check_devices, open_combined, open_session
+from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, refuse_emulated_calibrations
 from shearloop.daemon.supervisor import Task
 from shearloop.daemon.torques import LONGEST_TARE_S, SensorListener, Tareable
 from shearloop.drivers.calibration_files import load_device_calibration
@@ -43,7 +43,7 @@ class Sessions:
 
 def open_sessions(config: DaemonConfig) -> Sessions:
     """Return the sessions of the configured fingertips; raises UserError for files that cannot be used."""
-    check_devices(config)
+    refuse_emulated_calibrations(config)
     fingertips = {name: open_session(fingertip, name) for name, fingertip in config.fingertips.items()}
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     log_assumptions(fingertips if combined is None else {**fingertips, COMBINED: combined})

@@ -1,14 +1,13 @@
-"""Bank and mesh on a difference: the paper's match, a refined match, and an image.
+"""A bank's match of a difference: the paper's, and a refined one.
 
 `PaperMatcher` takes the largest cross-correlation over all lags. `RefinedMatcher` uses no lags. The electrode numbering
 is found once, at calibration. Frame and bank are smoothed alike along the channels, as the paper did with its
-cylinders, the position is refined between grid cells, and the amplitude is kept. `image_matrix` is one Gauss–Newton
-step from the homogeneous conductivity with the NOSER prior (Cheney et al. 1990).
+cylinders, the position is refined between grid cells, and the amplitude is kept.
 """
 
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -17,9 +16,8 @@ from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import ChannelTable, smoothed_along_channels
 from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
-if TYPE_CHECKING:
-    from shearloop.bank.mesh import Mesh
-
+# Searches a whole bank. It has no state, so sessions may share one.
+BankSearch: TypeAlias = PrunedMatcher | PrunedZeroLagMatcher
 # A match is ambiguous if a cell scores within the first number of the best and lies further away in k (an eighth of
 # the fingertip) or in sigma (this ratio).
 _ALIKE, _FAR_K_CM, _FAR_SIGMA = 0.002, 0.55, 1.5
@@ -31,8 +29,6 @@ _SCORE_SCALE, _LEAST_WEIGHT = 0.0005, 1e-9
 _RESOLVED, _COARSE = 0.7, 0.005
 # Numberings correlate alike, by the symmetry of the fingertip, within this difference.
 _SYMMETRIC = 0.01
-_PIXELS_ALONG = 12
-_STEP, _SMOOTHING = 1e-3, 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +51,7 @@ class BankMatch:
 class PaperMatcher:
     """The paper's method: the heatmap's maximum, by default over all lags, found without the rest of the heatmap."""
 
-    def __init__(self, bank: Bank | PrunedMatcher | PrunedZeroLagMatcher) -> None:
+    def __init__(self, bank: Bank | BankSearch) -> None:
         """Take the bank, or a matcher on it that several fingertips share."""
         self._matcher = PrunedMatcher.from_bank(bank) if isinstance(bank, Bank) else bank
 
@@ -176,26 +172,6 @@ class RefinedMatcher:
 
 
 BankMatcher: TypeAlias = PaperMatcher | RefinedMatcher
-
-
-def image_matrix(mesh: "Mesh", table: ChannelTable) -> FloatArray:
-    """Return the (p, c) matrix from a difference of voltages to the change of p pixels' log conductivity.
-
-    One Gauss–Newton step, (JᵀJ + 0.05 · diag(JᵀJ))⁻¹ Jᵀ, with J by central differences of whole pixels. Pixels are
-    squares of the mesh's bounding box with at least one triangle.
-    """
-    # Imported here because only fitting needs it: it would slow the daemon's start.
-    from shearloop.bank.forward import BatchForwardModel
-
-    centres = mesh.nodes[mesh.triangles].mean(axis=1)
-    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    size = float((high - low).max()) / _PIXELS_ALONG
-    _, pixel = np.unique(np.floor((centres - low) / size).astype(np.int64) @ [1, 1000], return_inverse=True)
-    steps = np.where(pixel == np.arange(int(pixel.max()) + 1)[:, None], _STEP, 0.0)
-    up, down = np.split(BatchForwardModel(mesh, table).voltages(1.0 + np.concatenate([steps, -steps])), 2)
-    jacobian = (up - down).T / (2 * _STEP)
-    normal = jacobian.T @ jacobian
-    return np.asarray(np.linalg.solve(normal + _SMOOTHING * np.diag(np.diag(normal)), jacobian.T))
 
 
 def parabola_top(scores: FloatArray, i: int, grid: FloatArray) -> float:

@@ -3,17 +3,15 @@
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.archive import Format
-from shearloop.estimation.bank_match import BankMatcher
-from shearloop.estimation.estimator import Estimator, OutputModel, PaperEstimator, Quantity
+from shearloop.estimation.estimator import Estimator, OutputModel, Quantity
 from shearloop.estimation.estimator_names import estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.gain import GainCorrection, ToolLaw
@@ -22,6 +20,10 @@ from shearloop.estimation.learned_frames import UNKNOWN_FRAMES, LearnedFrames
 from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.values import INLINE, Measured
+
+if TYPE_CHECKING:
+    from shearloop.bank.bank_file import Bank
+    from shearloop.estimation.bank_match import BankMatcher
 
 FORMAT_VERSION = 11
 _FORMAT = Format("estimator calibration", FORMAT_VERSION, estimator_class)
@@ -116,9 +118,8 @@ class Calibration:
     @classmethod
     def uncalibrated(cls, bank_identity: str, table: ChannelTable = PAPER_TABLE) -> Self:
         """Return the paper's estimator on a bank without any fit: it gives k and sigma alone."""
-        return cls(
-            PaperEstimator(np.ones((1, table.n_channels)), table), (), "", bank_identity, learned=LearnedFrames.of([])
-        )
+        paper = estimator_class("paper")(np.ones((1, table.n_channels)), table)
+        return cls(paper, (), "", bank_identity, learned=LearnedFrames.of([]))
 
     @property
     def table(self) -> ChannelTable:
@@ -190,16 +191,16 @@ class Calibration:
             if not math.isfinite(value) or math.isnan(below + above):
                 raise ValueError("its coefficients give no finite value")
 
-    def check_bank(self, bank: Bank | None) -> Bank:
+    def check_bank(self, bank: "Bank | None") -> "Bank":
         """Return the bank; raises CalibrationError where it is missing or not the calibration's."""
         return check_bank(self.estimator, self.bank_identity, bank)
 
-    def matcher(self, bank: Bank | None) -> BankMatcher | None:
+    def matcher(self, bank: "Bank | None") -> "BankMatcher | None":
         """Return the matcher of an estimator that needs a bank, None for others; raises as `check_bank` does."""
         return self.estimator.matcher(self.check_bank(bank)) if self.estimator.needs == "bank" else None
 
 
-def check_bank(estimator: Estimator, identity: str, bank: Bank | None) -> Bank:
+def check_bank(estimator: Estimator, identity: str, bank: "Bank | None") -> "Bank":
     """Return the bank of an estimator; raises CalibrationError where it is missing or has another identity."""
     if bank is None:
         raise CalibrationError(f"the estimator {estimator.name} needs its bank; name it with --bank")

@@ -1,40 +1,29 @@
-"""The estimators' contract: requirements, features of a frame, and fit; and the estimators that read one frame.
+"""The estimators' contract: requirements, features of a frame, and fit; and the estimator that reads channels alone.
 
 An estimator is a subclass of `Estimator`, and a line in `estimator_names.py`. It must have `name` and `features`.
+Modules that only a fit or a bank needs are imported where they are used: the daemon runs without them.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
-from shearloop.estimation.bank_match import (
-    NOT_TURNED,
-    BankMatch,
-    BankMatcher,
-    ElectrodeNumbering,
-    PaperMatcher,
-    RefinedMatcher,
-    find_numberings,
-    image_matrix,
-    resolve_symmetry,
-)
 from shearloop.estimation.channel_imputer import ChannelImputer
 from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.grip_memory import Motion
-from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor
-from shearloop.estimation.left_out import later_origins, left_out_groups
 from shearloop.estimation.ridge import STRENGTHS, Ridge
 from shearloop.estimation.values import ProcessedFrame
 
 if TYPE_CHECKING:
+    from shearloop.bank.bank_file import Bank
     from shearloop.bank.mesh import Mesh
+    from shearloop.estimation.bank_match import BankMatch, BankMatcher
 
 Quantity = Literal["torque", "diameter"]
 # Least and largest torque (n,) that each frame may have.
@@ -52,7 +41,7 @@ NO_ERRORS: FloatArray = np.zeros((0, 1, 1))
 class Physics:
     """Knowledge before calibration: the bank, and the mesh of the reconstruction."""
 
-    bank: Bank | None = None
+    bank: "Bank | None" = None
     mesh: "Mesh | None" = None
 
 
@@ -67,7 +56,7 @@ class OutputModel:
     k_range: FloatArray
 
 
-def match_reasons(k_range: FloatArray, match: BankMatch) -> tuple[str, ...]:
+def match_reasons(k_range: FloatArray, match: "BankMatch") -> tuple[str, ...]:
     """Return the reason against a bank match far from the calibrated ones, if there is one.
 
     k_range holds the least and largest calibrated k in cm, or nothing.
@@ -90,10 +79,10 @@ class Reading:
 
     frame: ProcessedFrame
     t_s: float
-    matches: tuple[BankMatch, ...]
+    matches: "tuple[BankMatch, ...]"
 
     @classmethod
-    def of(cls, frame: ProcessedFrame, t_s: float, matcher: BankMatcher | None) -> Self:
+    def of(cls, frame: ProcessedFrame, t_s: float, matcher: "BankMatcher | None") -> Self:
         """Return the reading of a frame; the matcher belongs to the estimator's bank, None without one."""
         return cls(frame, t_s, () if matcher is None else tuple(map(matcher.match, frame.difference)))
 
@@ -169,7 +158,7 @@ class Estimator(ABC):
         """What a session remembers of the gel's motion."""
         return Motion()
 
-    def matcher(self, _bank: Bank) -> BankMatcher | None:
+    def matcher(self, _bank: "Bank") -> "BankMatcher | None":
         """Return the matcher on the bank, None for an estimator without a bank."""
         return None
 
@@ -205,6 +194,9 @@ class Estimator(ABC):
         The third value is the share of the torque's variance that a tool's motion leaves unexplained on frames left
         out, 0 where that is not tested.
         """
+        from shearloop.estimation.interval_fit import fit_interval_regressor
+        from shearloop.estimation.left_out import later_origins
+
         # Without memory the gel's drift enters the torque, so validation uses later frames only.
         regressor = fit_interval_regressor(
             features[:, self.columns["torque"]],
@@ -229,6 +221,9 @@ class Estimator(ABC):
 
     def fit_diameter(self, rows: CalibrationRows) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""
+        from shearloop.estimation.interval_fit import fit_interval_regressor
+        from shearloop.estimation.left_out import left_out_groups
+
         n = len(rows.age_s)
         rows = rows.where(np.arange(0, n, 1 + n // _MOST_FOR_DIAMETER))
         # A new grip is another recording, not a later part of this one.
@@ -256,93 +251,3 @@ class Regression(Estimator):
     def feature_width(self, _quantity: Quantity) -> int:
         """Return the number of channels of all sides."""
         return int(self.scale.size)
-
-
-@dataclass(frozen=True, eq=False)
-class Reconstruction(Estimator):
-    """A ridge on an image of the conductivity; image (p, c) maps a difference to pixels."""
-
-    name: ClassVar[str] = "reconstruction"
-    needs: ClassVar[Literal["bank", "mesh", ""]] = "mesh"
-
-    image: FloatArray = field(kw_only=True)
-
-    @classmethod
-    def prepare(cls, material: Material) -> Self:
-        """Return the estimator with the mesh's image."""
-        if material.physics.mesh is None:
-            raise ValueError("a reconstruction needs a mesh")
-        return cls(material.scale, material.table, image=image_matrix(material.physics.mesh, material.table))
-
-    def features(self, reading: Reading) -> FloatArray:
-        """Return the pixels of each side."""
-        return (reading.frame.difference @ self.image.T).ravel()
-
-    def feature_width(self, _quantity: Quantity) -> int:
-        """Return the number of pixels of all sides; raises ValueError for an image of other channels."""
-        sides, channels = self.scale.shape
-        if self.image.ndim != 2 or self.image.shape[1] != channels:
-            raise ValueError(f"the image has the shape {self.image.shape}, expected pixels of {channels} channels")
-        return int(sides * len(self.image))
-
-
-class _OnBank(Estimator):
-    """A ridge on a match in the bank, which lies within the bank's grid: its features need no limit."""
-
-    needs: ClassVar[Literal["bank", "mesh", ""]] = "bank"
-    limits_features: ClassVar[bool] = False
-
-    def ridge(self, features: FloatArray, values: FloatArray, strength: float) -> Ridge:
-        """Fit a ridge; the features of a match have different units and are scaled."""
-        return Ridge.fit_scaled(features, values, strength)
-
-
-@dataclass(frozen=True, eq=False)
-class BankEstimator(_OnBank):
-    """A ridge on a refined match of each side."""
-
-    name: ClassVar[str] = "bank"
-
-    numbering: ElectrodeNumbering = NOT_TURNED
-
-    @classmethod
-    def prepare(cls, material: Material) -> Self:
-        """Return the estimator with the numbering of the first side's electrodes."""
-        bank = material.physics.bank
-        if bank is None:
-            raise ValueError("a match needs a bank")
-        first = material.validators[0]
-        found = find_numberings(first.idle, bank.homogeneous, material.table)
-        return cls(material.scale, material.table, numbering=resolve_symmetry(found, first.gripped - first.idle, bank))
-
-    def matcher(self, bank: Bank) -> BankMatcher:
-        """Return the refined match on the bank."""
-        return RefinedMatcher(bank, self.numbering)
-
-    def features(self, reading: Reading) -> FloatArray:
-        """Return the features of each side's match."""
-        return np.concatenate([one.features for one in reading.matches])
-
-    def feature_width(self, _quantity: Quantity) -> int:
-        """Return the number of features of all sides: k, σ, σ² and the logarithm of the amplitude of each."""
-        return 4 * len(self.scale)
-
-
-class PaperEstimator(_OnBank):
-    """The paper's curves on one fingertip: torque over σ and σ², diameter over k; the amplitude is ignored."""
-
-    name: ClassVar[str] = "paper"
-    columns: ClassVar[Mapping[Quantity, slice]] = {"torque": slice(1, 3), "diameter": slice(0, 1)}
-    strengths: ClassVar[tuple[float, ...]] = (1e-9,)
-
-    def matcher(self, bank: Bank) -> BankMatcher:
-        """Return the paper's match on the bank."""
-        return PaperMatcher(bank)
-
-    def features(self, reading: Reading) -> FloatArray:
-        """Return k, σ and σ² of the first side."""
-        return reading.matches[0].features[:3]
-
-    def feature_width(self, quantity: Quantity) -> int:
-        """Return 2 for the torque, σ and σ², and 1 for the diameter, k."""
-        return {"torque": 2, "diameter": 1}[quantity]

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 ESTIMATORS = {
     "motion_regression": "shearloop.estimation.motion_regression:MotionRegression",
     "regression": "shearloop.estimation.estimator:Regression",
-    "bank": "shearloop.estimation.estimator:BankEstimator",
-    "paper": "shearloop.estimation.estimator:PaperEstimator",
-    "reconstruction": "shearloop.estimation.estimator:Reconstruction",
+    "bank": "shearloop.estimation.bank_estimators:BankEstimator",
+    "paper": "shearloop.estimation.bank_estimators:PaperEstimator",
+    "reconstruction": "shearloop.estimation.reconstruction:Reconstruction",
 }
 DEFAULT = next(iter(ESTIMATORS))
 if not TYPE_CHECKING:

@@ -275,3 +275,10 @@ def _shrinkage(predicted: FloatArray, truth: FloatArray, sure: float) -> float:
     if along <= 0 or float(((predicted - truth) ** 2).sum()) > sure**2 * power:
         return 1.0
     return along / power
+
+
+def main_directions(parts: Sequence[FloatArray], noise: FloatArray, frames: int) -> FloatArray:
+    """Return the main directions (p, c), in units of noise (c,), of the motion over `frames` in each part (n, c)."""
+    moved = np.vstack([(part[frames:] - part[:-frames]) / noise for part in parts])
+    rows = np.linalg.svd(moved, full_matrices=False)[2][:MOST_DIRECTIONS] / noise
+    return np.asarray(rows * np.sign(rows.sum(axis=1, keepdims=True)))

@@ -9,40 +9,20 @@ too and shows a long twist. `motion_fit` chooses directions and memory.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.bank.channels import ChannelTable, smoothed_along_channels
 from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation.defaults import BASELINE_FRAMES
-from shearloop.estimation.estimator import (
-    LEAST_LEFT,
-    Bounds,
-    CalibrationRows,
-    Estimator,
-    Material,
-    OutputModel,
-    Quantity,
-    Reading,
-)
+from shearloop.estimation.estimator import Bounds, CalibrationRows, Estimator, Material, OutputModel, Quantity, Reading
 from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.grip_memory import Motion
-from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor
-from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange
-from shearloop.estimation.left_out import left_out_blocks
-from shearloop.estimation.motion_fit import (
-    MEMORY_EDGES,
-    MOST_DIRECTIONS,
-    Layout,
-    LinearFit,
-    MotionFit,
-    choose_motion,
-    twists_left_out,
-)
 from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
+
+if TYPE_CHECKING:
+    from shearloop.estimation.motion_fit import MotionFit
 
 # The directions of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err
 # more, over 12 frames later twists do (docs/decisions/0044). A nested choice tries all three.
@@ -55,13 +35,6 @@ _MOST_LAGS = 1000
 # Positions drift between recordings, motion does not. So motion alone is preferred unless it leaves more than the first
 # share of the torque's variance unexplained on frames left out and the position lowers the error by the second.
 _MOTION_MAY_LEAVE, _POSITION_MUST_GAIN = 0.5, 0.5
-# Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.
-_N_NUISANCE, _MOST_FRAMES = 16, 500
-# The tools differ along a direction where the positions vary by this factor more than their noise. At least this share
-# of the variation along the clearest direction counts as the tools', at any noise.
-_CLEAR, _LEAST_SHARE = 2.0, 0.2
-# Centred positions have one direction less than their number; the last one is rounding.
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,9 +57,11 @@ class TemporalFeatures(Motion):
 
         With `nested` they are of the motion over several times, for the fit to choose.
         """
+        from shearloop.estimation.motion_fit import MEMORY_EDGES, main_directions
+
         windows = _NESTED_DIRECTION_FRAMES if nested else _DIRECTION_FRAMES
         directions = [
-            np.vstack([_main_directions([part[:, layer] for part in parts], one.noise, frames) for frames in windows])
+            np.vstack([main_directions([part[:, layer] for part in parts], one.noise, frames) for frames in windows])
             for layer, one in enumerate(validators)
         ]
         return cls(np.array(directions), np.array(MEMORY_EDGES), uses_position=True)
@@ -101,13 +76,7 @@ class TemporalFeatures(Motion):
         """How many positions of a grip an estimate needs."""
         return min(self.n_lags, _LEAST_LAGS) + 1
 
-    @property
-    def layout(self) -> Layout:
-        """What the columns of the features are."""
-        m, p, _ = self.directions.shape
-        return Layout(len(self.edges) - 1, m, p)
-
-    def reduced(self, to: MotionFit) -> Self:
+    def reduced(self, to: "MotionFit") -> Self:
         """Return the features that a fit uses."""
         first = to.first_direction
         directions = self.directions[:, first : first + to.n_directions].copy()
@@ -144,13 +113,6 @@ class TemporalFeatures(Motion):
         before = np.add.reduceat(rows[-2::-1], starts, axis=0) / counts[:, None]
         moved = (rows[-1] - before).ravel()
         return np.concatenate([moved, from_idle]) if self.uses_position else moved
-
-
-def _main_directions(parts: Sequence[FloatArray], noise: FloatArray, frames: int) -> FloatArray:
-    """Return the main directions (p, c), in units of noise (c,), of the motion over `frames` in each part (n, c)."""
-    moved = np.vstack([(part[frames:] - part[:-frames]) / noise for part in parts])
-    rows = np.linalg.svd(moved, full_matrices=False)[2][:MOST_DIRECTIONS] / noise
-    return np.asarray(rows * np.sign(rows.sum(axis=1, keepdims=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,13 +178,18 @@ class MotionRegression(Estimator):
         self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
     ) -> tuple[Self, IntervalRegressor, float]:
         """Return the torque's regressor, and the estimator with the chosen features."""
+        from shearloop.estimation.interval_fit import fit_interval_regressor
+        from shearloop.estimation.left_out import left_out_blocks
+        from shearloop.estimation.motion_fit import Layout, LinearFit, choose_motion, twists_left_out
+
         temporal = self.temporal
+        m, p, _ = temporal.directions.shape
+        layout = Layout(len(temporal.edges) - 1, m, p)
         fit_one: LinearFit = CensoredRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
         twists, variance = twists_left_out(torque_nm), float(torque_nm.var())
         left_out = twists or left_out_blocks(len(torque_nm))
         alone, with_position = (
-            choose_motion(features, torque_nm, temporal.layout, fit_one, left_out, position=used)
-            for used in (False, True)
+            choose_motion(features, torque_nm, layout, fit_one, left_out, position=used) for used in (False, True)
         )
         needs_position = alone.squared_error > _MOTION_MAY_LEAVE * variance
         gains = with_position.squared_error < _POSITION_MUST_GAIN * alone.squared_error
@@ -240,64 +207,7 @@ class MotionRegression(Estimator):
 
     def fit_diameter(self, rows: CalibrationRows) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""
+        from shearloop.estimation.cylinder_fit import fit_cylinders
+
         grips = [rows.where(rows.recording == one) for one in np.unique(rows.recording)]
         return OutputModel(fit_cylinders(grips, self.table), np.zeros(0))
-
-
-def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> IntervalRegressor:
-    """Return the diameter's regressor on the mean of a grip, from recordings of one grip each, of three diameters or
-    more.
-
-    Its interval is the error on cylinders left out.
-    """
-    diameters = np.array([one.diameter_mm[0] for one in grips])
-    line = fit_line(grips, table)
-    squares = []
-    for one, diameter in zip(grips, diameters, strict=True):
-        # Leave out all grips of this cylinder: another one would only confirm this diameter.
-        rest = [other for other in grips if other.diameter_mm[0] != diameter]
-        if len({float(other.diameter_mm[0]) for other in rest}) >= LEAST_LEFT:
-            squares.append(float(((fit_line(rest, table).predict(one.mean_position) - diameter) ** 2).mean()))
-    # Each recording counts once, which is too few for a quantile.
-    half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
-    low, high = float(diameters.min()), float(diameters.max())
-    intervals = Intervals(np.zeros(0), np.array([half_width]))
-    return IntervalRegressor(line, intervals, ValueRange(low, high), line.mean, np.zeros(0))
-
-
-def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
-    """Return the line from a position to a diameter through grips of two diameters or more.
-
-    The noise of the idle frame is constant within a recording, like the diameter, so a regression on single frames
-    confuses the two. Here a recording counts as one position of known noise. Motion within recordings is shrunk, and
-    the line uses only directions where positions differ by more than their noise, by the amount that they would
-    differ without it (errors in variables, Fuller 1987). Averaging channels of one voltage and smoothing along
-    neighbours, as the paper did with its cylinders, lowers the noise.
-    """
-    diameters = np.array([one.diameter_mm[0] for one in grips])
-    n_sides = grips[0].position.shape[1] // table.n_channels
-    reduction = np.kron(np.eye(n_sides), table.twin_means(smoothed_along_channels(np.eye(table.n_channels))))
-    frames = [one.position @ reduction for one in grips]
-    positions = np.array([one.mean(axis=0) for one in frames])
-    moved = np.concatenate([one - position for one, position in zip(frames, positions, strict=True)])
-    moved = moved[:: 1 + len(moved) // _MOST_FRAMES]
-    _, sizes, directions = np.linalg.svd(moved, full_matrices=False)
-    n = max(min(_N_NUISANCE, int(np.count_nonzero(sizes)) - 1), 0)
-    shrink = 1.0 - sizes[n] / sizes[:n]
-
-    def whitened(rows: FloatArray) -> FloatArray:
-        return np.asarray(rows - (rows @ directions[:n].T * shrink) @ directions[:n])
-
-    frame_noise = float((whitened(moved) ** 2).sum()) / max(len(moved) - len(grips), 1)
-    noise = frame_noise * (1.0 / BASELINE_FRAMES + float(np.mean([1.0 / len(one) for one in frames])))
-    centred = whitened(positions - positions.mean(axis=0))
-    squares, modes = np.linalg.eigh(centred @ centred.T)
-    clear: BoolArray = squares > max(_CLEAR * noise, _ROUNDING * float(squares[-1]))
-    clear[-1] = True
-    squares, modes = squares[clear], modes[:, clear]
-    # One recording under several diameters differs by rounding alone, and would give an arbitrarily steep line.
-    least = _ROUNDING * noise + float(np.finfo(np.float64).eps * (positions**2).sum())
-    true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
-    along = centred.T @ (modes @ (modes.T @ (diameters - diameters.mean()) / true))
-    mean = np.mean([one.position.mean(axis=0) for one in grips], axis=0)
-    return Ridge(mean, reduction @ whitened(along), float(diameters.mean()), 0.0)

@@ -11,11 +11,11 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.matching import signal_above_noise
-from shearloop.estimation.bank_match import BankMatcher
+from shearloop.estimation.bank_match import BankMatcher, BankSearch
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.defaults import BASELINE_FRAMES, MAX_GAP_S
 from shearloop.estimation.fingertip_validator import LEAST_NOISE_V
-from shearloop.estimation.session import FINGERS_MOVED, BankSearch, Session
+from shearloop.estimation.session import FINGERS_MOVED, Session
 from shearloop.estimation.values import ProcessedFrame, TactileFrame
 
 # Frames with more unusable channels than this are refused.

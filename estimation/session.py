@@ -7,16 +7,13 @@ features then go through the models of the calibration.
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.estimation.adaptation import Adaptation, GripGain
-from shearloop.estimation.bank_match import BankMatch, BankMatcher
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.defaults import BASELINE_FRAMES
@@ -34,6 +31,10 @@ from shearloop.estimation.idle_frames import IdleFrames
 from shearloop.estimation.values import Estimate, Measured, ProcessedFrame, TactileFrame
 from shearloop.words import counted
 
+if TYPE_CHECKING:
+    from shearloop.bank.bank_file import Bank
+    from shearloop.estimation.bank_match import BankMatch, BankMatcher, BankSearch
+
 _REPEATED_FRAME = ("the board sent the same frame again",)
 FINGERS_MOVED = "the fingers moved while this frame was acquired"
 _NO_IDLE_FRAME = ("no idle frame: it took too long, or something was gripped; tare again with nothing gripped",)
@@ -45,8 +46,6 @@ AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
 
 # A value, and its 95 % interval: how far it extends below and above, or its ends.
 Interval = tuple[float, float, float]
-# Searches a whole bank. It has no state, so sessions may share one.
-BankSearch: TypeAlias = PrunedMatcher | PrunedZeroLagMatcher
 
 
 class Session:
@@ -58,10 +57,10 @@ class Session:
     def __init__(
         self,
         calibration: Calibration,
-        bank: Bank | None = None,
+        bank: "Bank | None" = None,
         *,
-        matcher: BankMatcher | None = None,
-        search: BankSearch | None = None,
+        matcher: "BankMatcher | None" = None,
+        search: "BankSearch | None" = None,
         period_s: float = np.inf,
         baseline_frames: int = BASELINE_FRAMES,
     ) -> None:
@@ -381,7 +380,7 @@ def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: Bo
     )
 
 
-def estimate_of(values: Mapping[Quantity, Interval], reasons: Iterable[str], match: BankMatch | None) -> Estimate:
+def estimate_of(values: Mapping[Quantity, Interval], reasons: Iterable[str], match: "BankMatch | None") -> Estimate:
     """Return the estimate of values with the ends of their intervals."""
     torque, diameter = values.get("torque", _UNKNOWN), values.get("diameter", _UNKNOWN)
     estimate = Estimate(bool(values), () if values else tuple(reasons), *torque, *diameter)

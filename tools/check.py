@@ -3,7 +3,7 @@
 import math
 import os
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, EmulatorConfig, SkinConfig
     from shearloop.daemon.control.experiment_schema import Mistake
     from shearloop.daemon.control.plan import Plan
+    from shearloop.daemon.torques import TorqueSource
     from shearloop.drivers.robotiq.models import GripperModel
     from shearloop.drivers.ur.settings import UrLimits
     from shearloop.estimation import Calibration
@@ -51,10 +52,14 @@ class Parts:
 
 def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulators) -> Parts:
     """Return what each part of the configuration in this file is; opens every file that it names."""
-    from shearloop.daemon.control.experiment_check import experiment_mistakes
-    from shearloop.daemon.experiment_files import check_experiment, read_document
-    from shearloop.daemon.sensing.sessions import COMBINED, check_devices, open_combined, open_session, torque_sources
-    from shearloop.daemon.torques import WRENCH, TorqueSource
+    from shearloop.daemon.sensing.sessions import (
+        COMBINED,
+        open_combined,
+        open_session,
+        refuse_emulated_calibrations,
+        torque_sources,
+    )
+    from shearloop.daemon.torques import TorqueSource
 
     parts, sessions, combined = Parts(), {}, None
     with parts.of("emulators"):
@@ -63,7 +68,7 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
         with parts.of("keys"):
             parts.texts["keys"] = f"{_clients(config.curve)} may connect"
     with parts.of("calibrations"):
-        check_devices(config)
+        refuse_emulated_calibrations(config)
     for name, fingertip in config.fingertips.items():
         with parts.of(name):
             session = sessions[name] = open_session(fingertip, name)
@@ -90,25 +95,34 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
     }
     sources = unopened | torque_sources(config, sessions, combined)
     with parts.of("experiment"):
-        warm_up_s = max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0)
-        if config.experiment is not None:
-            document = read_document(config.experiment)
-            mistakes = experiment_mistakes(document.content, config, sources, robot)
-            limits = robot.settings.limits if robot is not None else None
-            _add_plan(parts, document, mistakes, limits, config.gripper_model, warm_up_s)
-        experiment = check_experiment(config, sources, robot)
-        if experiment is not None:
-            text = (
-                f"{experiment.name!r}, {counted(len(experiment.steps), 'step')}, driven by {experiment.torque_source}"
-            )
-            if warm_up_s:
-                text += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
-            if robot is not None and experiment.torque_source != WRENCH:
-                noise_nm = robot.settings.facts.estimated_nm
-                if noise_nm:
-                    text += f"; the wrench supervises it to {noise_nm:g} N·m beyond its limits only"
-            parts.texts["experiment"] = text
+        _check_experiment(config, parts, sources, robot)
     return parts
+
+
+def _check_experiment(
+    config: "DaemonConfig", parts: Parts, sources: Mapping[str, "TorqueSource"], robot: "Commissioning | None"
+) -> None:
+    """Add the plan of the configured experiment, its mistakes, and what drives it."""
+    from shearloop.daemon.control.experiment_check import experiment_mistakes
+    from shearloop.daemon.experiment_files import check_experiment, read_document
+    from shearloop.daemon.torques import WRENCH
+
+    warm_up_s = max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0)
+    if config.experiment is not None:
+        document = read_document(config.experiment)
+        mistakes = experiment_mistakes(document.content, config, sources, robot)
+        limits = robot.settings.limits if robot is not None else None
+        _add_plan(parts, document, mistakes, limits, config.gripper_model, warm_up_s)
+    experiment = check_experiment(config, sources, robot)
+    if experiment is not None:
+        text = f"{experiment.name!r}, {counted(len(experiment.steps), 'step')}, driven by {experiment.torque_source}"
+        if warm_up_s:
+            text += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
+        if robot is not None and experiment.torque_source != WRENCH:
+            noise_nm = robot.settings.facts.estimated_nm
+            if noise_nm:
+                text += f"; the wrench supervises it to {noise_nm:g} N·m beyond its limits only"
+        parts.texts["experiment"] = text
 
 
 def check_experiment_alone(path: Path) -> Parts:

@@ -4,32 +4,29 @@ import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
 from shearloop.estimation import Calibration, Session
-from shearloop.estimation.bank_match import PaperMatcher
 from shearloop.estimation.defaults import MAX_GAP_S
-from shearloop.estimation.estimator import PaperEstimator
-from shearloop.estimation.paper_session import PaperSession
-from shearloop.estimation.session import BankSearch
+
+if TYPE_CHECKING:
+    from shearloop.estimation.bank_match import BankSearch
 
 # Source of the estimate from several fingertips together.
 COMBINED = "combined"
-_SEARCHES: Mapping[str, type[PrunedMatcher | PrunedZeroLagMatcher]] = {
-    "all_lags": PrunedMatcher,
-    "zero_lag": PrunedZeroLagMatcher,
-}
+# The only estimator that needs no calibration.
+_PAPER = "paper"
 # A search has no state, so fingertips with the same bank share one.
-_in_use: WeakValueDictionary[tuple[str, str], BankSearch] = WeakValueDictionary()
+_in_use: "WeakValueDictionary[tuple[str, str], BankSearch]" = WeakValueDictionary()
 # After a grip some frames are disturbed or missing.
 _WARM_UP_SHARE = 2.0
 
@@ -71,7 +68,7 @@ def open_session(config: FingertipConfig, name: str) -> Session:
         if calibration.estimator.needs == "bank" and config.bank is None:
             raise _without_bank(calibration.estimator.name, name)
         return _open(config.calibration, calibration, config)
-    if config.estimator not in (None, PaperEstimator.name):
+    if config.estimator not in (None, _PAPER):
         found = "none is configured" if config.calibration is None else f"{config.calibration} does not exist"
         options = f"--sides {name} --estimator {config.estimator} --out {shlex.quote(str(config.calibration or 'CAL'))}"
         raise UserError(
@@ -84,7 +81,7 @@ def open_session(config: FingertipConfig, name: str) -> Session:
             "and sigma"
         )
     if config.bank is None:
-        raise _without_bank(PaperEstimator.name, name)
+        raise _without_bank(_PAPER, name)
     if config.calibration is not None:
         # The file is missing, and the error says how to make it.
         return _open(config.calibration, Calibration.load(config.calibration), config)
@@ -92,7 +89,7 @@ def open_session(config: FingertipConfig, name: str) -> Session:
     return _session(Calibration.uncalibrated(bank.identity, bank.table), config)
 
 
-def check_devices(config: DaemonConfig) -> None:
+def refuse_emulated_calibrations(config: DaemonConfig) -> None:
     """Raise UserError for a calibration on emulated devices in a configuration of real ones."""
     if config.emulated:
         return
@@ -172,6 +169,9 @@ def _session(calibration: Calibration, config: FingertipConfig) -> Session:
     calibration.check_bank(bank)
     if search is None:
         raise ValueError("the paper's estimator needs a bank")
+    from shearloop.estimation.bank_match import PaperMatcher
+    from shearloop.estimation.paper_session import PaperSession
+
     return PaperSession(
         calibration,
         PaperMatcher(search),
@@ -182,11 +182,15 @@ def _session(calibration: Calibration, config: FingertipConfig) -> Session:
     )
 
 
-def _shared_search(bank: Bank, matching: str) -> BankSearch:
+def _shared_search(bank: Bank, matching: str) -> "BankSearch":
+    """Return the search of a bank, the one that another fingertip uses already where there is one."""
+    # Only a rig with a bank loads what searches it.
+    from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
+
     key = (f"{bank.identity} {bank.signals_sha256}", matching)
     shared = _in_use.get(key)
     if shared is None:
-        shared = _in_use[key] = _SEARCHES[matching].from_bank(bank)
+        shared = _in_use[key] = (PrunedZeroLagMatcher if matching == "zero_lag" else PrunedMatcher).from_bank(bank)
     return shared
 
 

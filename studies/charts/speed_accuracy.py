@@ -17,9 +17,9 @@ from shearloop.bank.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
 from shearloop.bank.mesh import Mesh
 from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.estimation import Calibration, FrameSeries, Physics
+from shearloop.estimation.bank_estimators import PaperEstimator
 from shearloop.estimation.bank_match import NOT_TURNED, BankMatcher, RefinedMatcher
 from shearloop.estimation.defaults import LOADED_NM
-from shearloop.estimation.estimator import PaperEstimator
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor

@@ -11,15 +11,8 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.estimator import (
-    BankEstimator,
-    Estimator,
-    Material,
-    PaperEstimator,
-    Physics,
-    Quantity,
-    Reading,
-)
+from shearloop.estimation.bank_estimators import BankEstimator, PaperEstimator
+from shearloop.estimation.estimator import Estimator, Material, Physics, Quantity, Reading
 from shearloop.estimation.estimator_names import DEFAULT, EstimatorName, estimator_class
 from shearloop.studies.slices.curve import CurveMean
 from shearloop.studies.slices.hidden_values import SlicePoint

@@ -15,8 +15,10 @@ from hypothesis import strategies as st
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import BankError, CalibrationError
 from shearloop.estimation import TRUSTED, Calibration, fit
+from shearloop.estimation.bank_estimators import BankEstimator, PaperEstimator
 from shearloop.estimation.channel_imputer import ChannelImputer
-from shearloop.estimation.estimator import BankEstimator, PaperEstimator, Reconstruction, Regression
+from shearloop.estimation.estimator import Regression
+from shearloop.estimation.reconstruction import Reconstruction
 from tests.estimation.conftest import follow
 from tests.paper_curve import paper_curve
 

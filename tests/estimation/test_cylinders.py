@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.estimation import TRUSTED, Session, fit
+from shearloop.estimation.cylinder_fit import fit_cylinders, fit_line
 from shearloop.estimation.estimator import CalibrationRows
-from shearloop.estimation.motion_regression import fit_cylinders, fit_line
 from shearloop.estimation.ridge import Ridge
 from tests.estimation.conftest import follow, twisting
 

@@ -12,9 +12,9 @@ from shearloop.estimation.bank_match import (
     ElectrodeNumbering,
     RefinedMatcher,
     find_numberings,
-    image_matrix,
     resolve_symmetry,
 )
+from shearloop.estimation.reconstruction import image_matrix
 from shearloop.studies.slices.fitting import fit_slices
 from shearloop.studies.slices.reader import SliceReader
 from tests.studies.slices.conftest import slices_of

@@ -12,7 +12,7 @@ from structlog.testing import capture_logs
 from shearloop.bank.errors import BankError
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
-from shearloop.daemon.sensing.sessions import check_devices, open_combined, open_session
+from shearloop.daemon.sensing.sessions import open_combined, open_session, refuse_emulated_calibrations
 from shearloop.daemon.sensors import log_assumptions
 from shearloop.drivers.eit_kit import Frame
 from shearloop.errors import UserError
@@ -145,11 +145,11 @@ def test_a_calibration_on_emulated_devices_is_refused_in_a_rig_of_real_ones(cali
     content = {"fingertips": tips, "combined": {"calibration": str(path)}}
     for emulated in (True, False):
         replace(calibration, emulated=emulated).save(path)
-        check_devices(DaemonConfig(**content, emulated=True))
-    check_devices(DaemonConfig(**content))
+        refuse_emulated_calibrations(DaemonConfig(**content, emulated=True))
+    refuse_emulated_calibrations(DaemonConfig(**content))
     replace(calibration, emulated=True).save(path)
     with pytest.raises(UserError, match=r"combined\.cal was made from recordings of emulated devices"):
-        check_devices(DaemonConfig(**content))
+        refuse_emulated_calibrations(DaemonConfig(**content))
 
 
 def test_check_and_log_say_where_the_strength_of_a_grip_is_not_checked(calibration, tmp_path):

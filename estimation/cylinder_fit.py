@@ -1,0 +1,82 @@
+"""The fit of a diameter to the mean position of the gel in a grip, for the estimator of motion."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.channels import ChannelTable, smoothed_along_channels
+from shearloop.estimation.confidence import TWO_SIDED_95
+from shearloop.estimation.defaults import BASELINE_FRAMES
+from shearloop.estimation.estimator import LEAST_LEFT, CalibrationRows
+from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange
+from shearloop.estimation.ridge import Ridge
+
+# Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.
+_N_NUISANCE, _MOST_FRAMES = 16, 500
+# The tools differ along a direction where the positions vary by this factor more than their noise. At least this share
+# of the variation along the clearest direction counts as the tools', at any noise.
+_CLEAR, _LEAST_SHARE = 2.0, 0.2
+# Centred positions have one direction less than their number; the last one is rounding.
+_ROUNDING = 1e-9
+
+
+def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> IntervalRegressor:
+    """Return the diameter's regressor on the mean of a grip, from recordings of one grip each, of three diameters or
+    more.
+
+    Its interval is the error on cylinders left out.
+    """
+    diameters = np.array([one.diameter_mm[0] for one in grips])
+    line = fit_line(grips, table)
+    squares = []
+    for one, diameter in zip(grips, diameters, strict=True):
+        # Leave out all grips of this cylinder: another one would only confirm this diameter.
+        rest = [other for other in grips if other.diameter_mm[0] != diameter]
+        if len({float(other.diameter_mm[0]) for other in rest}) >= LEAST_LEFT:
+            squares.append(float(((fit_line(rest, table).predict(one.mean_position) - diameter) ** 2).mean()))
+    # Each recording counts once, which is too few for a quantile.
+    half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
+    low, high = float(diameters.min()), float(diameters.max())
+    intervals = Intervals(np.zeros(0), np.array([half_width]))
+    return IntervalRegressor(line, intervals, ValueRange(low, high), line.mean, np.zeros(0))
+
+
+def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
+    """Return the line from a position to a diameter through grips of two diameters or more.
+
+    The noise of the idle frame is constant within a recording, like the diameter, so a regression on single frames
+    confuses the two. Here a recording counts as one position of known noise. Motion within recordings is shrunk, and
+    the line uses only directions where positions differ by more than their noise, by the amount that they would
+    differ without it (errors in variables, Fuller 1987). Averaging channels of one voltage and smoothing along
+    neighbours, as the paper did with its cylinders, lowers the noise.
+    """
+    diameters = np.array([one.diameter_mm[0] for one in grips])
+    n_sides = grips[0].position.shape[1] // table.n_channels
+    reduction = np.kron(np.eye(n_sides), table.twin_means(smoothed_along_channels(np.eye(table.n_channels))))
+    frames = [one.position @ reduction for one in grips]
+    positions = np.array([one.mean(axis=0) for one in frames])
+    moved = np.concatenate([one - position for one, position in zip(frames, positions, strict=True)])
+    moved = moved[:: 1 + len(moved) // _MOST_FRAMES]
+    _, sizes, directions = np.linalg.svd(moved, full_matrices=False)
+    n = max(min(_N_NUISANCE, int(np.count_nonzero(sizes)) - 1), 0)
+    shrink = 1.0 - sizes[n] / sizes[:n]
+
+    def whitened(rows: FloatArray) -> FloatArray:
+        return np.asarray(rows - (rows @ directions[:n].T * shrink) @ directions[:n])
+
+    frame_noise = float((whitened(moved) ** 2).sum()) / max(len(moved) - len(grips), 1)
+    noise = frame_noise * (1.0 / BASELINE_FRAMES + float(np.mean([1.0 / len(one) for one in frames])))
+    centred = whitened(positions - positions.mean(axis=0))
+    squares, modes = np.linalg.eigh(centred @ centred.T)
+    clear: BoolArray = squares > max(_CLEAR * noise, _ROUNDING * float(squares[-1]))
+    clear[-1] = True
+    squares, modes = squares[clear], modes[:, clear]
+    # One recording under several diameters differs by rounding alone, and would give an arbitrarily steep line.
+    least = _ROUNDING * noise + float(np.finfo(np.float64).eps * (positions**2).sum())
+    true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
+    along = centred.T @ (modes @ (modes.T @ (diameters - diameters.mean()) / true))
+    mean = np.mean([one.position.mean(axis=0) for one in grips], axis=0)
+    return Ridge(mean, reduction @ whitened(along), float(diameters.mean()), 0.0)

@@ -177,7 +177,7 @@ class TorqueFilter:
         self.creep_nm = 0.0  # per measurement
         # The arrival of the latest measurement.
         self.fresh_ns: int | None = None
-        # The torque at a fixed angle has moved too far since the reference.
+        # The torque at a fixed angle has moved too far since the loop was closed.
         self.slipped = False
         span_s = settings.age_limit_s + settings.window_s + settings.lag_s
         self.angles = AngleHistory(int(1e9 * (span_s + 1.0)))
@@ -202,15 +202,11 @@ class TorqueFilter:
 
     @property
     def not_following(self) -> str:
-        """By how much the torque at a fixed angle has moved since the reference, where that is too much; else empty."""
+        """By how much the torque at one angle has moved since the loop was closed; empty unless that is too much."""
         if not self.slipped:
             return ""
         moved_nm, limit_nm = self.offset_nm - self._reference_nm, self._settings.offset_limit_nm
         return f"at one angle it moved by {moved_nm:+.3f} N·m, and {limit_nm:g} are allowed"
-
-    def restart(self) -> None:
-        """Take the present offset as the reference: a grip that slipped may slip as far again before the next hold."""
-        self._reference_nm, self.slipped = self.offset_nm, False
 
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int, *, integrates: bool = True) -> bool:
         """Use a torque of the time t_mid_ns that arrived at t_ns; return whether it can be used.
@@ -317,8 +313,10 @@ class TorqueController:
             self.ramp_nm = self.filter.expected_nm(self._angle_rad)
 
     def resume(self) -> None:
-        """Continue after a hold without commands; the ramp restarts at the present torque."""
-        self.filter.restart()
+        """Continue after a hold without commands; the ramp restarts at the present torque.
+
+        The reference of the offset stays: a grip that slips a little before each of many holds has slipped far.
+        """
         self._rest()
 
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> bool:

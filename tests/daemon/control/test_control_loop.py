@@ -38,25 +38,68 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     assert held.std() < 0.006
 
 
-@pytest.mark.parametrize("drive", ["right", "load_cell"])
-def test_a_tool_that_slips_while_a_torque_is_held_ends_in_a_stop_and_not_as_done(drive):
-    hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 20}
+def holding(drive: str) -> Rig:
+    """Return a rig that has reached its torque and holds it."""
+    hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 60}
     rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, hold, {"do": "release"}, torque_source=drive)
     while not rig.control_loop.experiment.command.hold_number:
         rig.step()
     rig.run(5)
-    turned, begun_s = rig.twin.step, rig.tick * TICK_S
+    return rig
+
+
+def slip(rig: Rig, rate_rad_per_s: float, most_rad: float) -> None:
+    """Leave the tool behind the fingers from now on, by more and more."""
+    turned, begun = rig.twin.step, rig.tick
 
     def slipping(step_s: float, wrist_rad: float, force_n: float) -> Any:
-        """Leave the tool behind the fingers, by more and more."""
-        return turned(step_s, wrist_rad - min(0.35, 0.1 * (rig.tick * TICK_S - begun_s)), force_n)
+        slipped_rad = min(most_rad, rate_rad_per_s * (rig.tick - begun) * TICK_S)
+        return turned(step_s, wrist_rad - slipped_rad, force_n)
 
     rig.twin = SimpleNamespace(step=slipping)
-    rig.run(60)
+
+
+def assert_stopped_because_the_torque_does_not_follow(rig: Rig) -> None:
     assert phase(rig) is ExperimentPhase.STOPPED
     assert "the torque no longer follows the wrist: at one angle it moved by -0." in rig.control_loop.status.activity
+
+
+@pytest.mark.parametrize("drive", ["right", "load_cell"])
+def test_a_tool_that_slips_while_a_torque_is_held_ends_in_a_stop_and_not_as_done(drive):
+    rig = holding(drive)
+    slip(rig, rate_rad_per_s=0.1, most_rad=0.35)
+    rig.run(60)
+    assert_stopped_because_the_torque_does_not_follow(rig)
     assert rig.control_loop.safety.stop_faults[0].code is FaultCode.NOT_FOLLOWING
     assert rig.true_nm[-1] < 0.05
+
+
+def pause_for(rig: Rig, seconds: float) -> None:
+    assert rig.control_loop.pause() is None
+    rig.run(seconds)
+    assert rig.control_loop.resume() is None
+
+
+def lose_the_load_cell_for(rig: Rig, seconds: float) -> None:
+    rig.silent.add("load_cell")
+    rig.run(seconds)
+    assert rig.control_loop.status.decision.response is Response.HOLD
+    rig.silent.clear()
+
+
+@pytest.mark.parametrize("hold", [pause_for, lose_the_load_cell_for])
+def test_a_hold_forgives_no_slip(hold):
+    rig = holding("load_cell")
+    begun_rad = rig.wrist_rad
+    for _ in range(4):
+        slip(rig, rate_rad_per_s=0.1, most_rad=0.15)
+        rig.run(5)
+        if rig.control_loop.status.decision.faults:
+            break
+        hold(rig, 2.0)
+    rig.run(20)
+    assert_stopped_because_the_torque_does_not_follow(rig)
+    assert abs(rig.wrist_rad - begun_rad) < 0.45
 
 
 def test_a_tighter_grip_of_the_same_tool_keeps_the_angle_of_the_grip():

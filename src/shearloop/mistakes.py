@@ -140,6 +140,9 @@ def _written(location: Sequence[int | str], content: object, node: yaml.Node | N
             name, node = _pair(content, part, node)
             content = content[part]
         elif isinstance(content, list) and isinstance(part, int) and isinstance(node, yaml.SequenceNode):
+            if part >= len(content):
+                # The entry is missing.
+                return ""
             name = node = node.value[part]
             content = content[part]
     wrong = name if key else node

@@ -5,10 +5,11 @@ import os
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import pytest
-from hypothesis import given
+import yaml
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
@@ -16,8 +17,11 @@ from shearloop.cli.config_schema import MODELS, schema_of
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
-from shearloop.yaml_files import read_yaml
+from shearloop.yaml_files import load_model, read_yaml
+
+CONFIG = Path(__file__).parents[2] / "config"
 
 
 class Inner(ConfigModel):
@@ -268,6 +272,61 @@ def test_no_content_whatever_does_anything_but_load_or_be_refused(tmp_path_facto
     path.write_bytes(b"torque_limit_nm: 1\n" + content)
     with suppress(UserError):
         assert isinstance(load_yaml_model(path, Outer), Outer)
+
+
+SHIPPED = [
+    ("configuration", "rig.yaml"),
+    ("configuration", "skin_demo.yaml"),
+    ("robot", "ur.yaml"),
+    ("experiment", "experiments/torque_sweep.yaml"),
+    ("bank", "banks/paper.yaml"),
+    ("fingertip", "fingertips/round.yaml"),
+]
+OTHERS = [None, True, -1, 1e9, float("nan"), "x", "", [], {}, [1], {"x": 1}, {1: "x"}, 10**23]
+
+
+def places(content: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Return the path to each value of a document, its sections and lists included."""
+    inside = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    return [path, *(place for key, value in inside for place in places(value, (*path, key)))]
+
+
+def changed(content: Any, path: tuple[Any, ...], how: int) -> Any:
+    """Return a document with the value at a path removed, shortened, lengthened, or replaced by another one."""
+    if path:
+        copy = content.copy()
+        if len(path) == 1 and how == len(OTHERS):
+            del copy[path[0]]
+        else:
+            copy[path[0]] = changed(content[path[0]], path[1:], how)
+        return copy
+    if isinstance(content, list):
+        return (content[:-1], [*content, *content[-1:]], *OTHERS)[how % (len(OTHERS) + 2)]
+    return OTHERS[how % len(OTHERS)]
+
+
+@pytest.mark.parametrize(("kind", "name"), SHIPPED)
+@given(drawn=st.data())
+@settings(max_examples=25, deadline=None)
+def test_a_shipped_file_with_any_value_changed_loads_or_is_refused_in_sentences(kind, name, drawn, tmp_path_factory):
+    content = yaml.safe_load((CONFIG / name).read_text())
+    place = drawn.draw(st.sampled_from(places(content)))
+    path = tmp_path_factory.getbasetemp() / f"changed_{kind}.yaml"
+    path.write_text(yaml.safe_dump(changed(content, place, drawn.draw(st.integers(0, len(OTHERS) + 1)))))
+    module, model = MODELS[kind]
+    with suppress(UserError):
+        load_model(path, getattr(importlib.import_module(module), model), UserError)
+
+
+def test_each_list_of_the_robots_file_may_lack_an_entry(tmp_path):
+    content = yaml.safe_load((CONFIG / "ur.yaml").read_text())
+    path = tmp_path / "ur.yaml"
+    lists = [place for place in places(content) if place and place[-1] in ("lower_rad", "upper_rad", "lower_m")]
+    assert len(lists) == 3
+    for place in lists:
+        path.write_text(yaml.safe_dump(changed(content, place, 0)))
+        with pytest.raises(UserError, match=rf"{place[-1]}.*: is missing"):
+            load_model(path, UrSettings, UserError)
 
 
 @pytest.mark.parametrize(

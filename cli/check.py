@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.yaml_files import read_yaml
 
     content = read_yaml(args.config, UserError, "file")
-    is_experiment = isinstance(content, dict) and "steps" in content
+    is_experiment = _is_experiment(content)
     if args.rig is not None and not is_experiment:
         raise UserError(
             f"{args.config}: this file is a configuration, and --config goes with an experiment; leave --config out"
@@ -45,6 +45,19 @@ def run(args: argparse.Namespace) -> int:
     plan = parts.plans[0].as_json() if parts.plans else None
     result = {"config": str(args.config), "parts": parts.texts, "plan": plan}
     return print_result(result, [*sentences, f"{args.config} is in order"], as_json=args.json)
+
+
+def _is_experiment(content: object) -> bool:
+    """Return whether a file is meant as an experiment: by its steps, or by most of its keys where one is misspelt."""
+    from shearloop.daemon.config import DaemonConfig
+    from shearloop.daemon.control.experiment_schema import ExperimentFile
+
+    if not isinstance(content, dict) or "steps" in content:
+        return isinstance(content, dict)
+    of_experiments, of_configurations = (
+        sum(key in model.model_fields for key in content) for model in (ExperimentFile, DaemonConfig)
+    )
+    return of_experiments > of_configurations
 
 
 def _check_configuration(path: Path) -> "Parts":

@@ -99,7 +99,8 @@ class Experiment:
     def __init__(self, file: ExperimentFile, t_ns: int, speeds: steps.Speeds = steps.AS_ASKED) -> None:
         """Begin at t_ns; `speeds` are the largest that the rig allows."""
         self.file = file
-        self._speeds = speeds
+        # The approximate duration of each step, for the remaining time shown to the operator.
+        self._expected_s = [one.takes_s for one in steps.demands(file.steps, speeds)]
         self.phase = ExperimentPhase.RUNNING
         self.stop_reason = ""
         # The step's command, also while the wrist is paused or held.
@@ -134,19 +135,15 @@ class Experiment:
     @property
     def _left_s(self) -> float:
         """The approximate time of what has not been done."""
-        here_s = max(0.0, self._expected_s(self.step) - self._elapsed_s + self._step_began_s)
-        return here_s + sum(map(self._expected_s, self.file.steps[self.step_number :]))
+        here_s = max(0.0, self._expected_s[self.step_number - 1] - self._elapsed_s + self._step_began_s)
+        return here_s + sum(self._expected_s[self.step_number :])
 
     @property
     def progress(self) -> float:
         """The completed share, 0 to 1; a stopped experiment keeps that of its stop."""
         if self.phase is ExperimentPhase.DONE:
             return 1.0
-        return max(0.0, 1.0 - self._left_s / max(sum(map(self._expected_s, self.file.steps)), 1e-9))
-
-    def _expected_s(self, step: Step) -> float:
-        """Return the approximate duration of a step, for the remaining time shown to the operator."""
-        return steps.demand(step, self._speeds).takes_s
+        return max(0.0, 1.0 - self._left_s / max(sum(self._expected_s), 1e-9))
 
     def update(
         self, t_ns: int, wrist_rad: float, torque_nm: float | None, *, gripped_at_rad: float = 0.0, held: bool = False

@@ -8,7 +8,7 @@ from typing import Any
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_check import Turn, reversals, turns
-from shearloop.daemon.control.experiment_schema import AS_ASKED, Demand, ExperimentFile, Speeds, Step, demand
+from shearloop.daemon.control.experiment_schema import AS_ASKED, Demand, ExperimentFile, Speeds, Step, demands
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
@@ -137,8 +137,8 @@ def plan_of(
     # Whether the next step that twists waits for the first torques of a grip or a tare.
     waits = False
     opened = False
-    for number, (step, turn) in enumerate(zip(file.steps, turns(file), strict=True), 1):
-        needs = demand(step, speeds)
+    expected = zip(file.steps, turns(file), demands(file.steps, speeds), strict=True)
+    for number, (step, turn, needs) in enumerate(expected, 1):
         duration_s = needs.takes_s
         notes = list(_notes(file, step, turn, robot))
         if isinstance(step, steps.GripStep | steps.TareStep):
@@ -147,6 +147,8 @@ def plan_of(
             notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques of the grip")
             duration_s += warm_up_s
             waits = False
+        if step.timeout_s is not None and needs.takes_s > step.timeout_s:
+            notes.append(f"its timeout_s of {step.timeout_s:g} s may stop it before its end")
         if number in back:
             notes.insert(0, back[number])
         opened = opened or isinstance(step, steps.ReleaseStep)

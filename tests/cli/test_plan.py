@@ -9,11 +9,13 @@ import yaml
 from shearloop.cli import main
 from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.drivers.ur.settings import UrLimits, read_settings
+from tests.daemon.control.loop_rig import TICK_S, Rig, new_loop, phase, started
 from tests.fixtures.daemons import collector, running_daemon, shearloop
 
 ROOT = Path(__file__).parents[2]
@@ -201,9 +203,49 @@ def test_the_duration_knows_of_the_robots_speed_and_of_the_approach_to_each_angl
         return plan_of(ExperimentFile.model_validate({"name": "fast", "steps": [step]}), limits).duration_s
 
     # 8 rad, and 40 angles or 20 that are come near to.
-    assert duration_s(twist, None) == pytest.approx(8 / 3 + 40.0)
-    assert duration_s(twist, robot) == pytest.approx(8 / fastest_rad_per_s + 40.0)
+    assert duration_s(twist, None) == pytest.approx(8 / 3 + 20.0)
+    assert duration_s(twist, robot) == pytest.approx(8 / fastest_rad_per_s + 20.0)
     # From the grip to the first angle it is half as far as between the others.
-    assert duration_s({**twist, "return_to_start": False}, robot) == pytest.approx(7.8 / fastest_rad_per_s + 20.0)
+    assert duration_s({**twist, "return_to_start": False}, robot) == pytest.approx(7.8 / fastest_rad_per_s + 10.0)
     once = {**twist, "angles_rad": [0.4], "speed_rad_per_s": 0.02, "repeats": 1, "return_to_start": False}
-    assert duration_s(once, robot) == pytest.approx(20.0 + 1.0)
+    assert duration_s(once, robot) == pytest.approx(20.0 + 0.5)
+
+
+def test_the_duration_knows_what_the_steps_before_have_left():
+    hold = {"do": "hold_torque", "torque_nm": 0.08, "ramp_nm_per_s": 0.04, "hold_s": 12}
+    back = {**hold, "torque_nm": -0.05}
+    turn = {"do": "turn_to", "angle_rad": 1.4}
+    twist = {"do": "twist", "angles_rad": [1.45, 1.65], "absolute": True, "hold_s": 0, "speed_rad_per_s": 0.1}
+    file = ExperimentFile.model_validate({"name": "one", "steps": [turn, GRIP, twist, hold, back, GRIP, hold]})
+    durations_s = [step.duration_s for step in plan_of(file).steps]
+    assert durations_s[2] == pytest.approx(2 * (0.05 + 0.25) / 0.1 + 4 * 0.5)
+    assert durations_s[3:5] == pytest.approx([12 + 0.08 / 0.04, 12 + 0.13 / 0.04])
+    assert durations_s[6] == durations_s[3]
+
+
+def test_an_experiment_without_its_steps_is_still_one(tmp_path, capsys):
+    path = tmp_path / "experiment.yaml"
+    path.write_text("{name: one, torque_source: load_cell, step: [{do: release}]}")
+    for options in ((), ("--config", str(rig(tmp_path)))):
+        assert main(["check", str(path), *options]) == 2
+        assert f"{path}:1: step: is not a known key; did you mean steps?" in capsys.readouterr().err
+
+
+def test_a_timeout_that_may_end_a_step_early_is_named():
+    file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "release", "timeout_s": 1}, GRIP]})
+    first, second = plan_of(file).steps
+    assert first.notes == ("its timeout_s of 1 s may stop it before its end",)
+    assert second.notes == ()
+
+
+@pytest.mark.parametrize("speed_rad_per_s", [0.1, 0.2, 0.5])
+def test_the_planned_duration_of_a_twist_is_the_real_one(speed_rad_per_s):
+    step = {"do": "twist", "angles_rad": [0.05, 0.3], "hold_s": 2, "speed_rad_per_s": speed_rad_per_s, "repeats": 3}
+    rig = started(Rig(new_loop()), GRIP, step, torque_source="load_cell", limits={"torque_nm": 1, "angle_rad": 1})
+    while not rig.speed:
+        rig.step()
+    begun = rig.tick
+    rig.run(120)
+    assert phase(rig) is ExperimentPhase.DONE
+    planned_s = plan_of(rig.control_loop.experiment.file).steps[1].duration_s
+    assert (rig.tick - begun) * TICK_S == pytest.approx(planned_s, rel=0.1)

@@ -2,6 +2,7 @@
 
 import argparse
 import shlex
+from contextlib import ExitStack
 from importlib import resources
 from pathlib import Path
 
@@ -41,8 +42,11 @@ def packaged_files() -> dict[Path, bytes]:
 
 
 def write_files(folder: Path, files: dict[Path, bytes]) -> None:
-    """Write the files below a folder; raises UserError where that fails."""
-    for path, content in files.items():
-        with writing(folder / path, "the file"):
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            (folder / path).write_bytes(content)
+    """Write new files below a folder; raises UserError where that fails, and then none of them is left."""
+    with ExitStack() as undone:
+        for path, content in files.items():
+            with writing(folder / path, "the file"):
+                (folder / path).parent.mkdir(parents=True, exist_ok=True)
+                undone.callback((folder / path).unlink, missing_ok=True)
+                (folder / path).write_bytes(content)
+        undone.pop_all()

@@ -2,6 +2,7 @@
 
 import argparse
 import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -114,6 +115,9 @@ def _judge_left_out(
         found = plan.judge(SerialExecutor())
     except (UserError, CalibrationError) as error:
         return {"left_out": None, "left_out_refused": str(error)}, [f"Not judged by {kind} left out: {error}."]
+    except KeyboardInterrupt:
+        print(f"{args.out} is written and whole; its trial with {kind} left out has not ended", file=sys.stderr)
+        raise
     return {"left_out": found.figures()}, sentences_of_left_out(found)
 
 

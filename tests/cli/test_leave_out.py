@@ -2,6 +2,8 @@
 
 import pytest
 
+from shearloop.cli import main
+from shearloop.estimation import Calibration
 from shearloop.tools.recordings.matlab_import import import_mat
 
 
@@ -33,6 +35,20 @@ def test_calibrate_judges_or_names_the_command(limit_s, slices_folder, tmp_path,
         command = result["left_out_command"].split()
         assert command[:4] == ["shearloop", "evaluate", "--leave-out", "levels"]
         assert command[-4:] == recipe
+
+
+def test_an_interrupted_trial_says_that_the_calibration_is_written(shared, tmp_path, capsys, monkeypatch):
+    recording = tmp_path / "30mm.mcap"
+    import_mat(sorted((shared / "recordings/streams/cylinders").glob("30mm_1_*.mat")), recording)
+
+    def interrupted(*_args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("shearloop.tools.leave_out.plan_left_out", interrupted)
+    out = tmp_path / "a.cal"
+    assert main(["calibrate", str(recording), "--load-cell-delay-s", "0", "--out", str(out)]) == 130
+    assert f"{out} is written and whole; its trial with twists left out has not ended" in capsys.readouterr().err
+    assert Calibration.load(out).measures_torque
 
 
 @pytest.mark.parametrize(

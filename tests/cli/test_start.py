@@ -1,5 +1,6 @@
 """What a user starts with: `init`, `schema`, and the files of `demo`."""
 
+import errno
 import json
 import os
 import signal
@@ -76,6 +77,23 @@ def test_init_writes_files_that_load_and_changes_none(tmp_path, ran, mistake):
     assert (folder / "rig.yaml").read_text() == "mine"
     assert not (folder / "ur.yaml").exists()
     assert "cannot be written: Not a directory; choose another path" in mistake("init", folder / "rig.yaml")
+
+
+def test_init_leaves_nothing_behind_on_a_full_disc(tmp_path, mistake, monkeypatch):
+    written, whole = [], Path.write_bytes
+
+    def until_full(path: Path, content: bytes) -> int:
+        written.append(path)
+        # As a disc fills up within a file.
+        size = whole(path, content[: None if len(written) < 8 else 3])
+        if len(written) == 8:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return size
+
+    monkeypatch.setattr(Path, "write_bytes", until_full)
+    assert "cannot be written: No space left on device" in mistake("init", tmp_path / "rig")
+    assert [path for path in (tmp_path / "rig").rglob("*") if path.is_file()] == []
+    assert len(written) == 8
 
 
 def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys):

@@ -2,7 +2,7 @@
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -58,6 +58,8 @@ _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 # Among this many frames on either side, at least one should have been read without delay.
 _NEIGHBOURS = 12
+# Four frames. A board gives ten values a second, a loop of the paper's two.
+_LOAD_PAUSE_S = 2.0
 # Of one period: so much higher are the stamps after a frame that is missing. One that is late does not count.
 _LEAST_MISSING = 0.8
 # Fewer frames after a gap, at the end, may all be late.
@@ -316,6 +318,7 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
             _check_whole(stream.unix_s)
         load, streams, sure = _loop_times(load, streams, remarks)
     load = _valid_load(load, remarks)
+    remarks += _missing_load(load.unix_s)
     arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in one.unix_s] for side, one in streams.items()}
     middles = {side: frame_middles(one) for side, one in arrivals.items()}
     remarks += [_missing(side, one) for side, one in arrivals.items() if pauses(one)]
@@ -462,6 +465,17 @@ def _missing(side: str, arrivals_ns: Sequence[int]) -> str:
         f"Frames of the {side} side are missing in {counted(len(found), 'place')}, for up to {longest_s:.1f} s: the "
         "board or its program paused."
     )
+
+
+def _missing_load(stamps_s: FloatArray) -> Iterator[str]:
+    """Yield the remark on load values that are missing, where there is one."""
+    pauses_s = np.diff(stamps_s)
+    pauses_s = pauses_s[pauses_s > _LOAD_PAUSE_S]
+    if len(pauses_s):
+        yield (
+            f"Load values are missing in {counted(len(pauses_s), 'place')}, for up to {pauses_s.max():.1f} s: frames "
+            "there have no torque."
+        )
 
 
 def _loop_clock(stamps_s: FloatArray) -> tuple[float, float] | None:

@@ -445,3 +445,14 @@ def test_a_frame_that_was_copied_is_refused(repeats, tmp_path):
         UserError, match=rf"right\.mat: row 22 is a copy of the row above, .* \({number} in all\): remove"
     ):
         import_mat([tmp_path / "right.mat"], tmp_path / "a.mcap")
+
+
+def test_missing_load_values_are_named(tmp_path):
+    seconds = np.arange(0, 60, 0.1)
+    kept = seconds[(seconds < 20) | (seconds > 38)]
+    frames = stream_table(110, 1024)
+    savemat(tmp_path / "device.mat", {"Right_Data": np.column_stack([frames[:, 0], 0.5 * np.ones((110, 1024))])})
+    savemat(tmp_path / "load.mat", {"Load_Data": np.column_stack([DATENUM + kept / 86400, np.sin(kept)])})
+    result = import_mat([tmp_path / "device.mat", tmp_path / "load.mat"], tmp_path / "a.mcap")
+    missing = [one for one in result.remarks if one.startswith("Load values are missing in 1 place, for up to 18.")]
+    assert len(missing) == 1

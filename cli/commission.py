@@ -40,7 +40,9 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from shearloop.cli.terminal import print_result
+    from shearloop.daemon.commissioning import commissioning_of
     from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.rig import open_settings
     from shearloop.tools.commission.context import Counts
     from shearloop.tools.commission.operator import Operator
     from shearloop.tools.commission.procedure import commission
@@ -56,8 +58,13 @@ def run(args: argparse.Namespace) -> int:
             order = devices.order
         operator = Operator(terminal.answer, terminal.say, order)
         report, page = commission(config, args.config, args.out, operator, counts, args.stages)
-    written = f"{label}{args.out} and {page} are written."
-    print_result(report.model_dump(mode="json", exclude_none=True), [written], as_json=args.json)
+        sentences = [f"{label}{args.out} and {page} are written."]
+        settings = open_settings(config)
+        if settings is not None:
+            named = config.model_copy(update={"commissioned": args.out})
+            if allowed := commissioning_of(named, settings).sentence:
+                sentences.append(f"{label}With `commissioned: {args.out}`, {allowed}.")
+    print_result(report.model_dump(mode="json", exclude_none=True), sentences, as_json=args.json)
     return 0 if report.passed else 1
 
 

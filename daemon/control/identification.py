@@ -193,8 +193,9 @@ def _refuse_bad(fit: _Fit, torque_nm: FloatArray, noise_nm: float, stiffness_sha
     lost, lost_std = _lost_at_rest(fit, torque_nm, noise_nm)
     if lost > max(_SLIP_SHARE * abs(stiffness) * turned, 3.5 * lost_std):
         raise IdentifyError(
-            f"identify: back at its first angle the torque is {lost:.3g} N·m lower than before; the tool slipped in "
-            f"the grip, so grip harder or turn less than {turned:.2g} rad"
+            f"identify: back at its first angle the torque is {lost:.3g} N·m lower than before: the tool slipped in "
+            f"the grip (grip harder, or turn less than {turned:.2g} rad), or the torque itself errs by as much (drive "
+            "by the load cell, or calibrate the fingertip better)"
         )
     if stiffness <= 0.0 or std > stiffness_share * stiffness:
         raise NotYetKnownError(

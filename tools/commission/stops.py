@@ -133,6 +133,14 @@ class StraightMove:
         return sum(one * (at - home) for one, at, home in zip(axis, here, self._home[:3], strict=True))
 
 
+def rising_speeds(speeds_rad_per_s: Sequence[float], fastest_rad_per_s: float) -> list[float]:
+    """Return rising speeds within the robot's limit, which is the last where one is above it.
+
+    The report allows the largest speed at which every layer passed.
+    """
+    return sorted({min(speed, fastest_rad_per_s) for speed in speeds_rad_per_s})
+
+
 def measure(context: Context) -> Measured:
     """Return the stage's lines, the largest speed at which every layer passed, and the largest angle to rest."""
     context.confirm()
@@ -140,7 +148,7 @@ def measure(context: Context) -> Measured:
     passed_rad_per_s, largest_rad = 0.0, 0.0
     limits = context.settings.limits
     fastest = limits.wrist_speed_rad_per_s.inner
-    speeds = [speed for speed in context.counts.speeds_rad_per_s if speed <= fastest]
+    speeds = rising_speeds(context.counts.speeds_rad_per_s, fastest)
     for speed in speeds:
         stops, found = _all_layers(context, WristTurn(context, speed))
         lines += found

@@ -23,7 +23,7 @@ from shearloop.tools.commission.limits import EMULATED, REAL
 from shearloop.tools.commission.motion import SIGMAS, Turn, judge_noise
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.rtde import judge_clock, judge_samples
-from shearloop.tools.commission.stops import Stop, judge_stops
+from shearloop.tools.commission.stops import Stop, judge_stops, rising_speeds
 from shearloop.tools.commission.tap import frame_step_s, judge_clocks, load_step_s
 from shearloop.tools.commission.tool import Held, judge_signs, judge_twists
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
@@ -365,3 +365,11 @@ def test_what_a_rig_without_boards_cannot_measure_is_noted_and_raises_no_torque(
     assert [line.what for line in of_tool.lines] == ["tool and spring"]
     assert {line.verdict for line in (*of_boards.lines, *of_tool.lines)} == {"noted"}
     assert (of_boards.supplies, of_tool.supplies) == (NOTHING_SUPPLIED, NOTHING_SUPPLIED)
+
+
+@pytest.mark.parametrize(
+    ("fastest", "tested"),
+    [(0.2, [0.05, 0.2]), (0.45, [0.05, 0.2, 0.45]), (0.5, [0.05, 0.2, 0.5]), (1.0, [0.05, 0.2, 0.5]), (0.03, [0.03])],
+)
+def test_stops_are_tested_up_to_the_robots_own_limit(fastest, tested):
+    assert rising_speeds((0.05, 0.2, 0.5), fastest) == tested

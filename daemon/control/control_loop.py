@@ -67,6 +67,8 @@ class _GrippedTool:
     """What the loop knows of the tool between the fingers."""
 
     grip: Grip = NO_GRIP
+    # Whether an earlier process has closed it: the pendant may have gripped the same tool again, as far closed.
+    is_earlier: bool = False
     # Why the object is of another grip than the last one that was known.
     another: str = ""
     # When the latest grip, release or tare ended, until each torque has been measured since, or should have been.
@@ -244,7 +246,7 @@ class ControlLoop:
 
     def restore_grip(self, grip: Grip, on_judged: OnJudged) -> None:
         """Take the grip that a process before this one has closed, until the gripper shows whether it still has it."""
-        self._gripped.grip, self._on_judged = grip, on_judged
+        self._gripped.grip, self._gripped.is_earlier, self._on_judged = grip, True, on_judged
 
     @property
     def held(self) -> str | None:
@@ -254,6 +256,8 @@ class ControlLoop:
             return None
         known = force_n is not None and gripper.others_requests == self._others_requests
         force = f"with at most {force_n:g} N" if known else "with an unknown force"
+        if known and self._gripped.is_earlier:
+            force += " unless it was gripped again before this daemon began"
         return f"{gripper.fingers}, {force}"
 
     @property
@@ -427,6 +431,7 @@ class ControlLoop:
         still_held = gripper is not None and gripper.holding
         self._gripped = _GrippedTool(
             grip=before.grip if still_held else NO_GRIP,
+            is_earlier=before.is_earlier,
             another=before.another,
             unmeasured_since_ns=t_ns,
             expected=expected,
@@ -553,7 +558,7 @@ class ControlLoop:
         if isinstance(action, GripStep):
             # A process that dies while the fingers close leaves this force behind.
             force_n = max(gripped.grip.force_n or 0.0, action.force_n)
-            gripped.grip, gripped.another = Grip(origin_rad, force_n), ""
+            gripped.grip, gripped.is_earlier, gripped.another = Grip(origin_rad, force_n), False, ""
             gripper = self.inputs.gripper
             gripped.tightens = gripper is not None and gripper.holding and not isinstance(action, Opening)
         if isinstance(action, IdentifyStep):

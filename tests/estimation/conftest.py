@@ -1,5 +1,6 @@
 """A rig that is played by formulas: fingertips with a pattern of their own, a gel that creeps, a one-sided lever."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -75,9 +76,16 @@ IDLE, TURN, REST = 20, 6, 5
 
 
 def elastic(
-    *grips: int, idle: int = IDLE, rest: int = REST, begins_gripped: bool = False, seed: int = 0
+    *grips: int,
+    idle: int = IDLE,
+    rest: int = REST,
+    begins_gripped: bool = False,
+    seed: int = 0,
+    turns: Sequence[float] = (-1.0, 0.5, 1.0),
 ) -> FrameSeries:
     """Return grips of so many twists in turn, in both directions, with idle frames around each grip.
+
+    The twists go through `turns`, in 0.1 N·m, again and again.
 
     The torque follows the twist at once, as on a rig without a lever. With `rest` 0 each twist begins as the grip
     closes, and the next one as the last ends.
@@ -85,7 +93,7 @@ def elastic(
     angles = np.concatenate([np.linspace(0, 1, TURN), np.ones(TURN), np.linspace(1, 0, TURN), np.zeros(rest)])
     closed: list[FloatArray] = []
     for number, n_twists in enumerate(grips):
-        twists = [sign * angles for sign in np.resize([-1.0, 0.5, 1.0], n_twists)]
+        twists = [sign * angles for sign in np.resize(turns, n_twists)]
         closed += [
             np.full(0 if begins_gripped and not number else idle, np.nan),
             np.concatenate([np.zeros(rest), *twists]),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from shearloop.estimation import TRUSTED, fit
 from shearloop.estimation.motion_fit import (
     MEMORY_EDGES,
     MOST_DIRECTIONS,
@@ -12,6 +13,7 @@ from shearloop.estimation.motion_fit import (
     twists_left_out,
 )
 from shearloop.estimation.ridge import CensoredRidge, Ridge
+from tests.estimation.conftest import elastic, follow, judged
 
 LAYOUT = Layout(len(MEMORY_EDGES) - 1, 2, 3)
 TWIST = [0.0, 0.0, 0.0, 0.0, 0.0, 0.02, 0.05, 0.04, 0.0, 0.0]
@@ -93,3 +95,18 @@ def test_a_mean_of_ridges_predicts_the_mean():
     members = [Ridge.fit(rows[part], values[part], 0.1) for part in (slice(0, 20), slice(20, 40))]
     mean = np.mean([one.predict(rows) for one in members], axis=0)
     np.testing.assert_allclose(mean_ridge(members).predict(rows), mean)
+
+
+@pytest.mark.parametrize("rest", [1, 5])
+def test_twists_that_alternate_do_not_teach_their_order(rest):
+    """The motion over 10 s tells which twist comes next; the gel's position tells the torque."""
+    learnt = [elastic(12, 12, rest=rest, turns=(0.5, -0.5, 1.0, -1.0))]
+    calibration = fit("motion_regression", learnt, "rig", timing=TRUSTED)
+    others = elastic(3, rest=10, turns=(1.0,), seed=3)
+    found = judged(follow(calibration, others), others)
+    assert found.rmse < 0.005
+    assert found.coverage > 0.95
+
+
+def test_a_gel_that_drifts_is_read_by_its_motion(motion_calibration):
+    assert not motion_calibration.estimator.temporal.uses_position

@@ -29,6 +29,7 @@ from shearloop.daemon.sd_notify import notify
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.sensors import build_sensors, open_sessions
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH, HealthReporter, Reporter, Supervisor, Task, TaskFacts
+from shearloop.daemon.torques import LatestTorques
 from shearloop.printable import printable
 
 if TYPE_CHECKING:
@@ -87,12 +88,17 @@ class Daemon:
             self.health = HealthReporter(self.publisher, self.supervisor, clock, config.emulated, config.name)
             self.rig: Rig | None = None
             self._experiment: ConfiguredExperiment | None = None
+            torques = LatestTorques()
             if robot is not None:
                 self._build_rig(config, *robot, clock)
             else:
-                self.sensors = build_sensors(config, self.publisher, clock, self.recorder, open_sessions(config))
+                sessions = open_sessions(config)
+                self.sensors = build_sensors(config, self.publisher, clock, self.recorder, sessions, torques)
+            tare_refusal = torques.tare_refusal if self.rig is None else self.rig.control_loop.tare_refusal
+            self.health.refusals["tare"] = tare_refusal
+            report = partial(self._report, clock)
             self.commands = Commands(
-                self.rig, self.sensors, self._experiment, self.health, self.ending, partial(self._report, clock)
+                self.rig, self.sensors, self._experiment, self.health, self.ending, tare_refusal, report
             )
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)
@@ -126,11 +132,7 @@ class Daemon:
         )
         if self.rig.commissioning is not None:
             self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
-        self.health.refusals |= {
-            "tare": self.rig.control_loop.tare_refusal,
-            "start": self.rig.runner.start_refusal,
-            "release": self.rig.runner.release_refusal,
-        }
+        self.health.refusals |= {"start": self.rig.runner.start_refusal, "release": self.rig.runner.release_refusal}
         if config.experiment is not None:
             daemon_end = self.ending if config.stop_when_done else None
             self._experiment = ConfiguredExperiment(

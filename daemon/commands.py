@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
@@ -32,6 +32,13 @@ ARGUMENTS: Mapping[str, Mapping[str, type]] = {
 STOP_DELAY_S = 0.05
 
 
+class TareRefusal(Protocol):
+    """Says why no zero may be taken now."""
+
+    def __call__(self, *, confirmed: bool = False) -> str | None:
+        """Return why not, or None; `confirmed`: the operator says that nothing is loaded."""
+
+
 class Answered(NamedTuple):
     """A command's name and request, and why it was refused, or None."""
 
@@ -52,6 +59,8 @@ class Commands:
     experiment: "ConfiguredExperiment | None"
     health: HealthReporter
     daemon_end: asyncio.Event
+    # Why no zero may be taken now, of the control loop or of the sensors alone.
+    tare_refusal: TareRefusal
     # Receives each answered command, except questions.
     report: Callable[["Answered"], None] = lambda _: None
 
@@ -166,8 +175,7 @@ class Commands:
         if source is not None and not (isinstance(source, str) and source in sensors):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(sensors)}")
         names = list(sensors) if source is None else [source]
-        if self.rig is not None:
-            _refuse_if(self.rig.control_loop.tare_refusal(confirmed=bool(request.get("confirmed"))))
+        _refuse_if(self.tare_refusal(confirmed=bool(request.get("confirmed"))))
         for name in names:
             sensors[name].tare()
         return {"taring": names}

@@ -1,7 +1,7 @@
 """What sensors and control loop exchange: torques with their sources, zeros, and known torques."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -10,6 +10,9 @@ from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
 # The paper's ten frames take 5.4 s.
 LONGEST_TARE_S = 30.0
+# A torque below this counts as drift: a tare needs no confirmation.
+LOADED_NM = 0.05
+CONFIRM_TARE = "take the load off, or confirm with `shearloop command tare --yes` that there is none"
 # The source of the robot's own torque.
 WRENCH = "wrench"
 
@@ -80,6 +83,42 @@ class SensorListener(Protocol):
 
     def torques_of(self, source: str) -> tuple[Sequence[int], Sequence[float]]:
         """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m."""
+
+
+class LatestTorques:
+    """The listener of sensors without a robot: it knows which of them is loaded."""
+
+    def __init__(self) -> None:
+        self._torques_nm: dict[str, float] = {}
+
+    def on_link(self, device: str, _sentence: str, *, up: bool) -> None:
+        """Forget the torque of a device that was lost."""
+        if not up:
+            self._torques_nm.pop(device, None)
+
+    def on_torque(self, torque: TorqueSample) -> None:
+        """Take a torque of any source."""
+        if torque.torque_nm is None:
+            self._torques_nm.pop(torque.source, None)
+        else:
+            self._torques_nm[torque.source] = torque.torque_nm
+
+    def torques_of(self, _source: str) -> tuple[Sequence[int], Sequence[float]]:
+        """Return no torques: nothing adapts a fingertip without a robot."""
+        return [], []
+
+    def tare_refusal(self, *, confirmed: bool = False) -> str | None:
+        """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
+        loaded = loaded_sentence(self._torques_nm)
+        return f"{loaded}, which would become the zero; {CONFIRM_TARE}" if loaded and not confirmed else None
+
+
+def loaded_sentence(torques_nm: Mapping[str, float | None]) -> str:
+    """Return which source measures a load that does not come from its drift, or an empty string."""
+    for name, torque_nm in torques_nm.items():
+        if torque_nm is not None and abs(torque_nm) > LOADED_NM:
+            return f"{name} measures {torque_nm:+.3f} N·m"
+    return ""
 
 
 class Tareable(Protocol):

@@ -30,10 +30,8 @@ from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDe
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import Compute, WristController, at_once
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.torques import TorqueSample, TorqueSource
+from shearloop.daemon.torques import CONFIRM_TARE, TorqueSample, TorqueSource, loaded_sentence
 
-# A torque below this counts as drift: a tare needs no confirmation.
-LOADED_NM = 0.05
 # An `adapt` step compares the fingertip with the torques of this time.
 ADAPTED_OVER_S = 600.0
 
@@ -345,32 +343,31 @@ class ControlLoop:
             return f"{held}, and its torque would become the zero; open the gripper first (`shearloop command release`)"
         if confirmed:
             return None
-        cure = "take the load off, or confirm with `shearloop command tare --yes` that there is none"
         if (uncertain := self._why_uncertain()) is not None:
-            return f"{uncertain}; {cure}"
-        if (loaded := self._loaded()) is not None:
-            return f"{loaded}, which would become the zero; {cure}"
+            return f"{uncertain}; {CONFIRM_TARE}"
+        if loaded := self._loaded():
+            return f"{loaded}, which would become the zero; {CONFIRM_TARE}"
         return None
 
     def _why_no_tare_step(self) -> str | None:
         """Return why an experiment cannot take a zero now, or None: nobody is there to confirm it."""
         if (reason := self.held or self._why_uncertain()) is not None:
             return f"{reason}; put a `release` before it"
-        if (loaded := self._loaded()) is not None:
+        if loaded := self._loaded():
             cure = "if nothing is loaded, `shearloop command tare --yes` takes the zero before the start"
             return f"{loaded}, which would become the zero; take the load off ({cure})"
         return None
 
-    def _loaded(self) -> str | None:
-        """Return which sensor measures a load that does not come from its drift, or None."""
+    def _loaded(self) -> str:
+        """Return which sensor measures a load that does not come from its drift, or an empty string."""
         # Fingers that are known to be empty do not load a fingertip: its torque is drift.
         empty = "gripper" in self._watched.required and self.inputs.gripper is not None
-        for name, latest in self.inputs.torques.items():
-            source = self._sources[name]
-            judged = not source.from_robot and not (empty and source.warm_up_s)
-            if judged and latest.torque_nm is not None and abs(latest.torque_nm) > LOADED_NM:
-                return f"{name} measures {latest.torque_nm:+.3f} N·m"
-        return None
+        judged = {
+            name: latest.torque_nm
+            for name, latest in self.inputs.torques.items()
+            if not self._sources[name].from_robot and not (empty and self._sources[name].warm_up_s)
+        }
+        return loaded_sentence(judged)
 
     def start_refusal(self) -> str | None:
         """Return why no experiment at all can begin, or None."""
@@ -423,26 +420,28 @@ class ControlLoop:
             self._on_judged = None
         # What the last experiment knew of the tool may be wrong by now.
         self.wrist.reset()
-        # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
-        gripper = self.inputs.gripper
-        expected = "gripper" not in watched.required or (gripper is not None and gripper.holding)
-        before = self._gripped
-        # The angle since the grip belongs to the grip: a tool that is still held keeps it.
-        still_held = gripper is not None and gripper.holding
-        self._gripped = _GrippedTool(
-            grip=before.grip if still_held else NO_GRIP,
-            is_earlier=before.is_earlier,
-            another=before.another,
-            unmeasured_since_ns=t_ns,
-            expected=expected,
-            release_error=before.release_error,
-        )
+        self._gripped = self._gripped_at_start(t_ns)
         self._acknowledged = self._later_stop = ""
         self.runs += 1
         # Until the first tick, the status must not show the end of the previous run.
         phase, activity = self.experiment.phase.value, self.experiment.command.activity
         self.status = LoopStatus(phase, activity, WristCommand(), SafetyDecision(Response.NOTE))
         return None
+
+    def _gripped_at_start(self, t_ns: int) -> _GrippedTool:
+        """Return what is known of the tool as an experiment begins."""
+        before, gripper = self._gripped, self.inputs.gripper
+        # The angle since the grip belongs to the grip: a tool that is still held keeps it.
+        still_held = gripper is not None and gripper.holding
+        return _GrippedTool(
+            grip=before.grip if still_held else NO_GRIP,
+            is_earlier=before.is_earlier,
+            another=before.another,
+            unmeasured_since_ns=t_ns,
+            # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
+            expected="gripper" not in self._watched.required or still_held,
+            release_error=before.release_error,
+        )
 
     def pause(self) -> str | None:
         """Stand still until `resume`; return None, or why not."""

@@ -253,7 +253,7 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
     """The file is replaced between the question and its answer, by another or by what the question showed."""
     runner, path = Runner(), write(folder / "one.yaml", VALID)
     subject = rig(folder, runner)
-    start = Commands(subject, None, None, None, asyncio.Event()).handlers()["start"]
+    start = Commands(subject, None, None, None, asyncio.Event(), None).handlers()["start"]
     asked = await start({"experiment": str(path), "ask": True})
     assert asked["question"].startswith("Start 'one'?")
     before = path.read_bytes()

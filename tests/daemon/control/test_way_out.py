@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.commands import Commands
-from shearloop.daemon.control.control_loop import LOADED_NM, ControlLoop
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
 from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, first_motion
@@ -20,7 +20,7 @@ from shearloop.daemon.control.plan import plan_of, speeds_of
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
-from shearloop.daemon.torques import WRENCH, TorqueSample
+from shearloop.daemon.torques import LOADED_NM, WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import MODELS
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
@@ -98,7 +98,7 @@ async def test_a_release_of_another_tool_than_the_one_in_the_question_opens_noth
 
 def commands_of(cell: Cell) -> Any:
     rig = SimpleNamespace(runner=cell.runner, control_loop=cell.control_loop)
-    return Commands(rig, None, None, None, asyncio.Event()).handlers()
+    return Commands(rig, None, None, None, asyncio.Event(), rig.control_loop.tare_refusal).handlers()
 
 
 @pytest.mark.parametrize("hand", [{"holding": True}, {"uncertain": True}, {"moving": True}])
@@ -402,7 +402,7 @@ async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
         await cell.cycles(1)
         ends = asyncio.Event()
         rig = SimpleNamespace(control_loop=cell.control_loop, runner=cell.runner)
-        commands = Commands(rig, SimpleNamespace(), None, SimpleNamespace(), ends)
+        commands = Commands(rig, SimpleNamespace(), None, SimpleNamespace(), ends, None)
         stop_command = commands.handlers()["stop"]
         for _ in range(2):
             reply = await stop_command({})

@@ -131,7 +131,9 @@ def test_foreign_messages_are_an_error(tmp_path):
 
 def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
     server = pytest.importorskip("shearloop.daemon.web.server", reason="the live page needs the extra `view`")
-    handled = Commands(rig=None, sensors=None, experiment=None, health=None, daemon_end=None).handlers()
+    handled = Commands(
+        rig=None, sensors=None, experiment=None, health=None, daemon_end=None, tare_refusal=None
+    ).handlers()
     assert set(DAEMON_COMMANDS) == set(handled) == {*server.NEEDS_TOKEN, STATUS, STOP, EXPERIMENTS}
 
 
@@ -144,6 +146,7 @@ async def test_commands_are_told_with_their_answer_and_questions_are_not():
         experiment=None,
         health=SimpleNamespace(tasks=dict, rig="bench"),
         daemon_end=asyncio.Event(),
+        tare_refusal=lambda **_: None,
         report=lambda answered: reported.append((answered.name, answered.refusal)),
     ).handlers()
     await handlers["tare"]({"by": "ann"})
@@ -180,7 +183,9 @@ def test_who_sends_a_command_is_one_printable_line(by, shown):
     ],
 )
 async def test_an_argument_that_a_command_does_not_have_moves_nothing(name, request_, why):
-    commands = Commands(rig=None, sensors=None, experiment=None, health=None, daemon_end=asyncio.Event())
+    commands = Commands(
+        rig=None, sensors=None, experiment=None, health=None, daemon_end=asyncio.Event(), tare_refusal=None
+    )
     with pytest.raises(CommandRefusedError, match=re.escape(why)):
         await commands.handlers()[name]({"command": name, "by": "ann", **request_})
 
@@ -188,14 +193,14 @@ async def test_an_argument_that_a_command_does_not_have_moves_nothing(name, requ
 async def test_tare_is_refused_during_an_experiment():
     tared: list[str] = []
     refusal: list[str | None] = ["the experiment 'hold' is running, and a new zero would change its torques"]
-    loop = SimpleNamespace(tare_refusal=lambda *, confirmed: None if confirmed else refusal[0])
     sensors = {name: SimpleNamespace(tare=partial(tared.append, name)) for name in ("right", "load_cell")}
     commands = Commands(
-        rig=SimpleNamespace(control_loop=loop),
+        rig=None,
         sensors=SimpleNamespace(tareable=sensors),
         experiment=None,
         health=None,
         daemon_end=asyncio.Event(),
+        tare_refusal=lambda *, confirmed: None if confirmed else refusal[0],
     )
     tare = commands.handlers()["tare"]
     for request_ in ({}, {"source": "load_cell"}):

@@ -259,6 +259,14 @@ class ControlLoop:
         return f"{gripper.fingers}, {force}"
 
     @property
+    def _unknown_grip(self) -> str:
+        """Why the grip of what is held is not known; empty where it is, or nothing is held."""
+        gripped = self._gripped
+        if gripped.another or gripped.grip.known or self.held is None or self._on_judged is not None:
+            return gripped.another
+        return "no experiment of this rig has closed its fingers on it"
+
+    @property
     def may_still_hold(self) -> str | None:
         """The object between the fingers, or why a tool that was gripped may still be there; None without one."""
         if self.held is not None or self._gripped.grip.force_n is None:
@@ -505,8 +513,8 @@ class ControlLoop:
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
             if self.safety.stopped and self.held is not None:
                 found.append(Fault(FaultCode.TOOL_GRIPPED, self.held))
-            if gripped.another:
-                found.append(Fault(FaultCode.GRIP_UNKNOWN, gripped.another))
+            if unknown := self._unknown_grip:
+                found.append(Fault(FaultCode.GRIP_UNKNOWN, unknown))
             if arm is not None and arm.enabled_by_start:
                 found = [fault for fault in found if fault.code is not FaultCode.ROBOT_BLOCKED]
             return self._ended(self.safety.report(found))

@@ -229,8 +229,8 @@ class FaultCode(Enum):
     )
     GRIP_UNKNOWN = Rule(
         Response.NOTE,
-        "the gripper holds something else than in the last grip that is known: {detail}.",
-        "Angle, force and zeros of that grip are not used. Check what it holds; `shearloop command release --yes` "
+        "the gripper holds something in a grip that is not known: {detail}.",
+        "Angle, force and zeros of an earlier grip are not used. Check what it holds; `shearloop command release --yes` "
         "opens the gripper, and the object drops.",
     )
     DAEMON_ENDED = Rule(

@@ -274,6 +274,10 @@ def test_a_tool_that_was_exchanged_while_the_gripper_was_away_is_another_one(res
     rig.force_n = 0.0
     rig.run(0.1)
     assert FaultCode.GRIP_UNKNOWN.value.kind not in restarted.told
+    # Another tool, in a grip of the pendant: it is as unknown as the one before.
+    rig.force_n = 60.0
+    rig.run(0.1)
+    assert FaultCode.GRIP_UNKNOWN.value.kind in restarted.told
 
 
 async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_one():
@@ -383,3 +387,13 @@ async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it
     following.cancel()
     await asyncio.gather(following, return_exceptions=True)
     assert read_memory(FILES.states[0]).running == "test"
+
+
+def test_an_unknown_grip_is_still_unknown_after_a_restart():
+    rig = Rig(new_loop())
+    rig.force_n, rig.width_mm = 60.0, 30.0
+    for one in (rig, after_restart(rig)):
+        one.run(0.1)
+        faults = [fault.sentence for fault in one.control_loop.status.decision.faults]
+        said = "the gripper holds something in a grip that is not known: no experiment of this rig has closed"
+        assert any(sentence.startswith(said) for sentence in faults)

@@ -218,7 +218,7 @@ class Rig:
         limits = robot.settings.limits if robot is not None else None
         motion = first_motion(file, self.experiments.gripper, speeds_of(limits))
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)
-        note = self.control_loop.activation_note(file)
+        note = self.control_loop.held_note(file) + self.control_loop.activation_note(file)
         text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
         held = self.control_loop.release_stakes() if self.control_loop.may_hold() else ()
         # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.

@@ -330,6 +330,15 @@ class ControlLoop:
             return ""
         return f" Before step {first[0]} the gripper is activated: its fingers open and close once, and a tool drops."
 
+    def held_note(self, file: ExperimentFile) -> str:
+        """Return what is held as the first step moves, for the operator who starts; or an empty string."""
+        held = self.held
+        if held is None or first_motion_before_grip(file) is None:
+            return ""
+        unknown = self._unknown_grip
+        angle = f" The grip is not known ({unknown}): its angle counts from the start." if unknown else ""
+        return f" At present {held}.{angle}"
+
     def _why_no_activation(self, file: ExperimentFile) -> str | None:
         """Return why an experiment must not activate the gripper, or None: its grip would drop what is held."""
         first, held = first_gripper_step(file), self.may_still_hold

@@ -230,8 +230,8 @@ class FaultCode(Enum):
     GRIP_UNKNOWN = Rule(
         Response.NOTE,
         "the gripper holds something in a grip that is not known: {detail}.",
-        "Angle, force and zeros of an earlier grip are not used. Check what it holds; `shearloop command release --yes` "
-        "opens the gripper, and the object drops.",
+        "Angle, force and zeros of an earlier grip are not used. Check what it holds; "
+        "`shearloop command release --yes` opens the gripper, and the object drops.",
     )
     DAEMON_ENDED = Rule(
         _KEEP, "the daemon ended: {detail}.", "Look at the rig, then `shearloop command unlock` allows the next start."

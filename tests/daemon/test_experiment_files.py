@@ -235,7 +235,9 @@ class Runner:
 
 def rig(folder: Path, runner: Runner) -> Rig:
     return Rig(
-        SimpleNamespace(warm_up_s=0.0, runs=1, activation_note=lambda _: "", may_hold=lambda: False),
+        SimpleNamespace(
+            warm_up_s=0.0, runs=1, activation_note=lambda _: "", held_note=lambda _: "", may_hold=lambda: False
+        ),
         runner,
         {},
         ExperimentFiles((folder,)),

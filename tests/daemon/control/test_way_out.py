@@ -318,6 +318,24 @@ def test_a_new_grip_has_an_angle_of_its_own():
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
 
 
+def test_the_question_before_a_turn_says_what_is_held():
+    rig = held()
+    twist = {"do": "twist", "angles_rad": [0.1]}
+    file, after_release = (
+        ExperimentFile.model_validate({"name": "test", "steps": steps})
+        for steps in ([twist], [{"do": "release"}, twist])
+    )
+    note = rig.control_loop.held_note(file)
+    assert note.startswith(
+        " At present its fingers hold something 140.0 mm wide, with an unknown force. The grip is not"
+    )
+    assert note.endswith("its angle counts from the start.")
+    assert rig.control_loop.held_note(after_release) == ""
+    rig.force_n = 0.0
+    rig.step()
+    assert rig.control_loop.held_note(file) == ""
+
+
 @pytest.mark.parametrize("sense", [{}, {"uncertain": True}])
 def test_no_straight_move_begins_with_a_tool_that_is_or_may_be_gripped(sense):
     rig = held(**sense)

@@ -28,7 +28,7 @@ from shearloop.drivers.ur.messages import (
     tool_axis,
 )
 from shearloop.drivers.ur.settings import Six
-from shearloop.errors import ActionError
+from shearloop.errors import ActionError, NotBegunError
 
 # A release is tried for 5 s and takes up to 2 s; systemd kills a service 10 s after it asked for the end.
 RELEASED_WITHIN_S = 7.0
@@ -195,7 +195,12 @@ class ActionExecutor:
                     raise ActionError("no gripper is configured; add a `gripper` section to the configuration")
                 # After a failure, such as a lost connection, the fingers may still move.
                 self.fingers_move = True
-                await self.gripper.grip(action)
+                try:
+                    await self.gripper.grip(action)
+                except NotBegunError:
+                    # A halt would only make the gripper forget that it holds something.
+                    self.fingers_move = False
+                    raise
                 self.fingers_move = False
             case TareStep():
                 loop, longest_s = asyncio.get_running_loop(), action.timeout_s or LONGEST_TARE_S

@@ -520,8 +520,8 @@ class ControlLoop:
             found.append(Fault(FaultCode.NOT_RELEASED, gripped.release_error))
         if running is None:
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
-            if self.safety.stopped and self.held is not None:
-                found.append(Fault(FaultCode.TOOL_GRIPPED, self.held))
+            if self.safety.stopped and (gripped_still := self.may_still_hold) is not None:
+                found.append(Fault(FaultCode.TOOL_GRIPPED, gripped_still))
             if unknown := self._unknown_grip:
                 found.append(Fault(FaultCode.GRIP_UNKNOWN, unknown))
             if arm is not None and arm.enabled_by_start:

@@ -224,7 +224,7 @@ class FaultCode(Enum):
     )
     TOOL_GRIPPED = Rule(
         Response.NOTE,
-        "the gripper still holds something: {detail}.",
+        "a tool is still gripped, or may be: {detail}.",
         "Secure it. Then `shearloop command release --yes` opens the gripper, and the object drops.",
     )
     GRIP_UNKNOWN = Rule(

@@ -21,3 +21,7 @@ def require(module: str, extra: str, what: str) -> None:
 def missing(module: str | None, extra: str, what: str) -> UserError:
     """Return the error of a module that is not installed, with the command that installs it for this Python."""
     return UserError(f"{what} needs {module}: `{sys.executable} -m pip install 'shearloop[{extra}]'`")
+
+
+class NotBegunError(ActionError):
+    """An action that was refused before anything moved."""

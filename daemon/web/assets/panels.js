@@ -227,7 +227,8 @@ export function gripperPanel(link) {
   put(byId("gripper-width"), link.number(message, "width_mm", 1));
   put(byId("gripper-object"), said.object);
   const spread = said.diameter_std_mm == null ? "" : ` ± ${number(said.diameter_std_mm, 1)}`;
-  put(byId("gripper-diameter"), said.diameter_mm == null ? "nothing held" : `${number(said.diameter_mm, 1)}${spread} ${link.unit("gripper.state", "diameter_mm")}`);
+  const nothing = said.object === "unknown" ? "not known" : said.object === "moving" ? "–" : "nothing held";
+  put(byId("gripper-diameter"), said.diameter_mm == null ? nothing : `${number(said.diameter_mm, 1)}${spread} ${link.unit("gripper.state", "diameter_mm")}`);
   put(byId("gripper-current"), link.number(message, "current_ma", 0));
 }
 

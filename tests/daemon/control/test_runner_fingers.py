@@ -9,6 +9,7 @@ import pytest
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import Stop
+from shearloop.errors import NotBegunError
 from tests.daemon.control.cell import GRIP, Cell, driven, experiment, no_tick
 
 
@@ -46,6 +47,16 @@ async def test_a_grip_that_has_failed_stops_the_fingers_once(error):
         await cell.cycles(20)
         await cell.runner.halt_and_wait()
         assert cell.gripper.asked == ["grip", "halt", "grip"]
+
+
+async def test_a_grip_that_was_refused_halts_nothing():
+    """A halted gripper does not know any more whether it holds something."""
+    async with driven() as cell:
+        cell.gripper.error = NotBegunError("a grip to 20 mm would open them and drop it")
+        await cell.start(GRIP)
+        await cell.cycles(20)
+        assert "would open them" in cell.control_loop.experiment.stop_reason
+        assert cell.gripper.asked == ["grip"]
 
 
 async def test_a_stop_after_a_grip_leaves_the_fingers_alone():

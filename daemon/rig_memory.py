@@ -18,6 +18,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.robot_files import RobotFiles
+from shearloop.daemon.torques import LOAD_CELL
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import Six
@@ -109,6 +110,7 @@ class RigMemory:
         if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:
             self._calibrated_zero, self._load_restored = cell.calibration.tare_counts, zero
             cell.tare(zero)
+            self.loop.on_zero(LOAD_CELL)
         if self.robot is not None and remembered.wrench_zero is not None:
             self._wrench_restored = True
             self.robot.restore_wrench_zero(remembered.wrench_zero)
@@ -139,6 +141,7 @@ class RigMemory:
             and cell.calibration.tare_counts == self._load_restored
         ):
             cell.tare(self._calibrated_zero)
+            self.loop.on_zero(LOAD_CELL, known=False)
         if self.robot is not None and self._wrench_restored:
             self.robot.forget_wrench_zero()
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging.messages import stop_times, with_unit
-from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.daemon.torques import LOAD_CELL
 from shearloop.printable import printable
 from shearloop.words import counted, times
 

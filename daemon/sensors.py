@@ -14,10 +14,10 @@ from shearloop.daemon.recorder.recorder import Recorder
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask
 from shearloop.daemon.sensing.fingertip_task import ToolHolder
 from shearloop.daemon.sensing.frame_pairing import FramePairing
-from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
+from shearloop.daemon.sensing.load_cell_task import LoadCellTask
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, refuse_emulated_calibrations
 from shearloop.daemon.supervisor import Task
-from shearloop.daemon.torques import LONGEST_TARE_S, SensorListener, Tareable
+from shearloop.daemon.torques import LOAD_CELL, LONGEST_TARE_S, SensorListener, Tareable
 from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import EitKit

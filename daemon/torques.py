@@ -13,8 +13,8 @@ LONGEST_TARE_S = 30.0
 # A torque below this counts as drift: a tare needs no confirmation.
 LOADED_NM = 0.05
 CONFIRM_TARE = "take the load off, or confirm with `shearloop command tare --yes` that there is none"
-# The source of the robot's own torque.
-WRENCH = "wrench"
+# The sources of the robot's own torque, and of the load cell's.
+WRENCH, LOAD_CELL = "wrench", "load_cell"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,8 @@ class TorqueSource:
     fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
     the first torque; 0 for a source that measures without a grip. `has_gain`: an `adapt` step can correct its gain.
     `noise_nm`: the torque is known to this; such a source supervises beyond it only, and drives nothing gentler.
-    `only_sign`: of the only torques that it measures, 0 for both; a torque of the other sign may read as 0.
+    `needs_zero`: its torques count from a zero that somebody has to take. `only_sign`: of the only torques that it
+    measures, 0 for both; a torque of the other sign may read as 0.
     """
 
     name: str
@@ -61,6 +62,7 @@ class TorqueSource:
     warm_up_s: float = 0.0
     has_gain: bool = False
     noise_nm: float = 0.0
+    needs_zero: bool = False
     only_sign: int = 0
 
     def fresh_s(self, config: LoopConfig) -> float:
@@ -80,6 +82,9 @@ class SensorListener(Protocol):
 
     def on_torque(self, torque: TorqueSample) -> None:
         """Take a torque of any source."""
+
+    def on_zero(self, source: str, *, known: bool = True) -> None:
+        """Take that a source's zero is known from now on, or is not."""
 
     def torques_of(self, source: str) -> tuple[Sequence[int], Sequence[float]]:
         """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m."""
@@ -102,6 +107,9 @@ class LatestTorques:
             self._torques_nm.pop(torque.source, None)
         else:
             self._torques_nm[torque.source] = torque.torque_nm
+
+    def on_zero(self, source: str, *, known: bool = True) -> None:
+        """Ignore a zero: nothing turns that could need it."""
 
     def torques_of(self, _source: str) -> tuple[Sequence[int], Sequence[float]]:
         """Return no torques: nothing adapts a fingertip without a robot."""

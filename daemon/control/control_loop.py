@@ -22,6 +22,7 @@ from shearloop.daemon.control.experiment_schema import (
     TareStep,
     first_gripper_step,
     first_motion_before_grip,
+    first_turn_before_tare,
 )
 from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
 from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
@@ -135,6 +136,8 @@ class ControlLoop:
         self._later_stop = ""
         # Awaits the gripper's first state that shows whether a grip of an earlier process is the present one.
         self._on_judged: OnJudged | None = None
+        # The sources whose zero has been taken since this process began, or is kept from the one before.
+        self._zeroed: set[str] = set()
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
 
@@ -156,6 +159,10 @@ class ControlLoop:
         self.inputs.add_torque(torque)
         if (wrist := self._wrists.get(torque.source)) is not None:
             wrist.on_torque(torque)
+
+    def on_zero(self, source: str, *, known: bool = True) -> None:
+        """Take that a source's zero is known from now on, or is not."""
+        (self._zeroed.add if known else self._zeroed.discard)(source)
 
     def torques_of(self, source: str) -> tuple[Sequence[int], Sequence[float]]:
         """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m."""
@@ -349,6 +356,17 @@ class ControlLoop:
             "drops: take it out with `shearloop command release --yes`, or put a `release` before it"
         )
 
+    def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
+        """Return why no tool can be turned by a torque without a zero, or None: every limit would be off by it."""
+        number = first_turn_before_tare(file)
+        if number is None or not driving.needs_zero or driving.name in self._zeroed:
+            return None
+        return (
+            f"the {driving.name} has no zero since this daemon began, so that its torques and limits may be off by any "
+            f"load: put a `tare` before step {number} ({file.steps[number - 1].do}), or, with nothing gripped, "
+            "`shearloop command tare`"
+        )
+
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
         if (running := self.running) is not None:
@@ -417,8 +435,8 @@ class ControlLoop:
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
             return " ".join(refusals)
-        if (dropped := self._why_no_activation(file)) is not None:
-            return dropped
+        if (reason := self._why_no_activation(file) or self._why_no_zero(file, driving)) is not None:
+            return reason
         number, uncertain = first_motion_before_grip(file), self._why_uncertain()
         if number is not None:
             step = file.steps[number - 1]

@@ -282,14 +282,30 @@ def first_motion_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
+def first_turn_before_tare(file: ExperimentFile) -> int | None:
+    """Return the number, from 1, of the first step that turns a tool before any tare, or None."""
+    for number, step in enumerate(file.steps, 1):
+        if isinstance(step, TareStep):
+            return None
+        if isinstance(step, TwistingStep):
+            return number
+    return None
+
+
 def first_gripper_step(file: ExperimentFile) -> tuple[int, GripperStep] | None:
     """Return the first step that moves the fingers, with its number from 1, or None."""
     return next(((n, step) for n, step in enumerate(file.steps, 1) if isinstance(step, GripperStep)), None)
 
 
-def opens_to_mm(step: ReleaseStep, gripper: GripperModel | None) -> float:
-    """Return the width to which a step opens the fingers of a gripper; as it is written where none is known."""
-    return step.width_mm if gripper is None else min(step.width_mm, gripper.stroke_mm)
+def opens_to(step: ReleaseStep, gripper: GripperModel | None) -> str:
+    """Return how far a step opens the fingers of a gripper, in words; as it is written where none is known.
+
+    A width that would not let a held tool go opens them fully.
+    """
+    stroke_mm = LARGEST_STROKE_MM if gripper is None else gripper.stroke_mm
+    if step.width_mm >= stroke_mm:
+        return f"to {stroke_mm:g} mm"
+    return f"to {step.width_mm:g} mm, or fully where they hold something about as wide or wider"
 
 
 def first_motion(file: ExperimentFile, gripper: GripperModel | None = None, speeds: Speeds = AS_ASKED) -> str:
@@ -313,7 +329,7 @@ def motion_of(step: Step, gripper: GripperModel | None, speeds: Speeds) -> str |
         case GripStep():
             return f"the fingers close to {step.width_mm:g} mm, or onto a tool with at most {step.force_n:g} N"
         case ReleaseStep():
-            return f"the fingers open to {opens_to_mm(step, gripper):g} mm, and a tool in them drops"
+            return f"the fingers open {opens_to(step, gripper)}, and a tool in them drops"
         case TurnToStep():
             return f"the wrist turns to {step.angle_rad:g} rad, {speeds.turning(step.speed_rad_per_s)}"
         case TwistStep():

@@ -9,6 +9,7 @@ from typing import Any
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_check import Turn, reversals, turns
 from shearloop.daemon.control.experiment_schema import AS_ASKED, Demand, ExperimentFile, Speeds, Step, demands
+from shearloop.daemon.torques import LOAD_CELL
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
@@ -137,6 +138,7 @@ def plan_of(
     # Whether the next step that twists waits for the first torques of a grip or a tare.
     waits = False
     opened = False
+    untared = steps.first_turn_before_tare(file) if file.torque_source == LOAD_CELL else None
     expected = zip(file.steps, turns(file), demands(file.steps, speeds), strict=True)
     for number, (step, turn, needs) in enumerate(expected, 1):
         duration_s = needs.takes_s
@@ -149,6 +151,8 @@ def plan_of(
             waits = False
         if step.timeout_s is not None and needs.takes_s > step.timeout_s:
             notes.append(f"its timeout_s of {step.timeout_s:g} s may stop it before its end")
+        if number == untared:
+            notes.append("no `tare` comes before it: it is refused unless this daemon has taken a zero")
         if number in back:
             notes.insert(0, back[number])
         opened = opened or isinstance(step, steps.ReleaseStep)
@@ -189,7 +193,7 @@ def _words(step: Step, gripper: GripperModel | None) -> str:
             to = f"closes the fingers to {step.width_mm:g} mm, or onto a tool, at {step.speed_mm_per_s:g} mm/s"
             return f"{to} with up to {step.force_n:g} N; {empty}"
         case steps.ReleaseStep():
-            return f"opens the fingers to {steps.opens_to_mm(step, gripper):g} mm: a held tool drops"
+            return f"opens the fingers {steps.opens_to(step, gripper)}: a held tool drops"
         case steps.TareStep():
             return "takes the zero of every torque sensor; nothing turns"
         case steps.IdentifyStep():

@@ -10,10 +10,9 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
-from shearloop.daemon.torques import SensorListener, TorqueSample
+from shearloop.daemon.torques import LOAD_CELL, SensorListener, TorqueSample
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 
-LOAD_CELL = "load_cell"
 # Two seconds at 10.9 Hz.
 ZERO_SAMPLES = 22
 # An HX711 settles within four conversions (data sheet, "Output settling time": 400 ms at 10 a second, 50 ms at 80).
@@ -117,6 +116,8 @@ class LoadCellTask:
         if len(self._zeroing) == ZERO_SAMPLES:
             self._board.tare(sum(self._zeroing) / ZERO_SAMPLES)
             self._zeroing = None
+            if self._loop is not None:
+                self._loop.on_zero(LOAD_CELL)
 
 
 def load_message(sample: LoadSample) -> LoadTorque:

@@ -12,8 +12,7 @@ from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
-from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
-from shearloop.daemon.torques import TorqueSource
+from shearloop.daemon.torques import LOAD_CELL, TorqueSource
 from shearloop.errors import UserError
 from shearloop.estimation import Calibration, Session
 from shearloop.estimation.defaults import MAX_GAP_S
@@ -133,7 +132,7 @@ def torque_sources(
         if (skin := skin_torque_source(config.skin)) is not None:
             sources[skin.name] = skin
     if config.load_cell is not None:
-        sources[LOAD_CELL] = TorqueSource(name=LOAD_CELL, period_s=1.0 / config.load_cell.rate_hz)
+        sources[LOAD_CELL] = TorqueSource(name=LOAD_CELL, period_s=1.0 / config.load_cell.rate_hz, needs_zero=True)
     return sources
 
 

@@ -231,6 +231,18 @@ def test_an_experiment_without_its_steps_is_still_one(tmp_path, capsys):
         assert f"{path}:1: step: is not a known key; did you mean steps?" in capsys.readouterr().err
 
 
+def test_a_turn_without_a_zero_is_named():
+    steps = [GRIP, TIGHTEN]
+    for source, before, named in (
+        ("load_cell", [], True),
+        ("right", [], False),
+        ("load_cell", [{"do": "tare"}], False),
+    ):
+        content = {"name": "one", "torque_source": source, "steps": [*before, *steps]}
+        notes = plan_of(ExperimentFile.model_validate(content)).steps[-1].notes
+        assert any("no `tare` comes before it" in note for note in notes) is named
+
+
 def test_a_timeout_that_may_end_a_step_early_is_named():
     file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "release", "timeout_s": 1}, GRIP]})
     first, second = plan_of(file).steps

@@ -37,11 +37,12 @@ from shearloop.daemon.sensing.fingertip_messages import (
 )
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
 from shearloop.daemon.sensing.frame_pairing import FramePairing
-from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
+from shearloop.daemon.sensing.load_cell_task import load_message
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session
 from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
 from shearloop.daemon.sensing.snapshots import SnapshotError, restored
 from shearloop.daemon.sensors import load_cell_calibration
+from shearloop.daemon.torques import LOAD_CELL
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent

@@ -622,3 +622,28 @@ def test_a_wrist_angle_that_is_not_a_number_turns_nothing():
     rig.wrist_rad = float("nan")
     rig.sense(0.0)
     assert rig.control_loop.tick(rig.t_ns).wrist_rad_per_s == 0.0
+
+
+def test_no_torque_without_a_zero_turns_a_tool():
+    cell = replace(LOAD, needs_zero=True)
+    rig = Rig(ControlLoop(CONFIG, {"right": EIT, "load_cell": cell}, ("gripper", "right")))
+    rig.run(0.6)
+    hold, twist = {"do": "hold_torque", "torque_nm": 0.1}, {"do": "twist", "angles_rad": [0.1]}
+
+    def refusal(*steps: dict[str, Any], source: str = "load_cell") -> str:
+        file = ExperimentFile.model_validate({"name": "one", "torque_source": source, "steps": list(steps)})
+        said = rig.control_loop.start(file, rig.t_ns) or ""
+        stop(rig)
+        rig.control_loop.acknowledge()
+        return said
+
+    for steps in ([GRIP, twist], [GRIP, {"do": "identify"}, hold]):
+        assert "the load_cell has no zero since this daemon began" in refusal(*steps)
+        assert "put a `tare` before step 2" in refusal(*steps)
+        assert refusal({"do": "tare"}, *steps) == ""
+        assert refusal(*steps, source="right") == ""
+    assert refusal(GRIP, {"do": "release"}) == ""
+    rig.control_loop.on_zero("load_cell")
+    assert refusal(GRIP, twist) == ""
+    rig.control_loop.on_zero("load_cell", known=False)
+    assert refusal(GRIP, twist) != ""

@@ -369,14 +369,20 @@ def test_the_first_motion_is_told_before_a_start(steps, said):
 
 
 @pytest.mark.parametrize(
-    ("step", "model", "opens_mm"),
-    [({}, None, 140), ({}, "Hand-E", 50), ({}, "2F-85", 85), ({"width_mm": 30}, "Hand-E", 30)],
+    ("step", "model", "opens"),
+    [
+        ({}, None, "140 mm"),
+        ({}, "Hand-E", "50 mm"),
+        ({}, "2F-85", "85 mm"),
+        ({"width_mm": 60}, "Hand-E", "50 mm"),
+        ({"width_mm": 30}, "Hand-E", "30 mm, or fully where they hold something about as wide or wider"),
+    ],
 )
-def test_the_first_motion_opens_no_further_than_the_configured_gripper(step, model, opens_mm):
+def test_the_first_motion_opens_no_further_than_the_configured_gripper(step, model, opens):
     file = ExperimentFile.model_validate({"name": "test", "steps": [{"do": "release", **step}]})
     gripper = MODELS[model] if model is not None else None
-    assert f"the fingers open to {opens_mm} mm, and" in first_motion(file, gripper)
-    assert f"opens the fingers to {opens_mm} mm:" in "\n".join(plan_of(file, gripper=gripper).sentences())
+    assert f"the fingers open to {opens}, and" in first_motion(file, gripper)
+    assert f"opens the fingers to {opens}:" in "\n".join(plan_of(file, gripper=gripper).sentences())
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ GRIP = {"do": "grip", "width_mm": 5, "force_n": 60, "speed_mm_per_s": 150}
 TWIST = {"do": "twist", "angles_rad": [0.05], "speed_rad_per_s": 0.2, "hold_s": 0.1}
 RELEASE = {"do": "release", "width_mm": 30}
 # By the boards' pace. A twist waits for the torques of several frames, which would take long at the rated pace.
-STEPS = {1: (GRIP, RELEASE), 30: (GRIP, TWIST, RELEASE)}
+STEPS = {1: (GRIP, RELEASE), 30: ({"do": "tare"}, GRIP, TWIST, RELEASE)}
 IDLE_FRAMES = 3
 TAKEN = f"taking the idle frame, {IDLE_FRAMES} of {IDLE_FRAMES}"
 # A busy computer takes several times as long as an idle one.

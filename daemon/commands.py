@@ -146,7 +146,8 @@ class Commands:
         confirmed, sentence = bool(request.get("confirmed")), rig.control_loop.unlock_question()
         if sentence:
             question = Question(
-                f"Unlock? {_capital(sentence)}.", digest_of("unlock", *rig.control_loop.release_stakes())
+                f"Unlock? {_capital(sentence)}.",
+                digest_of("unlock", *rig.occasion(), *rig.control_loop.release_stakes()),
             )
             _refuse_if(rig.runner.unlock_refusal())
             if not confirmed:
@@ -160,7 +161,9 @@ class Commands:
         rig = required_rig(self.rig)
         _refuse_if(rig.runner.release_refusal())
         sentence = rig.control_loop.release_question()
-        question = Question(f"Release? {_capital(sentence)}.", digest_of("release", *rig.control_loop.release_stakes()))
+        question = Question(
+            f"Release? {_capital(sentence)}.", digest_of("release", *rig.occasion(), *rig.control_loop.release_stakes())
+        )
         if request.get("ask"):
             return dict(question.facts)
         if not request.get("confirmed"):

@@ -1,5 +1,6 @@
 """The rig: builds robot, gripper and control loop from the configuration."""
 
+import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -194,7 +195,10 @@ class Rig:
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
         if digest is not None and digest != (question := self._question_of(experiment)).digest:
-            changed = "the file, or what its start does to a held tool, has changed since its plan was shown"
+            changed = (
+                "the file, or what its start does to a held tool, has changed since its plan was shown, or something "
+                "was stopped or run"
+            )
             raise QuestionChangedError(f"{path}: {changed}; look at the plan again", question)
         try:
             if self.memory is not None and (reason := await self.memory.begins(experiment.file.name)) is not None:
@@ -222,7 +226,11 @@ class Rig:
         text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
         held = self.control_loop.release_stakes() if self.control_loop.may_hold() else ()
         # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.
-        return Question(text, digest_of(experiment.data, text, *sentences, *held), sentences)
+        return Question(text, digest_of(experiment.data, text, *sentences, *self.occasion(), *held), sentences)
+
+    def occasion(self) -> tuple[str, ...]:
+        """Return what changes with each process, stop and run: a question from before it asks for another moment."""
+        return f"process {os.getpid()}", f"{self.runner.stop_count} stops", f"{self.control_loop.runs} runs"
 
     def state(self) -> Mapping[str, Any]:
         """Return what `status` shows of the control loop."""

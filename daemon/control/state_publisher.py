@@ -117,6 +117,8 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     status, experiment = control_loop.status, control_loop.experiment
     driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
+    if latest is not None and now_ns - latest.t_ns > 1e9 * control_loop.wrist.source.fresh_s(control_loop.config):
+        latest = None
     controller = control_loop.wrist.controller
     tool = control_loop.wrist.tool
     return LoopState(

@@ -279,6 +279,11 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
     with pytest.raises(CommandRefusedError, match="a held tool"):
         await start({"experiment": str(path), "digest": asked_again["digest"]})
     subject.control_loop.may_hold = lambda: False
+    # Somebody has pressed STOP since.
+    runner.stop_count = 1
+    with pytest.raises(CommandRefusedError, match="has changed since its plan was shown"):
+        await start({"experiment": str(path), "digest": asked["digest"]})
+    runner.stop_count = 0
     await start({"experiment": str(path), "digest": asked["digest"]})
     # Who asks nothing names the file as it is.
     await start({"experiment": str(path)})

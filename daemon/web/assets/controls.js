@@ -159,7 +159,7 @@ function refusals(link) {
   const health = link.get("health")?.content;
   if (!loop) {
     const waiting = "loop" in (health?.tasks ?? {});
-    return { ...all(waiting ? "the loop has not begun" : "the configuration has no robot"), tare: "" };
+    return { ...all(waiting ? "the loop has not begun" : "the configuration has no robot"), tare: health?.tare_refusal ?? "" };
   }
   const { phase, response } = loop;
   const stopped = response.startsWith("stop");
@@ -171,7 +171,7 @@ function refusals(link) {
     start: busy || (stopped ? "unlock first" : health?.start_refusal ?? ""),
     pause: idle || (phase === "paused" ? "it is paused" : ""),
     resume: idle || (phase === "running" ? "nothing is paused" : ""),
-    unlock: locked ? "" : "nothing is locked",
+    unlock: busy || (locked ? "" : "nothing is locked"),
     release: busy || (link.get("gripper.state") ? health?.release_refusal ?? "" : "no gripper answers"),
   };
 }

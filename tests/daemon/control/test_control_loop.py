@@ -647,3 +647,12 @@ def test_no_torque_without_a_zero_turns_a_tool():
     assert refusal(GRIP, twist) == ""
     rig.control_loop.on_zero("load_cell", known=False)
     assert refusal(GRIP, twist) != ""
+
+
+def test_a_torque_that_has_fallen_silent_is_not_published_as_present():
+    rig = holding("load_cell")
+    assert rig.control_loop.pause() is None
+    assert loop_state(rig.control_loop, 0.0, rig.t_ns).torque_nm == pytest.approx(0.1, abs=0.02)
+    rig.silent.add("load_cell")
+    rig.run(3)
+    assert loop_state(rig.control_loop, 0.0, rig.t_ns).torque_nm is None

@@ -97,7 +97,7 @@ async def test_a_release_of_another_tool_than_the_one_in_the_question_opens_noth
 
 
 def commands_of(cell: Cell) -> Any:
-    rig = SimpleNamespace(runner=cell.runner, control_loop=cell.control_loop)
+    rig = SimpleNamespace(runner=cell.runner, control_loop=cell.control_loop, occasion=lambda: ())
     return Commands(rig, None, None, None, asyncio.Event(), rig.control_loop.tare_refusal).handlers()
 
 

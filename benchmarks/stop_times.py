@@ -204,7 +204,7 @@ class RunningRig:
         twist = {"do": "twist", "angles_rad": [-FAR_RAD if wrist_rad > 0 else FAR_RAD], "absolute": True,
                  "speed_rad_per_s": SPEED_RAD_PER_S, "return_to_start": False}  # fmt: skip
         grip = {"do": "grip", "width_mm": 5, "speed_mm_per_s": 250, "force_n": 60}
-        return [{"do": "release", "width_mm": 30}, grip, twist]
+        return [{"do": "release", "width_mm": 30}, {"do": "tare", "timeout_s": 30}, grip, twist]
 
     def _run(
         self, steps: Callable[[], list[dict[str, Any]]], condition: Callable[[str, Mapping[str, Any]], bool]

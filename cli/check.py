@@ -1,6 +1,7 @@
 """`shearloop check`: check a configuration and the files it names, or an experiment, and print its plan."""
 
 import argparse
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,6 +55,8 @@ def _is_experiment(content: object) -> bool:
 
     if not isinstance(content, dict) or "steps" in content:
         return isinstance(content, dict)
+    if get_close_matches("steps", map(str, content), 1, 0.75):
+        return True
     of_experiments, of_configurations = (
         sum(key in model.model_fields for key in content) for model in (ExperimentFile, DaemonConfig)
     )

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         if settings is not None:
             named = config.model_copy(update={"commissioned": args.out})
             if allowed := commissioning_of(named, settings).sentence:
-                sentences.append(f"{label}With `commissioned: {args.out}`, {allowed}.")
+                sentences.append(f"{label}With `commissioned: {args.out.resolve()}`, {allowed}.")
     print_result(report.model_dump(mode="json", exclude_none=True), sentences, as_json=args.json)
     return 0 if report.passed else 1
 

@@ -129,7 +129,7 @@ def _without_controls(_logger: Any, _name: str, event: structlog.typing.EventDic
 
 @dataclass(frozen=True, slots=True)
 class LinkReporter:
-    """Logs the losses and returns of one device, and hands them to the control loop, where there is one."""
+    """Logs the losses and returns of one device, and hands them to what listens to the sensors."""
 
     device: str
     loop: "SensorListener | None" = None

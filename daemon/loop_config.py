@@ -14,10 +14,7 @@ class LoopConfig(ConfigModel):
     disagreement_nm: float = Field(default=0.05, gt=0, le=5, description="largest difference of two torque sources")
     max_innovation_nm: float = Field(default=0.08, gt=0, le=5, description="largest error of the expected torque")
     max_offset_drift_nm: float = Field(
-        default=0.06,
-        gt=0,
-        le=5,
-        description="drift at a fixed angle since the first torque step, pauses included: slip",
+        default=0.06, gt=0, le=5, description="drift at one angle from what `identify` found, pauses included: slip"
     )
     wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14, description="largest wrist speed of the loop")
     stale_after_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")

@@ -1,9 +1,9 @@
 """The rig: builds robot, gripper and control loop from the configuration."""
 
-import os
+import secrets
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -182,6 +182,8 @@ class Rig:
     # None where the emulated devices end with the daemon.
     memory: RigMemory | None = None
     commissioning: Commissioning | None = None
+    # Of this process: in a container, each has the same number.
+    token: str = field(default_factory=lambda: secrets.token_hex(8))
 
     async def start(self, path: Path, digest: str | None = None) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file.
@@ -222,15 +224,19 @@ class Rig:
         limits = robot.settings.limits if robot is not None else None
         motion = first_motion(file, self.experiments.gripper, speeds_of(limits))
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)
-        note = self.control_loop.held_note(file) + self.control_loop.activation_note(file)
+        note = self.control_loop.activation_note(file)
         text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
         held = self.control_loop.release_stakes() if self.control_loop.may_hold() else ()
         # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.
-        return Question(text, digest_of(experiment.data, text, *sentences, *self.occasion(), *held), sentences)
+        digest = digest_of(experiment.data, text, *sentences, *self.occasion(), *held)
+        # The width in this note wavers.
+        return Question(text + self.control_loop.held_note(file), digest, sentences)
 
     def occasion(self) -> tuple[str, ...]:
         """Return what changes with each process, stop and run: a question from before it asks for another moment."""
-        return f"process {os.getpid()}", f"{self.runner.stop_count} stops", f"{self.control_loop.runs} runs"
+        loop = self.control_loop
+        stops = f"{self.runner.stop_count} stops, {loop.safety.acknowledged} acknowledged"
+        return self.token, stops, f"{loop.runs} runs"
 
     def state(self) -> Mapping[str, Any]:
         """Return what `status` shows of the control loop."""

@@ -18,7 +18,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.robot_files import RobotFiles
-from shearloop.daemon.torques import LOAD_CELL
+from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import Six
@@ -110,7 +110,6 @@ class RigMemory:
         if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:
             self._calibrated_zero, self._load_restored = cell.calibration.tare_counts, zero
             cell.tare(zero)
-            self.loop.on_zero(LOAD_CELL)
         if self.robot is not None and remembered.wrench_zero is not None:
             self._wrench_restored = True
             self.robot.restore_wrench_zero(remembered.wrench_zero)
@@ -119,11 +118,13 @@ class RigMemory:
         """Keep the zeros of the grip before, or take them back where the gripper does not have that grip any more."""
         zeros = [
             name
-            for name, restored in (("load cell", self._calibrated_zero is not None), ("wrench", self._wrench_restored))
+            for name, restored in ((LOAD_CELL, self._calibrated_zero is not None), (WRENCH, self._wrench_restored))
             if restored
         ]
         log = structlog.get_logger()
         if not why_another:
+            for name in zeros:
+                self.loop.on_zero(name)
             if zeros:
                 log.info("the zeros of the present grip are kept", of=zeros)
             return
@@ -141,7 +142,6 @@ class RigMemory:
             and cell.calibration.tare_counts == self._load_restored
         ):
             cell.tare(self._calibrated_zero)
-            self.loop.on_zero(LOAD_CELL, known=False)
         if self.robot is not None and self._wrench_restored:
             self.robot.forget_wrench_zero()
 
@@ -170,12 +170,20 @@ class RigMemory:
         """Write the present state, unless the file has it already."""
         state = Remembered.of(self.loop)
         state = replace(state, running=state.running or self.starting)
-        if self.load_cell is not None and self.loop.may_hold():
+        if self.load_cell is not None and self.loop.may_hold() and self._knows_load_zero:
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)
         if self.robot is not None and self.loop.may_hold():
             state = replace(state, wrench_zero=self.robot.wrench_zero)
         await self.save(state)
+
+    @property
+    def _knows_load_zero(self) -> bool:
+        """Whether the load cell's zero was taken by somebody: else it is its calibration's, of another day."""
+        # A restored one counts once the gripper has shown its grip, and is kept until then.
+        cell = self.load_cell
+        restored = cell is not None and cell.calibration.tare_counts == self._load_restored
+        return self.loop.has_zero(LOAD_CELL) or restored
 
     async def save(self, state: Remembered) -> None:
         """Write a state, unless the file has it already; a failure is logged once, and tried again."""

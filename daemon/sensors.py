@@ -79,7 +79,7 @@ def build_sensors(
     loop: SensorListener | None = None,
     gripper: ToolHolder | None = None,
 ) -> Sensors:
-    """Return all sensors, which publish, are recorded, and drive the control loop, where there is one.
+    """Return all sensors, which publish, are recorded, and are passed on to the `loop`.
 
     The gripper gives the held tool, and receives the fingertips' diameters.
     """

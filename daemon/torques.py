@@ -75,7 +75,7 @@ class TorqueSource:
 
 
 class SensorListener(Protocol):
-    """Takes what all sensors report, where there is a robot: the control loop."""
+    """Takes what all sensors report: the control loop, or `LatestTorques` without a robot."""
 
     def on_link(self, device: str, sentence: str, *, up: bool) -> None:
         """Take the return or the loss of a device, with a sentence."""
@@ -96,10 +96,10 @@ class LatestTorques:
     def __init__(self) -> None:
         self._torques_nm: dict[str, float] = {}
 
-    def on_link(self, device: str, _sentence: str, *, up: bool) -> None:
-        """Forget the torque of a device that was lost."""
+    def on_link(self, _device: str, _sentence: str, *, up: bool) -> None:
+        """Forget all torques where a device is lost, `combined` among them: those of the others come again at once."""
         if not up:
-            self._torques_nm.pop(device, None)
+            self._torques_nm.clear()
 
     def on_torque(self, torque: TorqueSample) -> None:
         """Take a torque of any source."""

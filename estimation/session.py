@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from shearloop.estimation.bank_match import BankMatch, BankMatcher, BankSearch
 
 _REPEATED_FRAME = ("the board sent the same frame again",)
-_REPEATED_SIDE = ("one fingertip's frame is the one before: the next came late, or the board sent it again",)
+_REPEATED_SIDE = ("a fingertip's frame is the one before: the next came late, or the board sent it again",)
 FINGERS_MOVED = "the fingers moved while this frame was acquired"
 _NO_IDLE_FRAME = ("no idle frame: it took too long, or something was gripped; tare again with nothing gripped",)
 _NEVER_IDLE = "it was not seen untouched since the start; if it holds a tool, release it, tare, and grip again"

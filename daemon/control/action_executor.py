@@ -200,6 +200,7 @@ class ActionExecutor:
                 except NotBegunError:
                     # A halt would only make the gripper forget that it holds something.
                     self.fingers_move = False
+                    self.control_loop.on_grip_refused()
                     raise
                 self.fingers_move = False
             case TareStep():

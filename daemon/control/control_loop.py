@@ -70,6 +70,8 @@ class _GrippedTool:
     is_earlier: bool = False
     # Why the object is of another grip than the last one that was known.
     another: str = ""
+    # These three before the present `grip` step, which may be refused.
+    before_closing: tuple[Grip, bool, str] | None = None
     # When the latest grip, release or tare ended, until each torque has been measured since, or should have been.
     unmeasured_since_ns: int | None = None
     # Whether a tool should be between the fingers.
@@ -227,6 +229,8 @@ class ControlLoop:
             self.wrist.reset()
         if not isinstance(action, TareStep | GripStep):
             return
+        if isinstance(action, TareStep):
+            self._zeroed.update(name for name, source in self._sources.items() if source.from_robot)
         # The tool was identified with another zero, or in another grip.
         self._forget_tool()
         gripped.unmeasured_since_ns = arm.t_ns if arm is not None else None
@@ -237,6 +241,12 @@ class ControlLoop:
                 gripped.grip = replace(gripped.grip, origin_rad=origin_rad, force_n=action.force_n)
             # An unexpected object is watched as well.
             gripped.expected = action.expect_object or (gripper is not None and gripper.holding)
+
+    def on_grip_refused(self) -> None:
+        """Take that the present `grip` step was refused before the fingers moved: what they hold is as it was."""
+        gripped = self._gripped
+        if gripped.before_closing is not None:
+            gripped.grip, gripped.is_earlier, gripped.another = gripped.before_closing
 
     def on_release_ended(self, error: str | None = None) -> None:
         """Take the end of the release after a stop, and why the gripper did not open, if it did not."""
@@ -269,7 +279,9 @@ class ControlLoop:
     def _unknown_grip(self) -> str:
         """Why the grip of what is held is not known; empty where it is, or nothing is held."""
         gripped = self._gripped
-        if gripped.another or gripped.grip.known or self.held is None or self._on_judged is not None:
+        # A turn gives a grip an angle, and only a `grip` step its force.
+        known = gripped.grip.force_n is not None
+        if gripped.another or known or self.held is None or self._on_judged is not None:
             return gripped.another
         return "no experiment of this rig has closed its fingers on it"
 
@@ -358,14 +370,19 @@ class ControlLoop:
 
     def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
         """Return why no tool can be turned by a torque without a zero, or None: every limit would be off by it."""
-        number = first_turn_before_tare(file)
-        if number is None or not driving.needs_zero or driving.name in self._zeroed:
+        number = first_turn_before_tare(file, holds=self.may_hold())
+        if number is None or not driving.needs_zero or self.has_zero(driving.name):
             return None
+        # A command tares sensors, and an experiment the robot's wrench, too.
+        command = "" if driving.from_robot else ", or send `shearloop command tare` with nothing gripped"
         return (
-            f"the {driving.name} has no zero since this daemon began, so that its torques and limits may be off by any "
-            f"load: put a `tare` before step {number} ({file.steps[number - 1].do}), or, with nothing gripped, "
-            "`shearloop command tare`"
+            f"no zero of the {driving.name} is known since this daemon began, so that its torques and limits may be "
+            f"off by any load: put a `tare` before step {number} ({file.steps[number - 1].do}){command}"
         )
+
+    def has_zero(self, source: str) -> bool:
+        """Return whether a source's zero was taken since this process began, or is kept from the one before."""
+        return source in self._zeroed
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
@@ -592,6 +609,7 @@ class ControlLoop:
         if isinstance(action, GripStep):
             # A process that dies while the fingers close leaves this force behind.
             force_n = max(gripped.grip.force_n or 0.0, action.force_n)
+            gripped.before_closing = gripped.grip, gripped.is_earlier, gripped.another
             gripped.grip, gripped.is_earlier, gripped.another = Grip(origin_rad, force_n), False, ""
             gripper = self.inputs.gripper
             gripped.tightens = gripper is not None and gripper.holding and not isinstance(action, Opening)

@@ -282,12 +282,17 @@ def first_motion_before_grip(file: ExperimentFile) -> int | None:
     return None
 
 
-def first_turn_before_tare(file: ExperimentFile) -> int | None:
-    """Return the number, from 1, of the first step that turns a tool before any tare, or None."""
+def first_turn_before_tare(file: ExperimentFile, *, holds: bool = False) -> int | None:
+    """Return the number, from 1, of the first step that turns a tool before any tare, or None.
+
+    `holds`: whether the gripper may hold one as the experiment begins.
+    """
     for number, step in enumerate(file.steps, 1):
         if isinstance(step, TareStep):
             return None
-        if isinstance(step, TwistingStep):
+        if isinstance(step, GripperStep):
+            holds = not isinstance(step, ReleaseStep)
+        if isinstance(step, TwistingStep) or (holds and isinstance(step, TurnToStep)):
             return number
     return None
 

@@ -77,7 +77,8 @@ class GripperTask:
         """Return the width that the fingers have to move to, None where they are open already; raises DriverError.
 
         A release never closes them, and lets go: fingers that may hold something open fully where the width is not well
-        above the present one. A grip never opens them: raises NotBegunError where something would drop.
+        above the present one. A grip never opens them: raises ActionError where something would drop, NotBegunError
+        where they rest.
         """
         state = await self.gripper.read()
         if isinstance(target, Opening):
@@ -91,7 +92,9 @@ class GripperTask:
         may_hold = state.object is not ObjectStatus.AT_TARGET
         may_hold = may_hold and state.width_mm < self.gripper.model.stroke_mm - OPEN_WITHIN_MM
         if may_hold and target.width_mm > state.width_mm:
-            raise NotBegunError(
+            # Fingers that another program moves have to be halted.
+            refused = ActionError if state.object is ObjectStatus.MOVING else NotBegunError
+            raise refused(
                 f"the fingers are {state.width_mm:.1f} mm apart and hold something, or may hold it, and a grip to "
                 f"{target.width_mm:g} mm would open them and drop it; put a `release` before it, or correct `width_mm`"
             )

@@ -40,7 +40,9 @@ STOPPED_AT_START = "it was stopped during its start"
 
 def wrench_source(rate_hz: float, noise_nm: float = 0.0) -> TorqueSource:
     """Return the torque source of a robot's wrench, from the robot's rate of states and the noise of the wrench."""
-    return TorqueSource(name=WRENCH, period_s=PUBLISH_EVERY / rate_hz, from_robot=True, noise_nm=noise_nm)
+    return TorqueSource(
+        name=WRENCH, period_s=PUBLISH_EVERY / rate_hz, from_robot=True, needs_zero=True, noise_nm=noise_nm
+    )
 
 
 class ControlLoopRunner:

@@ -9,7 +9,7 @@ from typing import Any
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_check import Turn, reversals, turns
 from shearloop.daemon.control.experiment_schema import AS_ASKED, Demand, ExperimentFile, Speeds, Step, demands
-from shearloop.daemon.torques import LOAD_CELL
+from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
@@ -138,7 +138,7 @@ def plan_of(
     # Whether the next step that twists waits for the first torques of a grip or a tare.
     waits = False
     opened = False
-    untared = steps.first_turn_before_tare(file) if file.torque_source == LOAD_CELL else None
+    untared = steps.first_turn_before_tare(file) if file.torque_source in (LOAD_CELL, WRENCH) else None
     expected = zip(file.steps, turns(file), demands(file.steps, speeds), strict=True)
     for number, (step, turn, needs) in enumerate(expected, 1):
         duration_s = needs.takes_s
@@ -152,7 +152,7 @@ def plan_of(
         if step.timeout_s is not None and needs.takes_s > step.timeout_s:
             notes.append(f"its timeout_s of {step.timeout_s:g} s may stop it before its end")
         if number == untared:
-            notes.append("no `tare` comes before it: it is refused unless this daemon has taken a zero")
+            notes.append("no `tare` comes before it: the start is refused unless a zero is known")
         if number in back:
             notes.insert(0, back[number])
         opened = opened or isinstance(step, steps.ReleaseStep)

@@ -314,6 +314,8 @@ class SafetyMonitor:
     def __init__(self, patience: float = 1.0) -> None:
         """`patience` is the factor on the longest holds; above 1 on an emulated rig alone."""
         self._patience = patience
+        # How many stops the operator has acknowledged.
+        self.acknowledged = 0
         # Hold timers of faults and of the wrist, and the faults that held it at the last judgement.
         self._held_ns: dict[str, int] = {}
         self._wrist_ns = 0
@@ -357,6 +359,7 @@ class SafetyMonitor:
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command; a fault that persists stops again at the next judgement."""
+        self.acknowledged += self.stopped
         self._stop = None
         self._reset_timers()
 

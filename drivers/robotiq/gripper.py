@@ -253,6 +253,9 @@ class RobotiqGripper:
                 raise messages.GripperFaultError(
                     f"{fault.sentence} An operator has to confirm that the fingers are clear."
                 )
+            if fault.code == _OVER_TEMPERATURE:
+                # It ends by itself, and an activation would open the fingers.
+                raise messages.GripperFaultError(fault.sentence)
             if not blocking_fault(readout):
                 return self._state(readout, t_ns)
         await self._write(messages.GripperAction.RESET)

@@ -236,7 +236,12 @@ class Runner:
 def rig(folder: Path, runner: Runner) -> Rig:
     return Rig(
         SimpleNamespace(
-            warm_up_s=0.0, runs=1, activation_note=lambda _: "", held_note=lambda _: "", may_hold=lambda: False
+            warm_up_s=0.0,
+            runs=1,
+            safety=SimpleNamespace(acknowledged=0),
+            activation_note=lambda _: "",
+            held_note=lambda _: "",
+            may_hold=lambda: False,
         ),
         runner,
         {},

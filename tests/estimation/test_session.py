@@ -313,7 +313,7 @@ def test_a_frame_that_a_board_sends_again_is_no_new_one(motion_calibration, side
     frozen[hung : hung + 30, sides] = frozen[hung, sides]
     estimates = follow(motion_calibration, replace(whole, channels=frozen))
     assert estimates[hung] == expected[hung]
-    said = "one fingertip's frame is the one before: the next came late, or the board sent it again"
+    said = "a fingertip's frame is the one before: the next came late, or the board sent it again"
     assert all(one.reasons == (said,) for one in estimates[hung + 1 : hung + 30])
     number = np.arange(len(whole.t_s))
     without = kept(whole, (number <= hung) | (number >= hung + 30))

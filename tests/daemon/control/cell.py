@@ -207,6 +207,8 @@ class Cell:
         self.control_loop = control_loop or ControlLoop(
             LoopConfig(), {WRENCH: source}, ("robot",), dead_tasks=self.died
         )
+        # As after a tare.
+        self.control_loop.on_zero(WRENCH)
         clock = StepClock(self.robot.bench)
         self.sensors: dict[str, Any] = {}
         self.runner = ControlLoopRunner(

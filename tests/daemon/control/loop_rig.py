@@ -22,8 +22,10 @@ GRIP = {"do": "grip", "width_mm": 10.0, "force_n": 60.0}
 CONFIG = LoopConfig()
 
 
-def new_loop() -> ControlLoop:
-    return ControlLoop(CONFIG, {"right": EIT, "load_cell": LOAD}, ("gripper", "right"))
+def new_loop(*, needs_zero: bool = False) -> ControlLoop:
+    """Return the loop of a fingertip and a load cell, which may need a zero."""
+    sources = {"right": EIT, "load_cell": replace(LOAD, needs_zero=needs_zero)}
+    return ControlLoop(CONFIG, sources, ("gripper", "right"))
 
 
 class Rig:

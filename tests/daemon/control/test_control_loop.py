@@ -625,8 +625,7 @@ def test_a_wrist_angle_that_is_not_a_number_turns_nothing():
 
 
 def test_no_torque_without_a_zero_turns_a_tool():
-    cell = replace(LOAD, needs_zero=True)
-    rig = Rig(ControlLoop(CONFIG, {"right": EIT, "load_cell": cell}, ("gripper", "right")))
+    rig = Rig(new_loop(needs_zero=True))
     rig.run(0.6)
     hold, twist = {"do": "hold_torque", "torque_nm": 0.1}, {"do": "twist", "angles_rad": [0.1]}
 
@@ -638,13 +637,20 @@ def test_no_torque_without_a_zero_turns_a_tool():
         return said
 
     for steps in ([GRIP, twist], [GRIP, {"do": "identify"}, hold]):
-        assert "the load_cell has no zero since this daemon began" in refusal(*steps)
+        assert "no zero of the load_cell is known since this daemon began" in refusal(*steps)
         assert "put a `tare` before step 2" in refusal(*steps)
         assert refusal({"do": "tare"}, *steps) == ""
         assert refusal(*steps, source="right") == ""
     assert refusal(GRIP, {"do": "release"}) == ""
+    # Before a grip a turn of the empty hand moves no tool; a tool that is held already may be turned by it.
+    turn = {"do": "turn_to", "angle_rad": 0.4}
+    assert refusal(turn) == ""
+    assert "step 2 (turn_to)" in refusal(GRIP, turn)
+    rig.force_n = 60.0
+    rig.run(0.1)
+    assert "step 1 (turn_to)" in refusal(turn)
     rig.control_loop.on_zero("load_cell")
-    assert refusal(GRIP, twist) == ""
+    assert refusal(GRIP, twist) == refusal(turn) == ""
     rig.control_loop.on_zero("load_cell", known=False)
     assert refusal(GRIP, twist) != ""
 
@@ -656,3 +662,30 @@ def test_a_torque_that_has_fallen_silent_is_not_published_as_present():
     rig.silent.add("load_cell")
     rig.run(3)
     assert loop_state(rig.control_loop, 0.0, rig.t_ns).torque_nm is None
+
+
+def test_a_refused_grip_leaves_an_unknown_grip_unknown():
+    rig = Rig(new_loop())
+    rig.force_n = 60.0
+    rig.run(0.6)
+    asked = {**GRIP, "force_n": 20.0}
+    started(rig, asked)
+    while not rig.begun:
+        rig.step()
+    rig.pending.clear()
+    rig.control_loop.on_grip_refused()
+    rig.control_loop.on_action_ended("a grip to 50 mm would open them and drop it")
+    rig.run(0.1)
+    assert "with an unknown force" in (rig.control_loop.held or "")
+    assert FaultCode.GRIP_UNKNOWN in [fault.code for fault in rig.control_loop.status.decision.faults]
+
+
+def test_a_turn_makes_no_grip_known():
+    rig = Rig(new_loop())
+    rig.force_n = 60.0
+    rig.run(0.6)
+    started(rig, {"do": "twist", "angles_rad": [0.05], "hold_s": 0.1}, torque_source="load_cell")
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE
+    rig.step()
+    assert FaultCode.GRIP_UNKNOWN in [fault.code for fault in rig.control_loop.status.decision.faults]

@@ -285,6 +285,7 @@ async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_on
     cell = load_cell()
     memory = RigMemory(FILES, rig.control_loop, cell)
     cell.tare(8321.5)
+    rig.control_loop.on_zero("load_cell")
     rig.run(2)
     await memory.save_present()
 
@@ -392,8 +393,45 @@ async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it
 def test_an_unknown_grip_is_still_unknown_after_a_restart():
     rig = Rig(new_loop())
     rig.force_n, rig.width_mm = 60.0, 30.0
+    rig.run(0.1)
+    # A turn gives it an angle, which is remembered.
+    started(rig, {"do": "twist", "angles_rad": [0.05], "hold_s": 0.1}, torque_source="load_cell")
+    rig.run(20)
+    rig.run(0.1)
+    assert Remembered.of(rig.control_loop).origin_rad is not None
     for one in (rig, after_restart(rig)):
-        one.run(0.1)
         faults = [fault.sentence for fault in one.control_loop.status.decision.faults]
         said = "the gripper holds something in a grip that is not known: no experiment of this rig has closed"
         assert any(sentence.startswith(said) for sentence in faults)
+
+
+def why_no_turn(rig: Rig) -> str:
+    """Return why a twist by the load cell cannot start."""
+    content = {"name": "one", "torque_source": "load_cell", "steps": [{"do": "twist", "angles_rad": [0.1]}]}
+    said = rig.control_loop.start(ExperimentFile.model_validate(content), rig.t_ns) or ""
+    rig.control_loop.stop("it is over", Fault(FaultCode.OPERATOR_STOP, ""))
+    rig.control_loop.acknowledge()
+    return said
+
+
+@pytest.mark.parametrize("tared", [False, True])
+async def test_only_a_zero_that_somebody_took_is_known_after_a_restart(tared):
+    """The pendant has gripped the tool: a zero that is the calibration's own is none of this rig's."""
+    before, cell = Rig(new_loop(needs_zero=True)), load_cell()
+    if tared:
+        cell.tare(8321.5)
+        before.control_loop.on_zero("load_cell")
+    before.force_n = 60.0
+    before.run(0.6)
+    await RigMemory(FILES, before.control_loop, cell).save_present()
+    after, cell = Rig(new_loop(needs_zero=True)), load_cell()
+    memory = RigMemory(FILES, after.control_loop, cell)
+    # Until the fingers rest, nobody knows whether it is the same grip.
+    after.hand, still = replace(after.hand, moving=True), after.hand
+    after.run(0.6)
+    assert "no zero of the load_cell" in why_no_turn(after)
+    await memory.save_present()
+    after.hand, after.force_n = still, 60.0
+    after.run(0.1)
+    assert (why_no_turn(after) == "") is tared
+    assert cell.calibration.tare_counts == (8321.5 if tared else 8000.0)

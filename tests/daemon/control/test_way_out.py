@@ -17,9 +17,10 @@ from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, first_motion
 from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.plan import plan_of, speeds_of
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
+from shearloop.daemon.rig import Rig as RigOfDaemon
 from shearloop.daemon.torques import LOADED_NM, WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import MODELS
@@ -96,8 +97,31 @@ async def test_a_release_of_another_tool_than_the_one_in_the_question_opens_noth
         assert cell.gripper.asked == []
 
 
+@pytest.mark.parametrize("between", ["an operator's stop", "a stop by a fault", "another process"])
+async def test_a_release_of_another_moment_than_its_question_opens_nothing(between):
+    async with with_gripper() as cell:
+        cell.hand = {"holding": True}
+        await cell.cycles(5)
+        asking = commands_of(cell)["release"]
+        asked = await asking({"ask": True})
+        if between == "an operator's stop":
+            cell.runner.stop(also_idle=True)
+        elif between == "a stop by a fault":
+            cell.control_loop.safety.stop(Fault(FaultCode.PROTECTIVE_STOP, "it met something"))
+        await cell.cycles(5)
+        cell.control_loop.acknowledge()
+        answering = commands_of(cell)["release"] if between == "another process" else asking
+        with pytest.raises(CommandRefusedError, match="changed since the question") as refused:
+            await answering({"confirmed": True, "digest": asked["digest"]})
+        assert cell.gripper.asked == []
+        # The question that comes with the refusal can be confirmed at once.
+        answered = asyncio.create_task(answering({"confirmed": True, "digest": refused.value.facts["digest"]}))
+        await cell.cycles(10)
+        assert await answered == {}
+
+
 def commands_of(cell: Cell) -> Any:
-    rig = SimpleNamespace(runner=cell.runner, control_loop=cell.control_loop, occasion=lambda: ())
+    rig = RigOfDaemon(cell.control_loop, cell.runner, {}, None, None)
     return Commands(rig, None, None, None, asyncio.Event(), rig.control_loop.tare_refusal).handlers()
 
 

@@ -3,6 +3,7 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import asdict
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
 from shearloop.daemon.sensing import load_cell_task
 from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, ZERO_TIMEOUT_S, LoadCellTask
+from shearloop.daemon.torques import LatestTorques, TorqueSample
 from shearloop.drivers.load_cell import COUNTS_FOR_TORQUES, COUNTS_REASON, TORQUES_FOR_COUNTS, LoadSample
 from tests.running import running
 
@@ -52,9 +54,11 @@ class Board:
 
 
 @asynccontextmanager
-async def reading(rate_hz: float = 10.9, clock: Clock | None = None) -> AsyncIterator[tuple[LoadCellTask, Board]]:
+async def reading(
+    rate_hz: float = 10.9, clock: Clock | None = None, loop: Any = None
+) -> AsyncIterator[tuple[LoadCellTask, Board]]:
     board = Board()
-    task = LoadCellTask(board, SimpleNamespace(publish=board.published.append), clock or Clock(), None, rate_hz)
+    task = LoadCellTask(board, SimpleNamespace(publish=board.published.append), clock or Clock(), loop, rate_hz)
     async with running(task.run()):
         yield task, board
 
@@ -164,3 +168,31 @@ async def test_health_quotes_the_last_refused_line():
     async with reading() as (task, board):
         board.refusal = "refused '0,091': not a number"
         assert task.diagnostics()["error"] == board.refusal
+
+
+async def test_whoever_listens_is_told_of_a_zero_once_it_is_taken():
+    told: list[str] = []
+    loop = SimpleNamespace(on_torque=lambda _: None, on_zero=told.append)
+    async with reading(loop=loop) as (task, board):
+        zero = await asked(task)
+        await board.send(5.0, ZERO_SAMPLES // 2)
+        assert told == []
+        await board.send(5.0)
+        async with asyncio.timeout(10):
+            assert await zero is None
+        assert told == ["load_cell"]
+
+
+def test_without_a_robot_only_present_torques_count_as_loads():
+    latest = LatestTorques()
+    assert latest.tare_refusal() is None
+    latest.on_torque(TorqueSample("load_cell", -0.2, "", 0, 0))
+    assert (latest.tare_refusal() or "").startswith("load_cell measures -0.200 N·m, which would become the zero")
+    assert latest.tare_refusal(confirmed=True) is None
+    latest.on_torque(TorqueSample("load_cell", 0.04, "", 1, 1))
+    assert latest.tare_refusal() is None
+    # The estimate of both fingertips ends with either of them.
+    latest.on_torque(TorqueSample("combined", 0.2, "", 2, 2))
+    assert latest.tare_refusal() is not None
+    latest.on_link("left", "its cable is out", up=False)
+    assert latest.tare_refusal() is None

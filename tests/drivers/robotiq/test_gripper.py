@@ -154,6 +154,21 @@ async def test_halt_after_a_failed_activation_keeps_the_fault(way, tmp_path):
 
 
 @WAYS
+async def test_a_gripper_that_is_too_hot_is_not_activated_and_drops_nothing(way, tmp_path):
+    async with a_rig(way, tmp_path, active=True) as rig:
+        rig.model.object_mm = 40.0
+        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(5.0)))
+        held_mm = rig.model.width_mm
+        rig.model.fail(8)
+        await rig.driver.read()
+        with pytest.raises(messages.GripperFaultError, match="too hot"):
+            await rig.driver.activate()
+        await rig.driver.read()
+        assert rig.model.width_mm == held_mm
+        assert rig.model.taken.act, "it was not reset"
+
+
+@WAYS
 async def test_activating_an_active_gripper_moves_nothing(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
         rig.model.object_mm = 25.0

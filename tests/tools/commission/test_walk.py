@@ -46,7 +46,10 @@ FAST = {
     "torque_source": "wrench",
     "tool_mm": 20,
     "limits": {"torque_nm": 0.35, "angle_rad": 1.5},
-    "steps": [{"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.4, "hold_s": 0.5, "timeout_s": 30}],
+    "steps": [
+        {"do": "tare"},
+        {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.4, "hold_s": 0.5, "timeout_s": 30},
+    ],
 }
 
 

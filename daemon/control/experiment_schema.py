@@ -470,7 +470,11 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = Before()) -> 
             return Demand(moves_s=6.0)
         case ApproachStep(along_tool_m=float() as distance_m):
             return Demand(moves_s=1.0 + abs(distance_m) / min(step.speed_m_per_s, speeds.linear_m_per_s))
-        case ApproachStep() | GripStep() | ReleaseStep() | AdaptStep() | TurnToStep():
+        case TurnToStep(angle_rad=angle_rad):
+            # Where the wrist is, is known only there.
+            travel_rad = 1.0 if before.wrist_rad is None else abs(angle_rad - before.wrist_rad)
+            return Demand(moves_s=SETTLES_S + travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s))
+        case ApproachStep() | GripStep() | ReleaseStep() | AdaptStep():
             return Demand(moves_s=3.0)
-        case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | WaitStep():
+        case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | TurnToStep() | WaitStep():
             return Demand()

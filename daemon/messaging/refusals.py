@@ -23,7 +23,7 @@ class Refusals:
         self.counts[kind] += 1
         count = self.counts[kind]
         if not frequent or is_logged(count):
-            structlog.get_logger().warning("refused", reason=reason, count=count)
+            structlog.get_logger().warning("refused", what=kind.removesuffix(" refused"), reason=reason, count=count)
 
     def diagnostics(self) -> Mapping[str, Mapping[str, int]]:
         """Return the counts for `health`."""

@@ -9,6 +9,7 @@ import hashlib
 import platform
 import re
 import threading
+import unicodedata
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import suppress
@@ -372,7 +373,7 @@ class Recorder:
         """Close a file under a name with its experiment; if that fails, the PARTIAL file stays for a repair."""
         file = current.file
         began = file.partial.name.removesuffix(f".mcap{PARTIAL}")
-        slug = re.sub(r"[^a-z0-9.]+", "-", current.experiment.lower()).strip("-.")
+        slug = slug_of(current.experiment)
         path = file.partial.with_name(f"{began}_{slug}.mcap" if slug else f"{began}.mcap")
         try:
             if not file.messages and not current.experiment:
@@ -430,3 +431,11 @@ class Recorder:
         entry = {"t_mono_ns": now_ns, "offset_ns": clock.offset_ns, schema.SUSPENDED: clock.suspended_ns}
         t_unix_ns = now_ns + current.offset_ns
         current.file.add(schema.CLOCK_TOPIC, t_unix_ns, t_unix_ns, schema.as_json(entry))
+
+
+def slug_of(name: str) -> str:
+    """Return an experiment's name as a part of a file's: letters without accents, digits, points and hyphens."""
+    # casefold makes ss of ß, and NFKD divides a letter from its accent.
+    apart = unicodedata.normalize("NFKD", name.casefold())
+    letters = "".join(one for one in apart if not unicodedata.combining(one))
+    return re.sub(r"[^a-z0-9.]+", "-", letters).strip("-.")

@@ -26,7 +26,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, LoopState, wire_map
 from shearloop.daemon.recorder import recorder as recorder_module
-from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
+from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder, slug_of
 from shearloop.daemon.recorder.schema import basic_identity
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
@@ -130,6 +130,8 @@ def test_each_experiment_has_a_file_with_its_name(tmp_path):
     first, second = recorder.closed_files
     assert first.name.endswith("_hold-0.10-n-m.mcap")
     assert second.name.endswith("_again.mcap")
+    assert slug_of("Versuch Größe 1") == "versuch-grosse-1"
+    assert slug_of("実験") == ""
     assert [one["seq"] for one in topics(first)["load.torque"]] == [0, 1], "what led to it is with it"
     assert [one["seq"] for one in topics(second)["load.torque"]] == [2]
     assert summarise(first).experiments == ["Hold 0.10 N·m"]

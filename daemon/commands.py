@@ -178,9 +178,14 @@ class Commands:
         if source is not None and not (isinstance(source, str) and source in sensors):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(sensors)}")
         names = list(sensors) if source is None else [source]
-        _refuse_if(self.tare_refusal(confirmed=bool(request.get("confirmed"))))
+        confirmed, tasks = bool(request.get("confirmed")), self.health.tasks()
+        _refuse_if(self.tare_refusal(confirmed=confirmed))
+        lost = [name for name in names if tasks.get(name, {}).get("connected") is False]
+        if lost:
+            cure = "connect it, or name another one with `--source`"
+            raise CommandRefusedError(f"not connected: {' and '.join(lost)}; {cure}")
         for name in names:
-            sensors[name].tare()
+            sensors[name].tare(confirmed=confirmed)
         return {"taring": names}
 
     async def _status(self, _request: Request) -> Reply:
@@ -252,7 +257,8 @@ def _refuse_if(reason: str | None) -> None:
 def _refuse_if_changed(question: Question, sentence: str, request: Request) -> None:
     """Refuse what was confirmed with another question in view, and ask the present one."""
     if request.get("digest", question.digest) != question.digest:
-        changed = f"what the gripper says has changed since the question: {sentence}; answer it again"
+        changed = f"the gripper's state has changed since the question, or something was stopped or run: {sentence}"
+        changed += "; answer it again"
         raise CommandRefusedError(changed, **question.facts)
 
 

@@ -216,7 +216,10 @@ class Rig:
 
     async def start_question(self, path: Path) -> Question:
         """Return the question before a start, with the first motion, and the plan; raises UserError as `start` does."""
-        return self._question_of(await self.experiments.read(path))
+        experiment = await self.experiments.read(path)
+        if (reason := self.control_loop.file_refusal(experiment.file)) is not None:
+            raise UserError(reason)
+        return self._question_of(experiment)
 
     def _question_of(self, experiment: ReadExperiment) -> Question:
         file = experiment.file

@@ -136,8 +136,8 @@ class Tareable(Protocol):
     def taring(self) -> bool:
         """Whether a zero that was asked for is being taken."""
 
-    def tare(self) -> None:
-        """Take a new zero from later measurements."""
+    def tare(self, *, confirmed: bool = False) -> None:
+        """Take a new zero from later measurements; `confirmed`: the operator says that nothing is loaded."""
 
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new zero and wait until it is done; return None, or why it was not taken."""

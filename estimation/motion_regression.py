@@ -17,6 +17,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.estimator import Bounds, CalibrationRows, Estimator, Material, OutputModel, Quantity, Reading
 from shearloop.estimation.fingertip_validator import FingertipValidator
+from shearloop.estimation.gain import LOADED_SHARE
 from shearloop.estimation.grip_memory import Motion
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
@@ -33,10 +34,12 @@ _LEAST_LAGS = 12
 # A longer memory in a file would fill the session's own.
 _MOST_LAGS = 1000
 # Positions drift between recordings, motion does not. So the position must lower motion's squared error on frames left
-# out to the second share where motion leaves more than the first of the torque's variance, else to the third: motion
-# may have learnt the order of the twists, which is another one next time. On recorded fingertips the share is 0.54 to
-# 18, on emulated ones, which do not drift, 0.01 to 0.2.
+# out to the second share where motion leaves more than the first of the torque's variance, else to the third. On
+# recorded fingertips, which were twisted one way, the share is 0.54 to 18, on emulated ones 0.01 to 0.4.
 _MOTION_MAY_LEAVE, _POSITION_GAINS, _POSITION_GAINS_MUCH = 0.5, 0.5, 0.3
+# Of twists both ways, motion may learn the order, which is another one next time, and twists left out do not show it.
+# There the position also serves where it leaves this share of the torque's variance at most.
+_POSITION_MAY_LEAVE = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,7 +197,11 @@ class MotionRegression(Estimator):
             choose_motion(features, torque_nm, layout, fit_one, left_out, position=used) for used in (False, True)
         )
         share = _POSITION_GAINS if alone.squared_error > _MOTION_MAY_LEAVE * variance else _POSITION_GAINS_MUCH
-        chosen = with_position if with_position.squared_error < share * alone.squared_error else alone
+        enough = share * alone.squared_error
+        both_ways = min(-float(torque_nm.min()), float(torque_nm.max())) > LOADED_SHARE * float(np.abs(torque_nm).max())
+        if both_ways:
+            enough = max(enough, _POSITION_MAY_LEAVE * variance)
+        chosen = with_position if with_position.squared_error < enough else alone
         regressor = fit_interval_regressor(
             features[:, chosen.columns], torque_nm, chosen.fit_used, strengths=(0.0,), limit_features=True,
             twists=twists, bounds=bounds, recordings=recordings, fingertips=len(temporal.directions),

@@ -206,6 +206,8 @@ class ControlLoop:
             self.inputs.lost.pop(device, None)
         else:
             self.inputs.lost[device] = sentence
+            # A board that was unplugged may come back with another zero.
+            self._zeroed.discard(device)
 
     def on_recording_error(self, error: str) -> None:
         """Take the present error of the recording; an empty string ends it."""
@@ -368,6 +370,19 @@ class ControlLoop:
             "drops: take it out with `shearloop command release --yes`, or put a `release` before it"
         )
 
+    def _why_no_grip(self, file: ExperimentFile) -> str | None:
+        """Return why the first `grip` would open the fingers on what they hold, or None."""
+        first, gripper, held = first_gripper_step(file), self.inputs.gripper, self.held
+        if first is None or gripper is None or held is None:
+            return None
+        number, step = first
+        if isinstance(step, Opening) or step.width_mm <= gripper.width_mm:
+            return None
+        return (
+            f"{held}; step {number} (grip) to {step.width_mm:g} mm would open them and drop it: put a `release` before "
+            "it, or correct `width_mm`"
+        )
+
     def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
         """Return why no tool can be turned by a torque without a zero, or None: every limit would be off by it."""
         number = first_turn_before_tare(file, holds=self.may_hold())
@@ -437,32 +452,16 @@ class ControlLoop:
         if self.inputs.gripper is not None:
             # What other programs asked for before the start is no fault of this experiment.
             self._judge_grip(self.inputs.gripper)
-        if file.torque_source not in self._wrists:
-            known = ", ".join(self._wrists)
-            return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
+        if (reason := self._why_no_source(file)) is not None:
+            return reason
         driving = self._sources[file.torque_source]
-        if driving.noise_nm >= file.tightest_nm:
-            return too_noisy(driving.name, driving.noise_nm, file.tightest_nm)
-        unmeasured = next(not_measured(file, driving), None)
-        if unmeasured is not None:
-            place, why_not = unmeasured
-            return f"step {place + 1}: {why_not}"
         watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
         faults = detect_faults(self.inputs, watched, self.config, t_ns)
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
             return " ".join(refusals)
-        if (reason := self._why_no_activation(file) or self._why_no_zero(file, driving)) is not None:
+        if (reason := self._why_not_with_tool(file)) is not None:
             return reason
-        number, uncertain = first_motion_before_grip(file), self._why_uncertain()
-        if number is not None:
-            step = file.steps[number - 1]
-            straight = isinstance(step, ApproachStep)
-            # The limits watch a turn of a held tool. Nothing watches what a straight move does to it.
-            why = uncertain or (f"the gripper is closed: {self.held}" if straight and self.held else None)
-            if why is not None:
-                motion = f"step {number} ({step.do}), which {'moves the arm' if straight else 'turns the wrist'}"
-                return f"{why}; put a `grip` or a `release` before {motion}"
         speeds = Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
         self.experiment, self._watched = Experiment(file, t_ns, speeds), watched
         self.wrist = self._wrists[file.torque_source]
@@ -479,6 +478,40 @@ class ControlLoop:
         phase, activity = self.experiment.phase.value, self.experiment.command.activity
         self.status = LoopStatus(phase, activity, WristCommand(), SafetyDecision(Response.NOTE))
         return None
+
+    def file_refusal(self, file: ExperimentFile) -> str | None:
+        """Return why this experiment cannot begin with the tool and the zeros of now, or None."""
+        return self._why_no_source(file) or self._why_not_with_tool(file)
+
+    def _why_no_source(self, file: ExperimentFile) -> str | None:
+        if file.torque_source not in self._wrists:
+            known = ", ".join(self._wrists)
+            return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
+        driving = self._sources[file.torque_source]
+        if driving.noise_nm >= file.tightest_nm:
+            return too_noisy(driving.name, driving.noise_nm, file.tightest_nm)
+        unmeasured = next(not_measured(file, driving), None)
+        if unmeasured is not None:
+            place, why_not = unmeasured
+            return f"step {place + 1}: {why_not}"
+        return None
+
+    def _why_not_with_tool(self, file: ExperimentFile) -> str | None:
+        """Return why the tool that is held, or may be, forbids an experiment, or its torque's zero does."""
+        driving = self._sources[file.torque_source]
+        if reason := self._why_no_activation(file) or self._why_no_grip(file) or self._why_no_zero(file, driving):
+            return reason
+        number, uncertain = first_motion_before_grip(file), self._why_uncertain()
+        if number is None:
+            return None
+        step = file.steps[number - 1]
+        straight = isinstance(step, ApproachStep)
+        # The limits watch a turn of a held tool. Nothing watches what a straight move does to it.
+        why = uncertain or (f"the gripper is closed: {self.held}" if straight and self.held else None)
+        if why is None:
+            return None
+        motion = f"step {number} ({step.do}), which {'moves the arm' if straight else 'turns the wrist'}"
+        return f"{why}; put a `grip` or a `release` before {motion}"
 
     def _gripped_at_start(self, t_ns: int) -> _GrippedTool:
         """Return what is known of the tool as an experiment begins."""

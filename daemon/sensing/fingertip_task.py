@@ -192,7 +192,7 @@ class FingertipTask:
         self.count += 1
         self._tare.add(message.reason, taring=self.session.taring)
 
-    def tare(self) -> None:
+    def tare(self, *, confirmed: bool = False) -> None:  # noqa: ARG002 - a fingertip judges by itself whether it is idle
         """Take a new idle frame from frames acquired entirely after now, within `longest_tare_s`."""
         self._tare.begin(self.clock.now_ns(), self.longest_tare_s)
 

@@ -10,7 +10,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
-from shearloop.daemon.torques import LOAD_CELL, SensorListener, TorqueSample
+from shearloop.daemon.torques import CONFIRM_TARE, LOAD_CELL, SensorListener, TorqueSample, loaded_sentence
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 # Two seconds at 10.9 Hz.
@@ -37,6 +37,7 @@ class LoadCellTask:
         self._zeroing: list[float] | None = None
         self._zero_from_ns = self._zero_until_ns = 0
         self._zero_error: str | None = None
+        self._confirmed = False
         self._sampled = asyncio.Event()
         self._latest: LoadSample | None = None
 
@@ -61,9 +62,15 @@ class LoadCellTask:
         self._sampled.set()
         self._sampled.clear()
 
-    def tare(self) -> None:
-        """Make the mean of samples measured from now on the zero; samples under way belong to the load before."""
-        self._zeroing, self._zero_error = [], None
+    def tare(self, *, confirmed: bool = False) -> None:
+        """Make the mean of samples measured from now on the zero; samples under way belong to the load before.
+
+        A mean that is a load by the zero before is refused unless the operator has `confirmed` that there is none.
+        """
+        self._zeroing, self._zero_error, self._confirmed = [], None, confirmed
+        if self._loop is not None:
+            # Whoever asks for a zero does not trust the one before.
+            self._loop.on_zero(LOAD_CELL, known=False)
         now_ns = self._clock.now_ns()
         # The middle of the first settled reading.
         self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self._period_s * 1e9)
@@ -100,7 +107,10 @@ class LoadCellTask:
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
     def _not_taken(self, within_s: float) -> str:
-        reason = (_reason(self._latest) if self._latest is not None else "") or "no usable reading came"
+        latest = self._latest
+        # A reading from before says nothing of the time since.
+        came = latest is not None and latest.t_mid_ns >= self._zero_from_ns
+        reason = (_reason(latest) if latest is not None and came else "") or "no usable reading came"
         return f"the load cell's zero could not be taken within {within_s:.3g} s: {reason}"
 
     def _take_zero(self, sample: LoadSample) -> None:
@@ -114,10 +124,19 @@ class LoadCellTask:
         if sample.trusted and sample.t_mid_ns >= self._zero_from_ns:
             self._zeroing.append(sample.raw)
         if len(self._zeroing) == ZERO_SAMPLES:
-            self._board.tare(sum(self._zeroing) / ZERO_SAMPLES)
-            self._zeroing = None
-            if self._loop is not None:
-                self._loop.on_zero(LOAD_CELL)
+            self._end_zero(sum(self._zeroing) / ZERO_SAMPLES)
+
+    def _end_zero(self, raw: float) -> None:
+        """Make a raw value the zero, unless it is a load that nobody has confirmed to be none."""
+        self._zeroing = None
+        loaded = loaded_sentence({LOAD_CELL: self._board.calibration.torque_nm(raw)})
+        if loaded and not self._confirmed:
+            self._zero_error = f"the load cell's zero was not taken: {loaded} meanwhile; {CONFIRM_TARE}"
+            structlog.get_logger().warning(self._zero_error)
+            return
+        self._board.tare(raw)
+        if self._loop is not None:
+            self._loop.on_zero(LOAD_CELL)
 
 
 def load_message(sample: LoadSample) -> LoadTorque:

@@ -111,7 +111,7 @@ class SkinTask:
                     state = {**self._skin.state, "estimator": self._estimator}
                     record_state(self._inputs, state, self._estimator.fixed, self._clock.now_ns())
 
-    def tare(self) -> None:
+    def tare(self, *, confirmed: bool = False) -> None:  # noqa: ARG002 - the skin judges by its gauges at rest
         """Take a new zero from samples measured from now on."""
         now_ns = self._clock.now_ns()
         self._asked_ns = now_ns

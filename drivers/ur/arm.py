@@ -8,8 +8,10 @@ import ctypes
 import os
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from operator import sub
+from statistics import fmean
 
 import rtde_control
 
@@ -31,6 +33,8 @@ from shearloop.drivers.ur.settings import Six, UrSettings
 # two samples. One-time commands wait for that thread, so that the slack is at most a sixth of the watchdog's time.
 _LONGEST_POLL_SLACK_NS, _SLACKS_PER_WATCHDOG = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
+# A CB3 estimates its wrench from motor currents: one sample is off by up to 10 N and 5 N·m, their mean by far less.
+_ZERO_OVER_S = 0.5
 # The longest time for sending the script.
 _UPLOAD_S = 1.0
 
@@ -66,6 +70,7 @@ class UrArm:
         self._age = SampleAge()
         # In the base's frame: of a controller that cannot zero its wrench, or that has zeroed it with a load.
         self.wrench_zero: Six = (0.0,) * 6
+        self._recent_wrenches: deque[Six] = deque(maxlen=max(1, round(_ZERO_OVER_S * settings.rate_hz)))
         # The wrench before a program was first sent, where something was held, until that program answers.
         self._held: Six | None = None
         self.script_readiness = ScriptReadiness(self._receiver, settings.command_timeout_s)
@@ -73,6 +78,7 @@ class UrArm:
     def read(self) -> RtdeSample:
         """Return the controller's latest sample and its age."""
         sample = self._receiver.latest()
+        self._recent_wrenches.append(sample.wrench)
         now_ns = time.monotonic_ns()
         # The controller listens to a script's sender only while the sender reads.
         self._script_port.drain()
@@ -136,9 +142,14 @@ class UrArm:
         return True
 
     def zero_wrench(self) -> bool:
-        """Make the present wrench zero: in the controller, or in this process where the controller cannot."""
+        """Make the present wrench zero: in the controller, or in this process where the controller cannot.
+
+        In this process it is the mean of the last samples.
+        """
         if not self._settings.facts.zeroes_wrench:
-            self.wrench_zero = self._receiver.latest().wrench
+            recent = self._recent_wrenches or [self._receiver.latest().wrench]
+            fx, fy, fz, mx, my, mz = (fmean(one) for one in zip(*recent, strict=True))
+            self.wrench_zero = fx, fy, fz, mx, my, mz
             return True
         if not self._send_once(self._control.zeroFtSensor):
             return False

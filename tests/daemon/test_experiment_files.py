@@ -242,6 +242,7 @@ def rig(folder: Path, runner: Runner) -> Rig:
             activation_note=lambda _: "",
             held_note=lambda _: "",
             may_hold=lambda: False,
+            file_refusal=lambda _: None,
         ),
         runner,
         {},

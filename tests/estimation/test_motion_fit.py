@@ -97,12 +97,13 @@ def test_a_mean_of_ridges_predicts_the_mean():
     np.testing.assert_allclose(mean_ridge(members).predict(rows), mean)
 
 
+@pytest.mark.parametrize("sides", [("right", "left"), ("right",)])
 @pytest.mark.parametrize("rest", [1, 5])
-def test_twists_that_alternate_do_not_teach_their_order(rest):
+def test_twists_that_alternate_do_not_teach_their_order(rest, sides):
     """The motion over 10 s tells which twist comes next; the gel's position tells the torque."""
-    learnt = [elastic(12, 12, rest=rest, turns=(0.5, -0.5, 1.0, -1.0))]
+    learnt = [elastic(12, 12, rest=rest, turns=(0.5, -0.5, 1.0, -1.0)).select_sides(sides)]
     calibration = fit("motion_regression", learnt, "rig", timing=TRUSTED)
-    others = elastic(3, rest=10, turns=(1.0,), seed=3)
+    others = elastic(3, rest=10, turns=(1.0,), seed=3).select_sides(sides)
     found = judged(follow(calibration, others), others)
     assert found.rmse < 0.005
     assert found.coverage > 0.95

@@ -651,8 +651,10 @@ def test_no_torque_without_a_zero_turns_a_tool():
     assert "step 1 (turn_to)" in refusal(turn)
     rig.control_loop.on_zero("load_cell")
     assert refusal(GRIP, twist) == refusal(turn) == ""
-    rig.control_loop.on_zero("load_cell", known=False)
-    assert refusal(GRIP, twist) != ""
+    # It may come back with another zero.
+    rig.control_loop.on_link("load_cell", "it was unplugged", up=False)
+    rig.control_loop.on_link("load_cell", "", up=True)
+    assert "no zero of the load_cell" in refusal(twist)
 
 
 def test_a_torque_that_has_fallen_silent_is_not_published_as_present():
@@ -689,3 +691,23 @@ def test_a_turn_makes_no_grip_known():
     assert phase(rig) is ExperimentPhase.DONE
     rig.step()
     assert FaultCode.GRIP_UNKNOWN in [fault.code for fault in rig.control_loop.status.decision.faults]
+
+
+def test_a_grip_that_would_drop_the_held_tool_cannot_be_asked():
+    rig = Rig(new_loop())
+    rig.force_n, rig.width_mm = 60.0, 30.0
+    rig.run(0.6)
+
+    def refusal(*steps: dict[str, Any]) -> str:
+        content = {"name": "one", "torque_source": "right", "steps": list(steps)}
+        return rig.control_loop.file_refusal(ExperimentFile.model_validate(content)) or ""
+
+    wide = {**GRIP, "width_mm": 35.0}
+    assert "step 1 (grip) to 35 mm would open them and drop it: put a `release` before" in refusal(wide)
+    assert refusal(GRIP) == refusal({"do": "release"}, wide) == ""
+    assert "is not a measured torque" in (
+        rig.control_loop.file_refusal(
+            ExperimentFile.model_validate({"name": "a", "torque_source": "x", "steps": [GRIP]})
+        )
+        or ""
+    )

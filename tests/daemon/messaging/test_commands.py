@@ -5,7 +5,6 @@ import socket
 import threading
 from collections.abc import Mapping
 from contextlib import closing
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -139,7 +138,7 @@ def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
 
 async def test_commands_are_told_with_their_answer_and_questions_are_not():
     reported: list[tuple[str, str | None]] = []
-    sensors = SimpleNamespace(tareable={"right": SimpleNamespace(tare=lambda: None)})
+    sensors = SimpleNamespace(tareable={"right": SimpleNamespace(tare=lambda **_: None)})
     handlers = Commands(
         rig=None,
         sensors=sensors,
@@ -193,12 +192,12 @@ async def test_an_argument_that_a_command_does_not_have_moves_nothing(name, requ
 async def test_tare_is_refused_during_an_experiment():
     tared: list[str] = []
     refusal: list[str | None] = ["the experiment 'hold' is running, and a new zero would change its torques"]
-    sensors = {name: SimpleNamespace(tare=partial(tared.append, name)) for name in ("right", "load_cell")}
+    sensors = {name: SimpleNamespace(tare=lambda name=name, **_: tared.append(name)) for name in ("right", "load_cell")}
     commands = Commands(
         rig=None,
         sensors=SimpleNamespace(tareable=sensors),
         experiment=None,
-        health=None,
+        health=SimpleNamespace(tasks=lambda: {"right": {"connected": True}}),
         daemon_end=asyncio.Event(),
         tare_refusal=lambda *, confirmed: None if confirmed else refusal[0],
     )

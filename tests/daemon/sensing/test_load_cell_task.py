@@ -24,6 +24,9 @@ class Board:
         self.sent: asyncio.Queue[LoadSample] = asyncio.Queue()
         self.tares: list[float] = []
         self.refusal = ""
+        # Nothing is loaded, unless a test says so.
+        self.calibration = SimpleNamespace(torque_nm=lambda _: self.load_nm)
+        self.load_nm = 0.0
         self.published: list[LoadTorque] = []
         # Later than all that a test asks for.
         self._seq = Clock().now_ns() + 10**9
@@ -171,16 +174,16 @@ async def test_health_quotes_the_last_refused_line():
 
 
 async def test_whoever_listens_is_told_of_a_zero_once_it_is_taken():
-    told: list[str] = []
-    loop = SimpleNamespace(on_torque=lambda _: None, on_zero=told.append)
+    told: list[bool] = []
+    loop = SimpleNamespace(on_torque=lambda _: None, on_zero=lambda _, known=True: told.append(known))
     async with reading(loop=loop) as (task, board):
         zero = await asked(task)
         await board.send(5.0, ZERO_SAMPLES // 2)
-        assert told == []
+        assert told == [False], "the zero before is not trusted any more"
         await board.send(5.0)
         async with asyncio.timeout(10):
             assert await zero is None
-        assert told == ["load_cell"]
+        assert told == [False, True]
 
 
 def test_without_a_robot_only_present_torques_count_as_loads():
@@ -196,3 +199,17 @@ def test_without_a_robot_only_present_torques_count_as_loads():
     assert latest.tare_refusal() is not None
     latest.on_link("left", "its cable is out", up=False)
     assert latest.tare_refusal() is None
+
+
+@pytest.mark.parametrize(
+    ("load_nm", "confirmed", "taken"), [(0.2, False, False), (0.2, True, True), (0.04, False, True)]
+)
+async def test_a_load_that_comes_while_a_zero_is_taken_does_not_become_it(load_nm, confirmed, taken):
+    told: list[bool] = []
+    loop = SimpleNamespace(on_torque=lambda _: None, on_zero=lambda _, known=True: told.append(known))
+    async with reading(loop=loop) as (task, board):
+        task.tare(confirmed=confirmed)
+        board.load_nm = load_nm
+        await board.send(5.0)
+        assert bool(board.tares) is told[-1] is taken
+        assert ("was not taken: load_cell measures +0.200 N·m" in task.diagnostics()["error"]) is not taken

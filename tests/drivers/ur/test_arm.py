@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError
 from types import ModuleType, SimpleNamespace
 from typing import ClassVar
 
+import numpy as np
 import pytest
 
 from shearloop.drivers.ur import script
@@ -185,6 +186,21 @@ def test_wrench_of_a_cb3_is_zeroed_without_its_controller(arm):
     Receiver.made.sample = dataclasses.replace(received(1.1), wrench=(1.0, 2.5, 3.0, 0.0, 0.0, 3.0))
     assert one.read().wrench == (0.0, 0.5, 0.0, 0.0, 0.0, 2.0)
     assert "zeroFtSensor" not in Client.made.calls
+
+
+def test_the_zero_of_a_cb3_is_the_mean_of_its_noisy_samples(arm):
+    limits = dataclasses.replace(SETTINGS.limits, torque_nm=ur.TorqueBound(8.0, 12.0))
+    one = arm.UrArm(dataclasses.replace(SETTINGS, limits=limits, generation="cb3"))
+    noise_nm = np.random.default_rng(0).uniform(-5.0, 5.0, 300)
+    for number, each_nm in enumerate(noise_nm):
+        Receiver.made.sample = dataclasses.replace(
+            received(number / 125), wrench=(0.0, 0.0, 0.0, 0.0, 0.0, 0.3 + each_nm)
+        )
+        one.read()
+    assert one.zero_wrench()
+    last = round(0.5 * SETTINGS.rate_hz)
+    assert one.wrench_zero[5] == pytest.approx(0.3 + noise_nm[-last:].mean())
+    assert abs(one.wrench_zero[5] - 0.3) < 1.5
 
 
 @pytest.mark.parametrize("held", [True, False])

@@ -376,7 +376,7 @@ class ControlLoop:
         if first is None or gripper is None or held is None:
             return None
         number, step = first
-        if isinstance(step, Opening) or step.width_mm <= gripper.width_mm:
+        if not isinstance(step, GripStep) or step.width_mm <= gripper.width_mm:
             return None
         return (
             f"{held}; step {number} (grip) to {step.width_mm:g} mm would open them and drop it: put a `release` before "

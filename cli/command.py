@@ -140,7 +140,9 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
         return table(("file", "name", ""), known)
     if name == "tare":
         end = "`shearloop command status` shows its end, and `start` is refused until then"
-        return [f"tare: the zero of {', '.join(reply['taring'])} is being taken; {end}"]
+        lost = reply.get("not_connected", ())
+        without = f"; NOT of {', '.join(lost)}, which is not connected" if lost else ""
+        return [f"tare: the zero of {', '.join(reply['taring'])} is being taken{without}; {end}"]
     if name == "stop":
         if reply.get("ended"):
             return ["stop: nothing was moving; the daemon has ended"]

@@ -181,12 +181,12 @@ class Commands:
         confirmed, tasks = bool(request.get("confirmed")), self.health.tasks()
         _refuse_if(self.tare_refusal(confirmed=confirmed))
         lost = [name for name in names if tasks.get(name, {}).get("connected") is False]
-        if lost:
-            cure = "connect it, or name another one with `--source`"
-            raise CommandRefusedError(f"not connected: {' and '.join(lost)}; {cure}")
-        for name in names:
+        taring = [name for name in names if name not in lost]
+        if not taring:
+            raise CommandRefusedError(f"not connected: {' and '.join(lost)}")
+        for name in taring:
             sensors[name].tare(confirmed=confirmed)
-        return {"taring": names}
+        return {"taring": taring, **({"not_connected": lost} if lost else {})}
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()

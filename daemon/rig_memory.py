@@ -53,8 +53,9 @@ class Remembered:
     # with a tool in the fingers nobody can take another zero.
     load_zero: float | None = None
     load_nm_per_count: float | None = None
-    # The zero of the wrench in this grip.
+    # The zero of the wrench in this grip, and whether somebody has taken it; else it is of a program's start.
     wrench_zero: Six | None = None
+    wrench_tared: bool = False
 
     @classmethod
     def of(cls, loop: ControlLoop) -> "Remembered":
@@ -95,8 +96,11 @@ class RigMemory:
     # The load cell's zero by its calibration, and the restored one.
     _calibrated_zero: float | None = None
     _load_restored: float | None = None
-    # Whether the wrench has the zero of the grip before.
+    # Whether the wrench has the zero of the grip before, and whether somebody had taken that.
     _wrench_restored: bool = False
+    _wrench_tared: bool = False
+    # Whether the gripper has shown since if it still has that grip: until then the restored zeros are kept.
+    _judged: bool = False
     _writing: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
@@ -111,7 +115,7 @@ class RigMemory:
             self._calibrated_zero, self._load_restored = cell.calibration.tare_counts, zero
             cell.tare(zero)
         if self.robot is not None and remembered.wrench_zero is not None:
-            self._wrench_restored = True
+            self._wrench_restored, self._wrench_tared = True, remembered.wrench_tared
             self.robot.restore_wrench_zero(remembered.wrench_zero)
 
     def _on_judged(self, why_another: str) -> None:
@@ -122,9 +126,12 @@ class RigMemory:
             if restored
         ]
         log = structlog.get_logger()
+        self._judged = True
         if not why_another:
+            taken = {LOAD_CELL: True, WRENCH: self._wrench_tared}
             for name in zeros:
-                self.loop.on_zero(name)
+                if taken[name]:
+                    self.loop.on_restored_zero(name)
             if zeros:
                 log.info("the zeros of the present grip are kept", of=zeros)
             return
@@ -174,16 +181,20 @@ class RigMemory:
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)
         if self.robot is not None and self.loop.may_hold():
-            state = replace(state, wrench_zero=self.robot.wrench_zero)
+            state = replace(state, wrench_zero=self.robot.wrench_zero, wrench_tared=self._knows_wrench_zero)
         await self.save(state)
 
     @property
     def _knows_load_zero(self) -> bool:
         """Whether the load cell's zero was taken by somebody: else it is its calibration's, of another day."""
-        # A restored one counts once the gripper has shown its grip, and is kept until then.
         cell = self.load_cell
         restored = cell is not None and cell.calibration.tare_counts == self._load_restored
-        return self.loop.has_zero(LOAD_CELL) or restored
+        return self.loop.has_zero(LOAD_CELL) or (restored and not self._judged)
+
+    @property
+    def _knows_wrench_zero(self) -> bool:
+        """Whether the wrench's zero was taken by somebody."""
+        return self.loop.has_zero(WRENCH) or (self._wrench_tared and not self._judged)
 
     async def save(self, state: Remembered) -> None:
         """Write a state, unless the file has it already; a failure is logged once, and tried again."""

@@ -140,6 +140,8 @@ class ControlLoop:
         self._on_judged: OnJudged | None = None
         # The sources whose zero has been taken since this process began, or is kept from the one before.
         self._zeroed: set[str] = set()
+        # The sources whose zero has been lost since, or asked for and not taken.
+        self._distrusted: set[str] = set()
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
 
@@ -165,6 +167,12 @@ class ControlLoop:
     def on_zero(self, source: str, *, known: bool = True) -> None:
         """Take that a source's zero is known from now on, or is not."""
         (self._zeroed.add if known else self._zeroed.discard)(source)
+        (self._distrusted.discard if known else self._distrusted.add)(source)
+
+    def on_restored_zero(self, source: str) -> None:
+        """Take that a zero of the process before is of the present grip; one that was lost since is none."""
+        if source not in self._distrusted:
+            self._zeroed.add(source)
 
     def torques_of(self, source: str) -> tuple[Sequence[int], Sequence[float]]:
         """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m."""
@@ -206,8 +214,10 @@ class ControlLoop:
             self.inputs.lost.pop(device, None)
         else:
             self.inputs.lost[device] = sentence
-            # A board that was unplugged may come back with another zero.
-            self._zeroed.discard(device)
+            # What was unplugged or switched off may come back with another zero.
+            for name, source in self._sources.items():
+                if name == device or (source.from_robot and device == "robot"):
+                    self.on_zero(name, known=False)
 
     def on_recording_error(self, error: str) -> None:
         """Take the present error of the recording; an empty string ends it."""
@@ -390,9 +400,10 @@ class ControlLoop:
             return None
         # A command tares sensors, and an experiment the robot's wrench, too.
         command = "" if driving.from_robot else ", or send `shearloop command tare` with nothing gripped"
+        tare = "a `release` and a `tare`" if self.held is not None else "a `tare`"
         return (
             f"no zero of the {driving.name} is known since this daemon began, so that its torques and limits may be "
-            f"off by any load: put a `tare` before step {number} ({file.steps[number - 1].do}){command}"
+            f"off by any load: put {tare} before step {number} ({file.steps[number - 1].do}){command}"
         )
 
     def has_zero(self, source: str) -> bool:

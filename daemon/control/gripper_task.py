@@ -58,7 +58,9 @@ class GripperTask:
     async def grip(self, target: GripStep) -> None:
         """Move to a width and wait for the end; raises DriverError and ActionError."""
         with self._motion.commanded(self.clock.now_ns()):
-            await self.gripper.activate()
+            if not (opens := isinstance(target, Opening)) and (fault := (await self.gripper.read()).fault).too_hot:
+                raise NotBegunError(fault.sentence)
+            await self.gripper.activate(may_drop=opens)
             if (width_mm := await self._width_of(target)) is None:
                 return
             sent = await self.gripper.move(GripperCommand(width_mm, target.speed_mm_per_s, target.force_n))

@@ -433,9 +433,13 @@ class Recorder:
         current.file.add(schema.CLOCK_TOPIC, t_unix_ns, t_unix_ns, schema.as_json(entry))
 
 
+# Some letters become several, and a file's name has at most 255.
+_LONGEST_SLUG = 100
+
+
 def slug_of(name: str) -> str:
     """Return an experiment's name as a part of a file's: letters without accents, digits, points and hyphens."""
     # casefold makes ss of ß, and NFKD divides a letter from its accent.
     apart = unicodedata.normalize("NFKD", name.casefold())
     letters = "".join(one for one in apart if not unicodedata.combining(one))
-    return re.sub(r"[^a-z0-9.]+", "-", letters).strip("-.")
+    return re.sub(r"[^a-z0-9.]+", "-", letters)[:_LONGEST_SLUG].strip("-.")

@@ -240,11 +240,12 @@ class RobotiqGripper:
         self.latest = self._state(*await self._read(whole=True))
         return self.latest
 
-    async def activate(self, *, operator_confirmed: bool = False) -> messages.GripperState:
+    async def activate(self, *, operator_confirmed: bool = False, may_drop: bool = False) -> messages.GripperState:
         """Return the state of the active gripper; one that is not active opens and closes its fingers once.
 
         After a major fault the operator has to confirm that the fingers are clear. `operator_confirmed` activates in
-        any state. Raises GripperFaultError when the activation is refused or fails.
+        any state. One that is too hot is activated only where what it holds `may_drop`. Raises GripperFaultError when
+        the activation is refused or fails.
         """
         readout, t_ns = await self._recent()
         fault = messages.fault_of(readout.flt)
@@ -253,8 +254,7 @@ class RobotiqGripper:
                 raise messages.GripperFaultError(
                     f"{fault.sentence} An operator has to confirm that the fingers are clear."
                 )
-            if fault.code == _OVER_TEMPERATURE:
-                # It ends by itself, and an activation would open the fingers.
+            if fault.too_hot and not may_drop:
                 raise messages.GripperFaultError(fault.sentence)
             if not blocking_fault(readout):
                 return self._state(readout, t_ns)

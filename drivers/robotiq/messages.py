@@ -33,6 +33,11 @@ class GripperFault:
         """Whether only a new activation, requested by the operator, ends it."""
         return self.code >= FIRST_MAJOR_CODE
 
+    @property
+    def too_hot(self) -> bool:
+        """Whether the gripper takes no commands until it has cooled down; an activation would open its fingers."""
+        return self.code == 8
+
 
 _FAULTS = {
     0: "",

@@ -78,13 +78,12 @@ class UrArm:
     def read(self) -> RtdeSample:
         """Return the controller's latest sample and its age."""
         sample = self._receiver.latest()
-        self._recent_wrenches.append(sample.wrench)
         now_ns = time.monotonic_ns()
         # The controller listens to a script's sender only while the sender reads.
         self._script_port.drain()
         if sample.runtime_state == RUNTIME_PLAYING:
             self._script_port.close()
-        return RtdeSample(
+        read = RtdeSample(
             **vars(sample) | {"wrench": _difference(sample.wrench, self.wrench_zero)},
             t_mono_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
@@ -93,6 +92,12 @@ class UrArm:
             and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
             rest_rad_per_s=self._settings.rest_rad_per_s,
         )
+        if read.rests:
+            self._recent_wrenches.append(sample.wrench)
+        else:
+            # A motion has a wrench of its own.
+            self._recent_wrenches.clear()
+        return read
 
     def take_errors(self) -> list[ControllerError]:
         """Return the controller's error codes since the last call."""
@@ -144,7 +149,7 @@ class UrArm:
     def zero_wrench(self) -> bool:
         """Make the present wrench zero: in the controller, or in this process where the controller cannot.
 
-        In this process it is the mean of the last samples.
+        In this process it is the mean of the last samples at rest.
         """
         if not self._settings.facts.zeroes_wrench:
             recent = self._recent_wrenches or [self._receiver.latest().wrench]

@@ -17,7 +17,7 @@ from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.drivers.errors import DriverError
-from shearloop.errors import ActionError
+from shearloop.errors import ActionError, NotBegunError
 from shearloop.estimation.confidence import TWO_SIDED_95
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 from tests.fixtures.daemons import DEADLINE_S
@@ -178,6 +178,21 @@ async def test_a_grip_never_drops_what_is_held(way, tmp_path):
         with pytest.raises(ActionError, match="or may hold it"):
             await task.grip(replace_step(GRIP, width_mm=60.0))
         assert rig.model.width_mm == held_mm, "after a halt the gripper does not say what it holds"
+
+
+@WAYS
+async def test_a_hot_gripper_refuses_a_grip_and_opens_for_a_release(way, tmp_path):
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        rig.model.object_mm = 40.0
+        task = task_of(rig)
+        await task.grip(GRIP)
+        held_mm = rig.model.width_mm
+        rig.model.fail(8)
+        with pytest.raises(NotBegunError, match="too hot"):
+            await task.grip(replace_step(GRIP, force_n=100.0))
+        assert rig.model.width_mm == held_mm
+        await task.open_by_operator()
+        assert rig.model.width_mm > 100
 
 
 @WAYS

@@ -11,15 +11,17 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import FOLLOWED_MM, SAME_WIDTH_MM, Grip
+from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memory, write_memory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
-from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, phase, started, stop
+from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS
 
 
@@ -435,3 +437,44 @@ async def test_only_a_zero_that_somebody_took_is_known_after_a_restart(tared):
     after.run(0.1)
     assert (why_no_turn(after) == "") is tared
     assert cell.calibration.tare_counts == (8321.5 if tared else 8000.0)
+
+
+@pytest.mark.parametrize("befalls", ["nothing", "unplugged", "asked anew"])
+async def test_a_restored_zero_that_was_lost_since_is_none(befalls):
+    before, cell = Rig(new_loop(needs_zero=True)), load_cell()
+    cell.tare(8321.5)
+    before.control_loop.on_zero("load_cell")
+    before.force_n = 60.0
+    before.run(0.6)
+    await RigMemory(FILES, before.control_loop, cell).save_present()
+    after, cell = Rig(new_loop(needs_zero=True)), load_cell()
+    memory = RigMemory(FILES, after.control_loop, cell)
+    if befalls == "unplugged":
+        after.control_loop.on_link("load_cell", "it was unplugged", up=False)
+        after.control_loop.on_link("load_cell", "", up=True)
+    elif befalls == "asked anew":
+        after.control_loop.on_zero("load_cell", known=False)
+    after.force_n = 60.0
+    after.run(0.6)
+    assert (why_no_turn(after) == "") is (befalls == "nothing")
+    await memory.save_present()
+    assert (read_memory(FILES.states[0]).load_zero == 8321.5) is (befalls == "nothing")
+
+
+async def test_only_a_wrench_that_somebody_tared_has_a_known_zero_after_a_restart():
+    for tared in (False, True):
+        before = Rig(ControlLoop(CONFIG, {"right": EIT, "wrench": wrench_source(125.0)}, ("gripper", "right")))
+        if tared:
+            before.control_loop.on_zero("wrench")
+        before.force_n = 60.0
+        before.run(0.6)
+        robot = UrRobot(SETTINGS)
+        robot.restore_wrench_zero((0.0, 1.0, 0.0, 0.0, 0.0, -0.11))
+        await RigMemory(FILES, before.control_loop, robot=robot).save_present()
+        after = Rig(ControlLoop(CONFIG, {"right": EIT, "wrench": wrench_source(125.0)}, ("gripper", "right")))
+        again = UrRobot(SETTINGS)
+        RigMemory(FILES, after.control_loop, robot=again)
+        after.force_n = 60.0
+        after.run(0.6)
+        assert again.wrench_zero[5] == -0.11, "what it reads goes on as before"
+        assert after.control_loop.has_zero("wrench") is tared

@@ -166,6 +166,10 @@ async def test_a_gripper_that_is_too_hot_is_not_activated_and_drops_nothing(way,
         await rig.driver.read()
         assert rig.model.width_mm == held_mm
         assert rig.model.taken.act, "it was not reset"
+        # Where the tool is to drop anyway, nothing keeps it.
+        await rig.driver.activate(may_drop=True)
+        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(140.0)))
+        assert rig.model.width_mm > 100
 
 
 @WAYS

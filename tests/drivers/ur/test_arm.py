@@ -201,6 +201,14 @@ def test_the_zero_of_a_cb3_is_the_mean_of_its_noisy_samples(arm):
     last = round(0.5 * SETTINGS.rate_hz)
     assert one.wrench_zero[5] == pytest.approx(0.3 + noise_nm[-last:].mean())
     assert abs(one.wrench_zero[5] - 0.3) < 1.5
+    # What a motion has measured is no part of the next zero.
+    turning = {"wrench": (0.0, 0.0, 0.0, 0.0, 0.0, 6.0), "qd_rad_per_s": (0.0,) * 5 + (0.2,)}
+    resting = {"wrench": (0.0, 0.0, 0.0, 0.0, 0.0, 0.4)}
+    for number, state in enumerate([turning] * 80 + [resting] * 2):
+        Receiver.made.sample = dataclasses.replace(received(3.0 + number / 125), **state)
+        one.read()
+    assert one.zero_wrench()
+    assert one.wrench_zero[5] == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("held", [True, False])

@@ -370,7 +370,10 @@ class _Page:
         except UserError as error:
             return self._refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
-        keys = ("ok", "reason", "stopped", "taring", "experiment", *QUESTION, "experiments", "configured")
+        keys = (
+            *("ok", "reason", "stopped", "taring", "not_connected", "experiment"),
+            *(*QUESTION, "experiments", "configured"),
+        )
         content = {key: reply[key] for key in keys if key in reply}
         return web.json_response(content, status=200 if reply.get("ok") else 409)
 

@@ -11,6 +11,13 @@ const STOP_LATE_MS = 4000;
 // An answer disappears after this time; an unconfirmed stop stays.
 const SHOWN_MS = 8000;
 
+// What an accepted command does, in words; a tare ends some seconds later.
+function outcome(name, { taring, not_connected: lost = [] }) {
+  if (name !== "tare") return `${name}: done`;
+  const without = lost.length ? `; NOT of ${lost.join(", ")}, which is not connected` : "";
+  return `tare: the zero of ${taring.join(", ")} is being taken${without}`;
+}
+
 export class Controls {
   constructor() {
     this.takeTokenFromAddress();
@@ -126,7 +133,7 @@ export class Controls {
     // A refusal of the first press with a question is no more than the question.
     const asks_only = reply.question && !digest;
     if (!reply.ok) this.tell(asks_only ? "" : `${name} was refused: ${reply.reason}`, "bad");
-    else this.tell(reply.question ? "" : `${name}: done`);
+    else this.tell(reply.question ? "" : outcome(name, reply));
     if (reply.question) this.ask_about(name, reply.question, reply.plan, reply.digest);
     // Ask again after a wrong token.
     if (reply.status === 403) this.keep("");

@@ -61,6 +61,7 @@ PLAN = [
     "   1  grip  closes the fingers",
     "   2  loosen  clockwise by up to 0.3 N·m",
 ]
+REPLIES = {"stop": {"stopped": "hold 0.10 N·m"}, "tare": {"taring": ["right", "load_cell"], "not_connected": ["left"]}}
 COMMANDS = ("tare", "start", "pause", "resume", "unlock", "release", "stop")
 
 
@@ -122,7 +123,7 @@ async def serve(folder: Path) -> None:
                 asked.write(" ".join(filter(None, (name, Path(request.get("experiment", "")).stem))) + "\n")
             if told["refusal"]:
                 raise CommandRefusedError(told["refusal"])
-            return {"stopped": "hold 0.10 N·m"} if name == "stop" else {}
+            return REPLIES.get(name, {})
 
         return handle
 

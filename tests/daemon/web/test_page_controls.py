@@ -41,6 +41,8 @@ COVERED = """() => {
     / area(document.querySelector('main').getBoundingClientRect());
 }"""
 
+TARED = "tare: the zero of right, load_cell is being taken; NOT of left, which is not connected"
+
 
 def test_stop_needs_no_token_and_motion_does(browsed):
     page = browsed.open()
@@ -87,7 +89,7 @@ def test_commands_reach_the_daemon_with_the_token(browsed):
                 browsed.until("#question-text", f"Really {name}? The first motion is told.")
                 assert browsed.daemon.asked == sent, "the first press moves nothing"
                 page.click("#confirm")
-            browsed.until("#answer", f"{name}: done")
+            browsed.until("#answer", TARED if name == "tare" else f"{name}: done")
             sent.append("start hold" if name == "start" else name)
     assert browsed.daemon.asked == sent
     browsed.daemon.say(refusal="no experiment is running")
@@ -127,7 +129,7 @@ def test_the_keyboard_reaches_everything_and_stop_first(browsed):
     browsed.until("#answer", "stopped: hold 0.10 N·m")
     page.focus("[data-command=tare]")
     page.keyboard.press("Space")
-    browsed.until("#answer", "tare: done")
+    browsed.until("#answer", TARED)
     assert browsed.daemon.asked == ["stop", "tare"]
 
 

@@ -53,9 +53,9 @@ def _is_experiment(content: object) -> bool:
     from shearloop.daemon.config import DaemonConfig
     from shearloop.daemon.control.experiment_schema import ExperimentFile
 
-    if not isinstance(content, dict) or "steps" in content:
-        return isinstance(content, dict)
-    if get_close_matches("steps", map(str, content), 1, 0.75):
+    if not isinstance(content, dict):
+        return False
+    if "steps" in content or get_close_matches("steps", map(str, content), n=1, cutoff=0.75):
         return True
     of_experiments, of_configurations = (
         sum(key in model.model_fields for key in content) for model in (ExperimentFile, DaemonConfig)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
@@ -183,10 +183,13 @@ class Commands:
         lost = [name for name in names if tasks.get(name, {}).get("connected") is False]
         taring = [name for name in names if name not in lost]
         if not taring:
-            raise CommandRefusedError(f"not connected: {' and '.join(lost)}")
+            raise CommandRefusedError(f"not connected: {' and '.join(lost)}; connect it, then send the tare again")
         for name in taring:
             sensors[name].tare(confirmed=confirmed)
-        return {"taring": taring, **({"not_connected": lost} if lost else {})}
+        reply: dict[str, Any] = {"taring": taring}
+        if lost:
+            reply["not_connected"] = lost
+        return reply
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()

@@ -118,7 +118,9 @@ class LatestTorques:
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
         loaded = loaded_sentence(self._torques_nm)
-        return f"{loaded}, which would become the zero; {CONFIRM_TARE}" if loaded and not confirmed else None
+        if confirmed or not loaded:
+            return None
+        return f"{loaded}, which would become the zero; {CONFIRM_TARE}"
 
 
 def loaded_sentence(torques_nm: Mapping[str, float | None]) -> str:

@@ -120,6 +120,18 @@ class TemporalFeatures(Motion):
         return np.concatenate([moved, from_idle]) if self.uses_position else moved
 
 
+def _reads_position(alone: "MotionFit", with_position: "MotionFit", torque_nm: FloatArray) -> bool:
+    """Return whether torques (n,) are fitted to the gel's position too, by both fits' errors on frames left out."""
+    variance = float(torque_nm.var())
+    leaves_much = alone.squared_error > _MOTION_MAY_LEAVE * variance
+    share = _POSITION_GAINS if leaves_much else _POSITION_GAINS_MUCH
+    if with_position.squared_error < share * alone.squared_error:
+        return True
+    loaded_nm = LOADED_SHARE * float(np.abs(torque_nm).max())
+    both_ways = bool(torque_nm.min() < -loaded_nm and torque_nm.max() > loaded_nm)
+    return both_ways and with_position.squared_error < _POSITION_MAY_LEAVE * variance
+
+
 @dataclass(frozen=True, eq=False)
 class MotionRegression(Estimator):
     """A ridge on the gel's motion over the last frames."""
@@ -196,12 +208,7 @@ class MotionRegression(Estimator):
         alone, with_position = (
             choose_motion(features, torque_nm, layout, fit_one, left_out, position=used) for used in (False, True)
         )
-        share = _POSITION_GAINS if alone.squared_error > _MOTION_MAY_LEAVE * variance else _POSITION_GAINS_MUCH
-        enough = share * alone.squared_error
-        both_ways = min(-float(torque_nm.min()), float(torque_nm.max())) > LOADED_SHARE * float(np.abs(torque_nm).max())
-        if both_ways:
-            enough = max(enough, _POSITION_MAY_LEAVE * variance)
-        chosen = with_position if with_position.squared_error < enough else alone
+        chosen = with_position if _reads_position(alone, with_position, torque_nm) else alone
         regressor = fit_interval_regressor(
             features[:, chosen.columns], torque_nm, chosen.fit_used, strengths=(0.0,), limit_features=True,
             twists=twists, bounds=bounds, recordings=recordings, fingertips=len(temporal.directions),

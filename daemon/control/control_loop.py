@@ -6,6 +6,7 @@ A plain object without I/O or clock: inputs come in, `ControlOutput` go out, and
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, Hold, StepCommand, TrackTorque
@@ -61,6 +62,14 @@ class LoopStatus:
     decision: SafetyDecision
 
 
+class _KnownGrip(NamedTuple):
+    """What was known of a grip; the names are those of `_GrippedTool`."""
+
+    grip: Grip
+    is_earlier: bool
+    another: str
+
+
 @dataclass(slots=True)
 class _GrippedTool:
     """What the loop knows of the tool between the fingers."""
@@ -70,8 +79,8 @@ class _GrippedTool:
     is_earlier: bool = False
     # Why the object is of another grip than the last one that was known.
     another: str = ""
-    # These three before the present `grip` step, which may be refused.
-    before_closing: tuple[Grip, bool, str] | None = None
+    # What was known as the present `grip` step began, which may be refused.
+    before_closing: _KnownGrip | None = None
     # When the latest grip, release or tare ended, until each torque has been measured since, or should have been.
     unmeasured_since_ns: int | None = None
     # Whether a tool should be between the fingers.
@@ -138,10 +147,9 @@ class ControlLoop:
         self._later_stop = ""
         # Awaits the gripper's first state that shows whether a grip of an earlier process is the present one.
         self._on_judged: OnJudged | None = None
-        # The sources whose zero has been taken since this process began, or is kept from the one before.
-        self._zeroed: set[str] = set()
-        # The sources whose zero has been lost since, or asked for and not taken.
-        self._distrusted: set[str] = set()
+        # By source: whether its zero is known, which was taken since this process began or is kept from an earlier one.
+        # It is not known once it was lost, or asked for and not taken; a source without an entry had neither.
+        self._zero_known: dict[str, bool] = {}
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
 
@@ -166,13 +174,11 @@ class ControlLoop:
 
     def on_zero(self, source: str, *, known: bool = True) -> None:
         """Take that a source's zero is known from now on, or is not."""
-        (self._zeroed.add if known else self._zeroed.discard)(source)
-        (self._distrusted.discard if known else self._distrusted.add)(source)
+        self._zero_known[source] = known
 
     def on_restored_zero(self, source: str) -> None:
-        """Take that a zero of the process before is of the present grip; one that was lost since is none."""
-        if source not in self._distrusted:
-            self._zeroed.add(source)
+        """Take that an earlier process's zero is of the present grip, unless it was lost since then."""
+        self._zero_known.setdefault(source, True)
 
     def torques_of(self, source: str) -> tuple[Sequence[int], Sequence[float]]:
         """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m."""
@@ -242,7 +248,9 @@ class ControlLoop:
         if not isinstance(action, TareStep | GripStep):
             return
         if isinstance(action, TareStep):
-            self._zeroed.update(name for name, source in self._sources.items() if source.from_robot)
+            for name, source in self._sources.items():
+                if source.from_robot:
+                    self.on_zero(name)
         # The tool was identified with another zero, or in another grip.
         self._forget_tool()
         gripped.unmeasured_since_ns = arm.t_ns if arm is not None else None
@@ -256,9 +264,11 @@ class ControlLoop:
 
     def on_grip_refused(self) -> None:
         """Take that the present `grip` step was refused before the fingers moved: what they hold is as it was."""
-        gripped = self._gripped
-        if gripped.before_closing is not None:
-            gripped.grip, gripped.is_earlier, gripped.another = gripped.before_closing
+        gripped, before = self._gripped, self._gripped.before_closing
+        if before is not None:
+            gripped.grip = before.grip
+            gripped.is_earlier = before.is_earlier
+            gripped.another = before.another
 
     def on_release_ended(self, error: str | None = None) -> None:
         """Take the end of the release after a stop, and why the gripper did not open, if it did not."""
@@ -408,7 +418,7 @@ class ControlLoop:
 
     def has_zero(self, source: str) -> bool:
         """Return whether a source's zero was taken since this process began, or is kept from the one before."""
-        return source in self._zeroed
+        return self._zero_known.get(source, False)
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
@@ -653,8 +663,10 @@ class ControlLoop:
         if isinstance(action, GripStep):
             # A process that dies while the fingers close leaves this force behind.
             force_n = max(gripped.grip.force_n or 0.0, action.force_n)
-            gripped.before_closing = gripped.grip, gripped.is_earlier, gripped.another
-            gripped.grip, gripped.is_earlier, gripped.another = Grip(origin_rad, force_n), False, ""
+            gripped.before_closing = _KnownGrip(gripped.grip, gripped.is_earlier, gripped.another)
+            gripped.grip = Grip(origin_rad, force_n)
+            gripped.is_earlier = False
+            gripped.another = ""
             gripper = self.inputs.gripper
             gripped.tightens = gripper is not None and gripper.holding and not isinstance(action, Opening)
         if isinstance(action, IdentifyStep):

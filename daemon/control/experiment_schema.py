@@ -420,9 +420,12 @@ class Before(NamedTuple):
     wrist_rad: float | None = None
 
 
+NOTHING_BEFORE: Final = Before()
+
+
 def demands(planned: Iterable[Step], speeds: Speeds = AS_ASKED) -> Iterator[Demand]:
     """Yield the demand of each step after those before it."""
-    before = Before()
+    before = NOTHING_BEFORE
     for step in planned:
         yield demand(step, speeds, before)
         match step:
@@ -433,11 +436,11 @@ def demands(planned: Iterable[Step], speeds: Speeds = AS_ASKED) -> Iterator[Dema
             case GripStep() | ReleaseStep() | TwistStep(return_to_start=True):
                 before = Before(wrist_rad=before.wrist_rad)
             case TwistStep() | TightenStep() | IdentifyStep():
-                # Their end is known only then.
-                before = Before()
+                # How they end is not known before.
+                before = NOTHING_BEFORE
 
 
-def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = Before()) -> Demand:  # noqa: B008 - it is immutable
+def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFORE) -> Demand:
     """Return the demand of a step; unknown values, as in an outline, are 0."""
     match step:
         case HoldTorqueStep(torque_nm=torque_nm):

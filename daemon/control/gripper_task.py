@@ -16,7 +16,13 @@ from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
-from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand, GripperState, ObjectStatus
+from shearloop.drivers.robotiq.messages import (
+    ActivationStatus,
+    GripperCommand,
+    GripperState,
+    GripperTooHotError,
+    ObjectStatus,
+)
 from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM
 from shearloop.errors import ActionError, NotBegunError
 from shearloop.estimation import Measured, combine
@@ -58,9 +64,10 @@ class GripperTask:
     async def grip(self, target: GripStep) -> None:
         """Move to a width and wait for the end; raises DriverError and ActionError."""
         with self._motion.commanded(self.clock.now_ns()):
-            if not (opens := isinstance(target, Opening)) and (fault := (await self.gripper.read()).fault).too_hot:
-                raise NotBegunError(fault.sentence)
-            await self.gripper.activate(may_drop=opens)
+            try:
+                await self.gripper.activate(may_drop=isinstance(target, Opening))
+            except GripperTooHotError as error:
+                raise NotBegunError(str(error)) from error
             if (width_mm := await self._width_of(target)) is None:
                 return
             sent = await self.gripper.move(GripperCommand(width_mm, target.speed_mm_per_s, target.force_n))

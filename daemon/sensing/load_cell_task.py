@@ -107,10 +107,11 @@ class LoadCellTask:
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
     def _not_taken(self, within_s: float) -> str:
-        latest = self._latest
+        latest, reason = self._latest, ""
         # A reading from before says nothing of the time since.
-        came = latest is not None and latest.t_mid_ns >= self._zero_from_ns
-        reason = (_reason(latest) if latest is not None and came else "") or "no usable reading came"
+        if latest is not None and latest.t_mid_ns >= self._zero_from_ns:
+            reason = _reason(latest)
+        reason = reason or "no usable reading came"
         return f"the load cell's zero could not be taken within {within_s:.3g} s: {reason}"
 
     def _take_zero(self, sample: LoadSample) -> None:

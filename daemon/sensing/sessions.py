@@ -186,10 +186,11 @@ def _shared_search(bank: Bank, matching: str) -> "BankSearch":
     # Only a rig with a bank loads what searches it.
     from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
+    searches: Mapping[str, type[BankSearch]] = {"all_lags": PrunedMatcher, "zero_lag": PrunedZeroLagMatcher}
     key = (f"{bank.identity} {bank.signals_sha256}", matching)
     shared = _in_use.get(key)
     if shared is None:
-        shared = _in_use[key] = (PrunedZeroLagMatcher if matching == "zero_lag" else PrunedMatcher).from_bank(bank)
+        shared = _in_use[key] = searches[matching].from_bank(bank)
     return shared
 
 

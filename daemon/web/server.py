@@ -57,6 +57,18 @@ WORDS = {"start": ("experiment", "digest"), "unlock": ("digest",), "release": ("
 ASKED_IF_NEEDED = ("unlock",)
 # The parts of a question, which a refusal has as well where another one is to be answered.
 QUESTION = ("question", "plan", "digest")
+# The parts of a daemon's reply that a page shows.
+_SHOWN_KEYS = (
+    "ok",
+    "reason",
+    "stopped",
+    "taring",
+    "not_connected",
+    "experiment",
+    *QUESTION,
+    "experiments",
+    "configured",
+)
 # Wrong tokens that are compared at once, and then per second.
 WRONG_BURST, WRONG_PER_S = 20.0, 1.0
 # Maximum redraw rate of a page.
@@ -370,11 +382,7 @@ class _Page:
         except UserError as error:
             return self._refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
-        keys = (
-            *("ok", "reason", "stopped", "taring", "not_connected", "experiment"),
-            *(*QUESTION, "experiments", "configured"),
-        )
-        content = {key: reply[key] for key in keys if key in reply}
+        content = {key: reply[key] for key in _SHOWN_KEYS if key in reply}
         return web.json_response(content, status=200 if reply.get("ok") else 409)
 
     async def stream(self, request: web.Request) -> web.StreamResponse:

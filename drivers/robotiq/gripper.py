@@ -46,7 +46,7 @@ ACTIVATION_DEADLINE_NS = 15_000_000_000
 MOTION_DEADLINE_NS = 10_000_000_000
 # Of the nominal counts per millimetre: more means diameters in another unit, or another model.
 _STEEPEST = 2.5
-_OVER_TEMPERATURE, _NO_COMMUNICATION = 8, 9
+_NO_COMMUNICATION = 9
 
 
 class WidthCalibration(CalibrationModel):
@@ -245,7 +245,7 @@ class RobotiqGripper:
 
         After a major fault the operator has to confirm that the fingers are clear. `operator_confirmed` activates in
         any state. One that is too hot is activated only where what it holds `may_drop`. Raises GripperFaultError when
-        the activation is refused or fails.
+        the activation is refused or fails, GripperTooHotError where that is why.
         """
         readout, t_ns = await self._recent()
         fault = messages.fault_of(readout.flt)
@@ -255,7 +255,7 @@ class RobotiqGripper:
                     f"{fault.sentence} An operator has to confirm that the fingers are clear."
                 )
             if fault.too_hot and not may_drop:
-                raise messages.GripperFaultError(fault.sentence)
+                raise messages.GripperTooHotError(fault.sentence)
             if not blocking_fault(readout):
                 return self._state(readout, t_ns)
         await self._write(messages.GripperAction.RESET)
@@ -453,7 +453,7 @@ class RobotiqGripper:
 
 def _is_active(readout: messages.Readout) -> bool:
     # Lower faults are normal during an activation, as is a silence before it.
-    if readout.act and readout.flt >= _OVER_TEMPERATURE and readout.flt != _NO_COMMUNICATION:
+    if readout.act and readout.flt >= messages.OVER_TEMPERATURE_CODE and readout.flt != _NO_COMMUNICATION:
         raise messages.GripperFaultError(messages.fault_of(readout.flt).sentence)
     return readout.act and readout.sta is messages.ActivationStatus.ACTIVE
 
@@ -461,7 +461,7 @@ def _is_active(readout: messages.Readout) -> bool:
 def blocking_fault(readout: messages.Readout) -> str:
     """Return why the gripper would not move now, as a sentence, or an empty string."""
     fault = messages.fault_of(readout.flt)
-    if fault.needs_activation or fault.code == _OVER_TEMPERATURE:
+    if fault.needs_activation or fault.too_hot:
         return fault.sentence
     if readout.sta is messages.ActivationStatus.ACTIVATING:
         return messages.fault_of(5).sentence

@@ -11,10 +11,15 @@ MA_PER_COUNT = 10.0
 _RELEASING_CODE = 11
 # From this fault code on the gripper takes no command before a new activation: a rising edge of ACT.
 FIRST_MAJOR_CODE = 10
+OVER_TEMPERATURE_CODE = 8
 
 
 class GripperFaultError(DriverError):
     """The gripper reports a fault that prevents the request."""
+
+
+class GripperTooHotError(GripperFaultError):
+    """The gripper has to cool down; nothing was sent."""
 
 
 class GripperRefusedError(DriverError):
@@ -36,7 +41,7 @@ class GripperFault:
     @property
     def too_hot(self) -> bool:
         """Whether the gripper takes no commands until it has cooled down; an activation would open its fingers."""
-        return self.code == 8
+        return self.code == OVER_TEMPERATURE_CODE
 
 
 _FAULTS = {

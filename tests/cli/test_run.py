@@ -214,7 +214,7 @@ async def test_a_load_cell_works_without_a_robot(config, tmp_path):
             refused = await ask(daemon, "tare", source="load_cell")
             assert re.match(r"load_cell measures \+0\.0[78]\d N·m, which would become the zero; ", refused["reason"])
             absent = await ask(daemon, "tare", source="right", confirmed=True)
-            assert absent["reason"] == "not connected: right"
+            assert absent["reason"] == "not connected: right; connect it, then send the tare again"
             reply = await ask(daemon, "tare", confirmed=True)
             assert (reply["taring"], reply["not_connected"]) == (["load_cell"], ["right"])
             while abs((await torques.get())["torque_nm"]) > 0.005:

@@ -216,6 +216,9 @@ export function robotPanel(link) {
   put(byId("speed-command"), clipped ? `requested ${number(sent.speed_command_rad_per_s, 3, "", SIGNED)}` : "");
 }
 
+// What the gripper holds while its state, `object`, gives no diameter.
+const WITHOUT_DIAMETER = { unknown: "not known", moving: "–" };
+
 export function gripperPanel(link) {
   const message = link.get("gripper.state");
   const known = "gripper" in (link.get("health")?.content.tasks ?? {});
@@ -227,8 +230,8 @@ export function gripperPanel(link) {
   put(byId("gripper-width"), link.number(message, "width_mm", 1));
   put(byId("gripper-object"), said.object);
   const spread = said.diameter_std_mm == null ? "" : ` ± ${number(said.diameter_std_mm, 1)}`;
-  const nothing = said.object === "unknown" ? "not known" : said.object === "moving" ? "–" : "nothing held";
-  put(byId("gripper-diameter"), said.diameter_mm == null ? nothing : `${number(said.diameter_mm, 1)}${spread} ${link.unit("gripper.state", "diameter_mm")}`);
+  const without = WITHOUT_DIAMETER[said.object] ?? "nothing held";
+  put(byId("gripper-diameter"), said.diameter_mm == null ? without : `${number(said.diameter_mm, 1)}${spread} ${link.unit("gripper.state", "diameter_mm")}`);
   put(byId("gripper-current"), link.number(message, "current_ma", 0));
 }
 

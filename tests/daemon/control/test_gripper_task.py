@@ -37,6 +37,14 @@ def task_of(rig: Rig, felt: Felt | None = None, *, measures_diameters: bool = Tr
     return GripperTask(rig.driver, silent, Felt() if felt is None else felt, diameters, Clock(), measures_diameters)
 
 
+async def holding(rig: Rig) -> tuple[GripperTask, float]:
+    """Grip an object of 40 mm; return the task, and the true width."""
+    rig.model.object_mm = 40.0
+    task = task_of(rig)
+    await task.grip(GRIP)
+    return task, rig.model.width_mm
+
+
 @asynccontextmanager
 async def reading(way: str, folder: Path, **settings: float) -> AsyncIterator[tuple[Rig, GripperTask, Felt]]:
     """Yield a rig and a task that reads its gripper."""
@@ -165,10 +173,7 @@ async def test_a_release_never_closes_the_fingers(way, tmp_path):
 @WAYS
 async def test_a_grip_never_drops_what_is_held(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
-        rig.model.object_mm = 40.0
-        task = task_of(rig)
-        await task.grip(GRIP)
-        held_mm = rig.model.width_mm
+        task, held_mm = await holding(rig)
         for target in (replace_step(GRIP, width_mm=60.0), replace_step(GRIP, width_mm=60.0, expect_object=False)):
             with pytest.raises(ActionError, match=r"40\.\d mm apart and hold .*, and a grip to 60 mm would"):
                 await task.grip(target)
@@ -183,10 +188,7 @@ async def test_a_grip_never_drops_what_is_held(way, tmp_path):
 @WAYS
 async def test_a_hot_gripper_refuses_a_grip_and_opens_for_a_release(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
-        rig.model.object_mm = 40.0
-        task = task_of(rig)
-        await task.grip(GRIP)
-        held_mm = rig.model.width_mm
+        task, held_mm = await holding(rig)
         rig.model.fail(8)
         with pytest.raises(NotBegunError, match="too hot"):
             await task.grip(replace_step(GRIP, force_n=100.0))
@@ -198,10 +200,7 @@ async def test_a_hot_gripper_refuses_a_grip_and_opens_for_a_release(way, tmp_pat
 @WAYS
 async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_path):
     async with a_rig(way, tmp_path, connected=True) as rig, asyncio.timeout(DEADLINE_S):
-        rig.model.object_mm = 40.0
-        task = task_of(rig)
-        await task.grip(GRIP)
-        held_mm = rig.model.width_mm
+        task, held_mm = await holding(rig)
         rig.driver.latest = None
         await task.unlock()
         for _ in range(200):

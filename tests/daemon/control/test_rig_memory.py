@@ -416,9 +416,8 @@ def why_no_turn(rig: Rig) -> str:
     return said
 
 
-@pytest.mark.parametrize("tared", [False, True])
-async def test_only_a_zero_that_somebody_took_is_known_after_a_restart(tared):
-    """The pendant has gripped the tool: a zero that is the calibration's own is none of this rig's."""
+async def restarted_with_a_tool(*, tared: bool) -> tuple[Rig, LoadCell, RigMemory]:
+    """Return a rig whose tool the pendant gripped before the daemon was restarted; the gripper is not heard yet."""
     before, cell = Rig(new_loop(needs_zero=True)), load_cell()
     if tared:
         cell.tare(8321.5)
@@ -427,7 +426,13 @@ async def test_only_a_zero_that_somebody_took_is_known_after_a_restart(tared):
     before.run(0.6)
     await RigMemory(FILES, before.control_loop, cell).save_present()
     after, cell = Rig(new_loop(needs_zero=True)), load_cell()
-    memory = RigMemory(FILES, after.control_loop, cell)
+    return after, cell, RigMemory(FILES, after.control_loop, cell)
+
+
+@pytest.mark.parametrize("tared", [False, True])
+async def test_only_a_zero_that_somebody_took_is_known_after_a_restart(tared):
+    """The pendant has gripped the tool: a zero that is the calibration's own is none of this rig's."""
+    after, cell, memory = await restarted_with_a_tool(tared=tared)
     # Until the fingers rest, nobody knows whether it is the same grip.
     after.hand, still = replace(after.hand, moving=True), after.hand
     after.run(0.6)
@@ -439,20 +444,13 @@ async def test_only_a_zero_that_somebody_took_is_known_after_a_restart(tared):
     assert cell.calibration.tare_counts == (8321.5 if tared else 8000.0)
 
 
-@pytest.mark.parametrize("befalls", ["nothing", "unplugged", "asked anew"])
+@pytest.mark.parametrize("befalls", ["nothing", "unplugged", "asked for again"])
 async def test_a_restored_zero_that_was_lost_since_is_none(befalls):
-    before, cell = Rig(new_loop(needs_zero=True)), load_cell()
-    cell.tare(8321.5)
-    before.control_loop.on_zero("load_cell")
-    before.force_n = 60.0
-    before.run(0.6)
-    await RigMemory(FILES, before.control_loop, cell).save_present()
-    after, cell = Rig(new_loop(needs_zero=True)), load_cell()
-    memory = RigMemory(FILES, after.control_loop, cell)
+    after, _, memory = await restarted_with_a_tool(tared=True)
     if befalls == "unplugged":
         after.control_loop.on_link("load_cell", "it was unplugged", up=False)
         after.control_loop.on_link("load_cell", "", up=True)
-    elif befalls == "asked anew":
+    elif befalls == "asked for again":
         after.control_loop.on_zero("load_cell", known=False)
     after.force_n = 60.0
     after.run(0.6)

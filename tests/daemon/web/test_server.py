@@ -524,7 +524,7 @@ async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(conf
                 assert (await post(page, f"/commands/{command}"))[0] == 403, command
             bearer = {"Authorization": f"Bearer {page.token}"}
             status, reply = await post(page, "/commands/tare", **bearer)
-            assert (status, reply["reason"]) == (409, "not connected: right")
+            assert (status, reply["reason"]) == (409, "not connected: right; connect it, then send the tare again")
             # It came to the daemon, which has nothing to start.
             status, reply = await post(page, "/commands/start", **bearer)
             assert status == 409

@@ -161,7 +161,7 @@ async def test_a_gripper_that_is_too_hot_is_not_activated_and_drops_nothing(way,
         held_mm = rig.model.width_mm
         rig.model.fail(8)
         await rig.driver.read()
-        with pytest.raises(messages.GripperFaultError, match="too hot"):
+        with pytest.raises(messages.GripperTooHotError, match="too hot"):
             await rig.driver.activate()
         await rig.driver.read()
         assert rig.model.width_mm == held_mm

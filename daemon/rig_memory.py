@@ -53,7 +53,7 @@ class Remembered:
     # with a tool in the fingers nobody can take another zero.
     load_zero: float | None = None
     load_nm_per_count: float | None = None
-    # The zero of the wrench in this grip, and whether somebody has taken it; else it is of a program's start.
+    # The zero of the wrench in this grip, and whether it was taken; else it is that of a program's start.
     wrench_zero: Six | None = None
     wrench_tared: bool = False
 
@@ -96,7 +96,7 @@ class RigMemory:
     # The load cell's zero by its calibration, and the restored one.
     _calibrated_zero: float | None = None
     _load_restored: float | None = None
-    # Whether the wrench has the zero of the grip before, and whether somebody had taken that.
+    # Whether the wrench has the zero of the grip before, and whether that was taken.
     _wrench_restored: bool = False
     _wrench_tared: bool = False
     # Whether the gripper has shown since if it still has that grip: until then the restored zeros are kept.
@@ -186,14 +186,14 @@ class RigMemory:
 
     @property
     def _knows_load_zero(self) -> bool:
-        """Whether the load cell's zero was taken by somebody: else it is its calibration's, of another day."""
+        """Whether the load cell's zero was taken; else it is its calibration's, of another day."""
         cell = self.load_cell
         restored = cell is not None and cell.calibration.tare_counts == self._load_restored
         return self.loop.has_zero(LOAD_CELL) or (restored and not self._judged)
 
     @property
     def _knows_wrench_zero(self) -> bool:
-        """Whether the wrench's zero was taken by somebody."""
+        """Whether the wrench's zero was taken."""
         return self.loop.has_zero(WRENCH) or (self._wrench_tared and not self._judged)
 
     async def save(self, state: Remembered) -> None:

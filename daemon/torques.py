@@ -49,7 +49,7 @@ class TorqueSource:
     fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
     the first torque; 0 for a source that measures without a grip. `has_gain`: an `adapt` step can correct its gain.
     `noise_nm`: the torque is known to this; such a source supervises beyond it only, and drives nothing gentler.
-    `needs_zero`: its torques count from a zero that somebody has to take. `only_sign`: of the only torques that it
+    `needs_zero`: its torques count from a zero that has to be taken. `only_sign`: of the only torques that it
     measures, 0 for both; a torque of the other sign may read as 0.
     """
 

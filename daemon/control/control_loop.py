@@ -299,7 +299,7 @@ class ControlLoop:
 
     @property
     def _unknown_grip(self) -> str:
-        """Why the grip of what is held is not known; empty where it is, or nothing is held."""
+        """Why the present grip is not known; empty where it is, or where nothing is held."""
         gripped = self._gripped
         # A turn gives a grip an angle, and only a `grip` step its force.
         known = gripped.grip.force_n is not None
@@ -372,7 +372,7 @@ class ControlLoop:
         return f" Before step {first[0]} the gripper is activated: its fingers open and close once, and a tool drops."
 
     def held_note(self, file: ExperimentFile) -> str:
-        """Return what is held as the first step moves, for the operator who starts; or an empty string."""
+        """Return what the gripper holds as the first step moves, for the operator's question; or an empty string."""
         held = self.held
         if held is None or first_motion_before_grip(file) is None:
             return ""

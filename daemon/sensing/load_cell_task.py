@@ -128,7 +128,7 @@ class LoadCellTask:
             self._end_zero(sum(self._zeroing) / ZERO_SAMPLES)
 
     def _end_zero(self, raw: float) -> None:
-        """Make a raw value the zero, unless it is a load that nobody has confirmed to be none."""
+        """Make a raw value the zero; a load is refused unless the operator has confirmed that there is none."""
         self._zeroing = None
         loaded = loaded_sentence({LOAD_CELL: self._board.calibration.torque_nm(raw)})
         if loaded and not self._confirmed:

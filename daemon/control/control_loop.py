@@ -362,7 +362,7 @@ class ControlLoop:
     def _activates(self) -> bool:
         """Whether the gripper is activated before its next motion, as after a fault or a loss of power."""
         gripper = self.inputs.gripper
-        return gripper is not None and (bool(gripper.fault) or gripper.inactive)
+        return gripper is not None and (bool(gripper.fault) or gripper.inactive or gripper.too_hot)
 
     def activation_note(self, file: ExperimentFile) -> str:
         """Return what the first step with the gripper does besides, for the operator who starts; or an empty string."""
@@ -385,6 +385,8 @@ class ControlLoop:
         first, held = first_gripper_step(file), self.may_still_hold
         if first is None or not isinstance(first[1], GripStep) or not self._activates() or held is None:
             return None
+        if self.inputs.gripper is not None and self.inputs.gripper.too_hot:
+            return f"{held}; the gripper is too hot for step {first[0]} (grip): let it cool down"
         return (
             f"{held}; step {first[0]} (grip) would activate the gripper first, which opens its fingers, and the tool "
             "drops: take it out with `shearloop command release --yes`, or put a `release` before it"
@@ -429,6 +431,8 @@ class ControlLoop:
             )
         if (held := self.held) is not None:
             return f"{held}, and its torque would become the zero; open the gripper first (`shearloop command release`)"
+        if self.inputs.gripper is None and self.may_hold():
+            return "the gripper has not answered yet, and an earlier daemon had gripped a tool: wait until it does"
         if confirmed:
             return None
         if (uncertain := self._why_uncertain()) is not None:

@@ -217,4 +217,5 @@ def status_of(state: GripperState) -> GripperStatus:
         requested_counts=state.requested_counts,
         others_requests=state.others_requests,
         inactive=state.activation is not ActivationStatus.ACTIVE,
+        too_hot=state.fault.too_hot,
     )

@@ -35,7 +35,7 @@ class GripperStatus:
     `uncertain`: the gripper cannot say whether it holds an object, because it is inactive, lost its power, or was
     stopped on its way. `requested_counts`: the position that it was last asked for, by anybody. `others_requests`: how
     many requests of other programs were seen. `inactive`: it activates before its next motion, which opens and closes
-    the fingers once.
+    the fingers once. `too_hot`: it refuses a grip, and activates before it opens.
     """
 
     t_ns: int
@@ -47,6 +47,7 @@ class GripperStatus:
     requested_counts: int | None = None
     others_requests: int = 0
     inactive: bool = False
+    too_hot: bool = False
 
     @property
     def fingers(self) -> str:

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import structlog
 
@@ -10,7 +10,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
-from shearloop.daemon.torques import CONFIRM_TARE, LOAD_CELL, SensorListener, TorqueSample, loaded_sentence
+from shearloop.daemon.torques import CONFIRM_TARE, LOAD_CELL, LOADED_NM, SensorListener, TorqueSample, loaded_sentence
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 # Two seconds at 10.9 Hz.
@@ -125,19 +125,33 @@ class LoadCellTask:
         if sample.trusted and sample.t_mid_ns >= self._zero_from_ns:
             self._zeroing.append(sample.raw)
         if len(self._zeroing) == ZERO_SAMPLES:
-            self._end_zero(sum(self._zeroing) / ZERO_SAMPLES)
+            samples, self._zeroing = self._zeroing, None
+            self._end_zero(samples)
 
-    def _end_zero(self, raw: float) -> None:
-        """Make a raw value the zero; a load is refused unless the operator has confirmed that there is none."""
-        self._zeroing = None
-        loaded = loaded_sentence({LOAD_CELL: self._board.calibration.torque_nm(raw)})
-        if loaded and not self._confirmed:
-            self._zero_error = f"the load cell's zero was not taken: {loaded} meanwhile; {CONFIRM_TARE}"
+    def _end_zero(self, samples: Sequence[float]) -> None:
+        """Make the mean of raw samples the zero, unless they are of a load, or of one that came or went."""
+        raw = sum(samples) / len(samples)
+        if why_not := self._why_no_zero(raw, samples):
+            self._zero_error = f"the load cell's zero was not taken: {why_not}"
             structlog.get_logger().warning(self._zero_error)
             return
         self._board.tare(raw)
         if self._loop is not None:
             self._loop.on_zero(LOAD_CELL)
+
+    def _why_no_zero(self, raw: float, samples: Sequence[float]) -> str:
+        """Return why the mean of raw samples is no zero, or an empty string.
+
+        The operator can confirm that a constant torque is no load, and not that a torque that changes is none.
+        """
+        calibration = self._board.calibration
+        changed_nm = abs(calibration.torque_nm(max(samples)) - calibration.torque_nm(min(samples)))
+        if changed_nm > LOADED_NM:
+            return f"its torque changed by {changed_nm:.3f} N·m meanwhile; keep the load away and send the tare again"
+        loaded = loaded_sentence({LOAD_CELL: calibration.torque_nm(raw)})
+        if loaded and not self._confirmed:
+            return f"{loaded} meanwhile; {CONFIRM_TARE}"
+        return ""
 
 
 def load_message(sample: LoadSample) -> LoadTorque:

@@ -711,3 +711,12 @@ def test_a_grip_that_would_drop_the_held_tool_cannot_be_asked():
         )
         or ""
     )
+
+
+def test_a_gripper_that_is_too_hot_says_what_a_release_does_and_grips_nothing():
+    rig = Rig(new_loop())
+    rig.hand, rig.force_n = replace(rig.hand, too_hot=True), 60.0
+    rig.run(0.6)
+    assert "it is activated first: the fingers open and close once" in rig.control_loop.release_question()
+    file = ExperimentFile.model_validate({"name": "one", "torque_source": "right", "steps": [GRIP]})
+    assert "too hot for step 1 (grip): let it cool down" in (rig.control_loop.file_refusal(file) or "")

@@ -476,3 +476,18 @@ async def test_only_a_wrench_that_somebody_tared_has_a_known_zero_after_a_restar
         after.run(0.6)
         assert again.wrench_zero[5] == -0.11, "what it reads goes on as before"
         assert after.control_loop.has_zero("wrench") is tared
+
+
+async def test_no_zero_is_taken_before_the_gripper_shows_what_it_holds():
+    """Not even a confirmed one: an earlier daemon knows of a tool."""
+    before = started(Rig(new_loop()), GRIP, WAIT)
+    before.run(2)
+    await RigMemory(FILES, before.control_loop).save_present()
+    after = Rig(new_loop())
+    RigMemory(FILES, after.control_loop)
+    after.silent.add("hand")
+    after.run(0.6)
+    assert "the gripper has not answered yet" in (after.control_loop.tare_refusal(confirmed=True) or "")
+    after.silent.clear()
+    after.run(0.1)
+    assert after.control_loop.tare_refusal(confirmed=True) is None, "it holds nothing"

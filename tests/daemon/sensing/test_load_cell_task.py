@@ -25,8 +25,8 @@ class Board:
         self.tares: list[float] = []
         self.refusal = ""
         # Nothing is loaded, unless a test says so.
-        self.calibration = SimpleNamespace(torque_nm=lambda _: self.load_nm)
-        self.load_nm = 0.0
+        self.calibration = SimpleNamespace(torque_nm=lambda raw: self.load_nm + self.nm_per_raw * raw)
+        self.load_nm = self.nm_per_raw = 0.0
         self.published: list[LoadTorque] = []
         # Later than all that a test asks for.
         self._seq = Clock().now_ns() + 10**9
@@ -213,3 +213,15 @@ async def test_a_load_that_comes_while_a_zero_is_taken_does_not_become_it(load_n
         await board.send(5.0)
         assert bool(board.tares) is told[-1] is taken
         assert ("was not taken: load_cell measures +0.200 N·m" in task.diagnostics()["error"]) is not taken
+
+
+@pytest.mark.parametrize("confirmed", [False, True])
+async def test_a_load_that_comes_or_goes_while_a_zero_is_taken_refuses_it(confirmed):
+    async with reading() as (task, board):
+        board.nm_per_raw = 1.0
+        task.tare(confirmed=confirmed)
+        await board.send(0.0, ZERO_SAMPLES // 2)
+        await board.send(0.3, ZERO_SAMPLES - ZERO_SAMPLES // 2)
+        assert board.tares == []
+        assert "was not taken: its torque changed by 0.300 N·m meanwhile" in task.diagnostics()["error"]
+        assert not task.taring

@@ -506,7 +506,11 @@ class ControlLoop:
 
     def file_refusal(self, file: ExperimentFile) -> str | None:
         """Return why this experiment cannot begin with the tool and the zeros of now, or None."""
-        return self._why_no_source(file) or self._why_not_with_tool(file)
+        if (reason := self._why_no_source(file) or self._why_not_with_tool(file)) is not None:
+            return reason
+        if isinstance(file.steps[0], TareStep) and (reason := self._why_no_tare_step()) is not None:
+            return f"step 1 (tare): {reason}"
+        return None
 
     def _why_no_source(self, file: ExperimentFile) -> str | None:
         if file.torque_source not in self._wrists:

@@ -11,7 +11,7 @@ from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.torques import CONFIRM_TARE, LOAD_CELL, LOADED_NM, SensorListener, TorqueSample, loaded_sentence
-from shearloop.drivers.load_cell import LoadCell, LoadSample
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 
 # Two seconds at 10.9 Hz.
 ZERO_SAMPLES = 22
@@ -38,6 +38,9 @@ class LoadCellTask:
         self._zero_from_ns = self._zero_until_ns = 0
         self._zero_error: str | None = None
         self._confirmed = False
+        # By which a zero is judged: with the zero before the first tare, or with the last that the operator confirmed.
+        # Small loads in one zero after the other would otherwise add up.
+        self._judged_by: LoadCalibration | None = None
         self._sampled = asyncio.Event()
         self._latest: LoadSample | None = None
 
@@ -65,7 +68,8 @@ class LoadCellTask:
     def tare(self, *, confirmed: bool = False) -> None:
         """Make the mean of samples measured from now on the zero; samples under way belong to the load before.
 
-        A mean that is a load by the zero before is refused unless the operator has `confirmed` that there is none.
+        A mean that is a load is refused unless the operator has `confirmed` that there is none. It is judged by the
+        zero that the operator confirmed last, else by that of the daemon's start.
         """
         self._zeroing, self._zero_error, self._confirmed = [], None, confirmed
         if self._loop is not None:
@@ -136,6 +140,8 @@ class LoadCellTask:
             structlog.get_logger().warning(self._zero_error)
             return
         self._board.tare(raw)
+        if self._confirmed:
+            self._judged_by = self._board.calibration
         if self._loop is not None:
             self._loop.on_zero(LOAD_CELL)
 
@@ -148,9 +154,11 @@ class LoadCellTask:
         changed_nm = abs(calibration.torque_nm(max(samples)) - calibration.torque_nm(min(samples)))
         if changed_nm > LOADED_NM:
             return f"its torque changed by {changed_nm:.3f} N·m meanwhile; keep the load away and send the tare again"
-        loaded = loaded_sentence({LOAD_CELL: calibration.torque_nm(raw)})
+        if self._judged_by is None:
+            self._judged_by = calibration
+        loaded = loaded_sentence({LOAD_CELL: self._judged_by.torque_nm(raw)})
         if loaded and not self._confirmed:
-            return f"{loaded} meanwhile; {CONFIRM_TARE}"
+            return f"{loaded}, counted from the last confirmed tare or the daemon's start; {CONFIRM_TARE}"
         return ""
 
 

@@ -1,7 +1,7 @@
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +17,18 @@ from shearloop.drivers.load_cell import COUNTS_FOR_TORQUES, COUNTS_REASON, TORQU
 from tests.running import running
 
 
+@dataclass(frozen=True)
+class Calibration:
+    """What a load cell's calibration does, with a load that is there at every raw value."""
+
+    load_nm: float = 0.0
+    nm_per_raw: float = 0.0
+    zero: float = 0.0
+
+    def torque_nm(self, raw: float) -> float:
+        return self.load_nm + self.nm_per_raw * (raw - self.zero)
+
+
 class Board:
     """A load cell's board whose samples a test sends."""
 
@@ -25,8 +37,7 @@ class Board:
         self.tares: list[float] = []
         self.refusal = ""
         # Nothing is loaded, unless a test says so.
-        self.calibration = SimpleNamespace(torque_nm=lambda raw: self.load_nm + self.nm_per_raw * raw)
-        self.load_nm = self.nm_per_raw = 0.0
+        self.calibration = Calibration()
         self.published: list[LoadTorque] = []
         # Later than all that a test asks for.
         self._seq = Clock().now_ns() + 10**9
@@ -41,6 +52,7 @@ class Board:
 
     def tare(self, raw_at_rest: float) -> None:
         self.tares.append(raw_at_rest)
+        self.calibration = replace(self.calibration, zero=raw_at_rest)
 
     def diagnostics(self) -> dict[str, bool | str]:
         return {"connected": True, "last_loss": "", "last_refusal": self.refusal}
@@ -209,7 +221,7 @@ async def test_a_load_that_comes_while_a_zero_is_taken_does_not_become_it(load_n
     loop = SimpleNamespace(on_torque=lambda _: None, on_zero=lambda _, known=True: told.append(known))
     async with reading(loop=loop) as (task, board):
         task.tare(confirmed=confirmed)
-        board.load_nm = load_nm
+        board.calibration = Calibration(load_nm=load_nm)
         await board.send(5.0)
         assert bool(board.tares) is told[-1] is taken
         assert ("was not taken: load_cell measures +0.200 N·m" in task.diagnostics()["error"]) is not taken
@@ -218,10 +230,29 @@ async def test_a_load_that_comes_while_a_zero_is_taken_does_not_become_it(load_n
 @pytest.mark.parametrize("confirmed", [False, True])
 async def test_a_load_that_comes_or_goes_while_a_zero_is_taken_refuses_it(confirmed):
     async with reading() as (task, board):
-        board.nm_per_raw = 1.0
+        board.calibration = Calibration(nm_per_raw=1.0)
         task.tare(confirmed=confirmed)
         await board.send(0.0, ZERO_SAMPLES // 2)
         await board.send(0.3, ZERO_SAMPLES - ZERO_SAMPLES // 2)
         assert board.tares == []
         assert "was not taken: its torque changed by 0.300 N·m meanwhile" in task.diagnostics()["error"]
         assert not task.taring
+
+
+async def test_small_loads_in_one_zero_after_the_other_do_not_add_up():
+    async with reading() as (task, board):
+        board.calibration = Calibration(nm_per_raw=1.0)
+
+        async def tare(load_nm: float, *, confirmed: bool = False) -> bool:
+            taken = len(board.tares)
+            task.tare(confirmed=confirmed)
+            await board.send(load_nm)
+            return len(board.tares) > taken
+
+        assert await tare(0.04)
+        assert not await tare(0.08), "it is only 0.04 N·m from the zero before"
+        assert "load_cell measures +0.080 N·m, counted from the last confirmed tare" in task.diagnostics()["error"]
+        assert await tare(0.03)
+        assert await tare(0.08, confirmed=True)
+        assert await tare(0.12), "0.04 N·m from the one that was confirmed"
+        assert not await tare(0.16)

@@ -36,6 +36,8 @@ from shearloop.daemon.torques import CONFIRM_TARE, TorqueSample, TorqueSource, l
 
 # An `adapt` step compares the fingertip with the torques of this time.
 ADAPTED_OVER_S = 600.0
+# Why nobody knows yet whether something is held.
+GRIPPED_BEFORE = "the gripper has not answered yet, and an earlier daemon had gripped a tool"
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,6 +312,8 @@ class ControlLoop:
     @property
     def may_still_hold(self) -> str | None:
         """The object between the fingers, or why a tool that was gripped may still be there; None without one."""
+        if self.inputs.gripper is None:
+            return GRIPPED_BEFORE if self.may_hold() else None
         if self.held is not None or self._gripped.grip.force_n is None:
             return self.held
         return self._why_uncertain()
@@ -412,7 +416,7 @@ class ControlLoop:
             return None
         # A command tares sensors, and an experiment the robot's wrench, too.
         command = "" if driving.from_robot else ", or send `shearloop command tare` with nothing gripped"
-        tare = "a `release` and a `tare`" if self.held is not None else "a `tare`"
+        tare = "a `release` and a `tare`" if self.may_hold() else "a `tare`"
         return (
             f"no zero of the {driving.name} is known since this daemon began, so that its torques and limits may be "
             f"off by any load: put {tare} before step {number} ({file.steps[number - 1].do}){command}"
@@ -432,7 +436,7 @@ class ControlLoop:
         if (held := self.held) is not None:
             return f"{held}, and its torque would become the zero; open the gripper first (`shearloop command release`)"
         if self.inputs.gripper is None and self.may_hold():
-            return "the gripper has not answered yet, and an earlier daemon had gripped a tool: wait until it does"
+            return f"{GRIPPED_BEFORE}: wait until it answers"
         if confirmed:
             return None
         if (uncertain := self._why_uncertain()) is not None:

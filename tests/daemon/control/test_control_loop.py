@@ -646,9 +646,12 @@ def test_no_torque_without_a_zero_turns_a_tool():
     turn = {"do": "turn_to", "angle_rad": 0.4}
     assert refusal(turn) == ""
     assert "step 2 (turn_to)" in refusal(GRIP, turn)
-    rig.force_n = 60.0
+    rig.hand = replace(rig.hand, uncertain=True)
     rig.run(0.1)
-    assert "step 1 (turn_to)" in refusal(turn)
+    assert "put a `release` and a `tare` before step 1 (turn_to)" in refusal(turn), "a tare alone would be refused"
+    rig.hand, rig.force_n = replace(rig.hand, uncertain=False), 60.0
+    rig.run(0.1)
+    assert "put a `release` and a `tare` before step 1 (turn_to)" in refusal(turn)
     rig.control_loop.on_zero("load_cell")
     assert refusal(GRIP, twist) == refusal(turn) == ""
     # It may come back with another zero.

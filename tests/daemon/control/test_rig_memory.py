@@ -488,6 +488,9 @@ async def test_no_zero_is_taken_before_the_gripper_shows_what_it_holds():
     after.silent.add("hand")
     after.run(0.6)
     assert "the gripper has not answered yet" in (after.control_loop.tare_refusal(confirmed=True) or "")
+    # A stop keeps the daemon: without it, no command opens the fingers.
+    assert "an earlier daemon had gripped a tool" in (after.control_loop.may_still_hold or "")
     after.silent.clear()
     after.run(0.1)
+    assert after.control_loop.may_still_hold is None
     assert after.control_loop.tare_refusal(confirmed=True) is None, "it holds nothing"

@@ -90,8 +90,8 @@ class FaultCode(Enum):
     TORQUE_LIMIT = Rule(
         _RELEASE,
         "the torque is beyond its limit: {detail}.",
-        "Find the obstacle of the tool, then `shearloop command unlock`; raise `limits.torque_nm` only if tool and gel "
-        "bear it.",
+        "Find the obstacle of the tool, then `shearloop command unlock`. A tool that is still held is let go by "
+        "`shearloop command release --yes`. Raise `limits.torque_nm` only if tool and gel bear it.",
     )
     ANGLE_LIMIT = Rule(
         _KEEP,

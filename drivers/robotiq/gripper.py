@@ -219,8 +219,11 @@ class RobotiqGripper:
         return MODELS[self.calibration.model]
 
     def diagnostics(self) -> Diagnostics:
-        """Return the gripper's part of `health`; counts are since the process began."""
-        return {**self.monitor.diagnostics(connected=self.connected), "states": self._seq}
+        """Return the gripper's part of `health`; counts are since the process began.
+
+        An open connection is not enough: a gripper without power lets its socket be opened and answers nothing.
+        """
+        return {**self.monitor.diagnostics(connected=self.latest is not None), "states": self._seq}
 
     async def connect(self) -> messages.GripperState:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""

@@ -33,6 +33,21 @@ async def test_silence_is_a_loss_and_clears_the_state(way, tmp_path):
         assert rig.driver.connected
 
 
+async def test_a_gripper_that_lets_itself_be_connected_and_answers_nothing_is_not_connected(tmp_path):
+    async with a_rig("socket", tmp_path, reply_deadline_s=0.2) as rig:
+        rig.silence(True)
+        first = asyncio.create_task(rig.driver.connect())
+        async with asyncio.timeout(20):
+            while not rig.driver.connected:
+                await asyncio.wait([first], timeout=0)
+        assert rig.driver.diagnostics()["connected"] is False
+        with pytest.raises(DeviceLostError):
+            await first
+        rig.silence(False)
+        await rig.driver.connect()
+        assert rig.driver.diagnostics()["connected"] is True
+
+
 @WAYS
 async def test_lost_gripper_reconnects_and_reports_it(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):

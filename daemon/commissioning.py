@@ -3,22 +3,26 @@
 It is a record, not a safety function: only the pendant's safety configuration is rated.
 """
 
-import hashlib
-import json
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
-from importlib import metadata
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Final, Literal, TypeVar
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict
+from pydantic import AwareDatetime
 
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.rig_identity import (
+    EMULATED_SERIAL_NUMBER,
+    Record,
+    RigIdentity,
+    identity_of,
+    judged_by,
+    judged_sha256s,
+)
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.robotiq.models import ModelName
-from shearloop.drivers.ur.script import own_script_hash
 from shearloop.drivers.ur.settings import Bound, UrSettings
 from shearloop.errors import UserError
 from shearloop.yaml_files import load_model
@@ -39,26 +43,12 @@ _HARD: Final = 1.6
 CURE: Final = (
     "run `shearloop commission CONFIG --out FILE{option}`, then write `commissioned: FILE` into the configuration"
 )
-# In the place of the serial number of a robot: no real one has it.
-EMULATED_SERIAL_NUMBER: Final = "EMULATED"
-# What a report is about: the parts of a configuration that name devices.
-_DEVICE_KEYS: Final[Any] = {
-    "fingertips": {"__all__": {"device", "frame_period_s"}},
-    "skin": {"source", "daq"},
-    "load_cell": True,
-    "robot": True,
-    "gripper": True,
-}
 # The stages, by the first figure of their names, that a quantity needs: the daemon's limits of it depend on them.
 _SPEED_NEEDS: Final = "0134"
 _TORQUE_NEEDS: Final = "01357"
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Line(_Record):
+class Line(Record):
     """One measured or noted value: its name, its limit, the number of measurements, and the promise it checks."""
 
     what: str
@@ -69,7 +59,7 @@ class Line(_Record):
     verdict: Verdict = "noted"
 
 
-class Supplied(_Record):
+class Supplied(Record):
     """Values that the daemon takes from a stage; a key that is absent was not measured."""
 
     wrist_speed_rad_per_s: float | None = None
@@ -85,54 +75,34 @@ class Supplied(_Record):
 NOTHING_SUPPLIED: Final = Supplied()
 
 
-class StageResult(_Record):
-    """The lines of one stage, who ran it, and when."""
+class StageResult(Record):
+    """The lines of one stage, who ran it, and when.
+
+    `judged_sha256s`: of what few stages judge, this one among them, in hexadecimal; what all need is in `RigIdentity`.
+    """
 
     stage: str
     operator: str
     date: AwareDatetime
     lines: tuple[Line, ...]
     supplies: Supplied = NOTHING_SUPPLIED
+    judged_sha256s: Mapping[str, str] = {}
 
     @property
     def passed(self) -> bool:
         """Whether no line failed."""
         return all(line.verdict != "failed" for line in self.lines)
 
-
-class RigIdentity(_Record):
-    """Which rig a report is about: hashes in hexadecimal, versions, and the robot's serial number."""
-
-    emulated: bool
-    configuration_sha256: str
-    robot_settings_sha256: str
-    script_sha256: str
-    ur_rtde: str
-    polyscope: str
-    robot_serial_number: str
-
-    def differences(self, other: "RigIdentity") -> Iterator[str]:
-        """Yield each difference in words."""
-        for key, what in _IDENTITY.items():
-            if getattr(self, key) != getattr(other, key):
-                yield what
+    def changed_since(self, hashes: Mapping[str, str]) -> list[str]:
+        """Return the keys of what this stage judged and has another of these hashes than then, for a sentence."""
+        now = judged_by(self.stage, hashes)
+        return [f"`{key}`" for key, own in now.items() if self.judged_sha256s.get(key) != own]
 
 
-_IDENTITY: Final = {
-    "emulated": "`emulated`",
-    "configuration_sha256": "the devices in the configuration",
-    "robot_settings_sha256": "the robot's settings",
-    "script_sha256": "the script for the robot",
-    "ur_rtde": "the version of ur-rtde",
-    "polyscope": "the version of PolyScope",
-    "robot_serial_number": "the robot's serial number",
-}
-
-
-class Report(_Record):
+class Report(Record):
     """All stages of one rig."""
 
-    version: Literal[2] = 2
+    version: Literal[3] = 3
     rig: RigIdentity
     stages: tuple[StageResult, ...] = ()
 
@@ -146,6 +116,10 @@ class Report(_Record):
         others = [stage for stage in self.stages if stage.stage != result.stage]
         stages = sorted([*others, result], key=lambda stage: stage.stage)
         return self.model_copy(update={"stages": tuple(stages)})
+
+    def without_stage(self, result: StageResult) -> "Report":
+        """Return the report without this stage."""
+        return self.model_copy(update={"stages": tuple(stage for stage in self.stages if stage != result)})
 
     def stage(self, number: str) -> StageResult | None:
         """Return the stage whose name begins with this figure, if it was run."""
@@ -236,10 +210,14 @@ class Commissioning:
             wrist_speed_rad_per_s=_lowered(limits.wrist_speed_rad_per_s, cap.wrist_speed_rad_per_s),
             linear_speed_m_per_s=_lowered(limits.linear_speed_m_per_s, cap.linear_speed_m_per_s),
         )
-        supplied = {
-            key: value for key in ("rest_rad_per_s", "reaction_s") if (value := getattr(self.supplied, key)) is not None
-        }
-        return replace(settings, limits=limits, **supplied)
+        measured = self.supplied
+        return replace(
+            settings,
+            limits=limits,
+            rest_rad_per_s=settings.rest_rad_per_s if measured.rest_rad_per_s is None else measured.rest_rad_per_s,
+            # Braking before an end of a range counts on the longest delay: few turns may not have met it.
+            reaction_s=max(settings.reaction_s, measured.reaction_s or 0.0),
+        )
 
     @property
     def supplied(self) -> Supplied:
@@ -303,6 +281,12 @@ def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
     seen = seen.model_copy(update=robot)
     if differs := list(report.rig.differences(seen)):
         return f"{' and '.join(differs)} changed since {config.commissioned} was measured"
+    hashes = judged_sha256s(config)
+    for stage in report.stages:
+        if differs := stage.changed_since(hashes):
+            keys = " and ".join(differs)
+            cure = f"run `shearloop commission` with `--stages {stage.stage[0]}`"
+            return f"{keys} changed since stage {stage.stage} of {config.commissioned} was measured; {cure}"
     failed = [f"{line.what} in stage {stage.stage}" for stage in report.stages for line in stage.lines
               if line.verdict == "failed"]  # fmt: skip
     if failed:
@@ -320,41 +304,6 @@ def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
 def load_report(path: Path) -> Report:
     """Return the report in a file; raises UserError for a file that is none."""
     return load_model(path, Report, UserError, "report of a commissioning", "; make it with `shearloop commission`")
-
-
-def identity_of(config: DaemonConfig, polyscope: str, robot_serial_number: str) -> RigIdentity:
-    """Return which rig this is, a rehearsal being the one that it plays, on emulated devices.
-
-    Raises UserError where the robot's settings cannot be read.
-    """
-    devices = config.real.model_dump(mode="json", exclude_unset=True, include=_DEVICE_KEYS)
-    return RigIdentity(
-        emulated=config.emulated,
-        configuration_sha256=_sha256(json.dumps(devices, sort_keys=True).encode()),
-        robot_settings_sha256=_sha256(_content(config.real.robot)),
-        script_sha256=own_script_hash(),
-        ur_rtde=_installed("ur-rtde"),
-        polyscope=polyscope,
-        robot_serial_number=EMULATED_SERIAL_NUMBER if config.emulated else robot_serial_number,
-    )
-
-
-def _content(path: Path | None) -> bytes:
-    try:
-        return path.read_bytes() if path is not None else b""
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
-def _installed(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def measured_widths(found: Supplied, model: ModelName) -> WidthCalibration | None:

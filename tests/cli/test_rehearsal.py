@@ -13,8 +13,9 @@ from shearloop.cli.emulate.devices import robot_make
 from shearloop.cli.emulator_processes import check_emulators
 from shearloop.cli.init import packaged_files
 from shearloop.cli.rehearsal import rehearsal
-from shearloop.daemon.commissioning import Line, Report, StageResult, Supplied, identity_of
+from shearloop.daemon.commissioning import Line, Report, StageResult, Supplied
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.drivers.calibration_files import save_calibration
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.ur.settings import GENERATIONS, read_settings
@@ -201,7 +202,8 @@ def test_an_experiment_beyond_the_cap_is_refused_as_on_the_real_rig(real_rig, ca
 
 def report_of_emulated(path: Path) -> Report:
     """Return what `commission --emulate` measures of a rig: the stages that raise the wrist's speed."""
-    rig = identity_of(load_daemon_config(path), "5.17.3.0", "EMULATED").model_copy(update={"emulated": True})
+    config = load_daemon_config(path)
+    rig = identity_of(config, "5.17.3.0", "EMULATED").model_copy(update={"emulated": True})
     line = Line(what="w", value="v", verdict="passed")
     stages = [
         StageResult(
@@ -210,6 +212,7 @@ def report_of_emulated(path: Path) -> Report:
             date=datetime.now(UTC),
             lines=(line,),
             supplies=Supplied(wrist_speed_rad_per_s=0.5),
+            judged_sha256s=judged_by(number, judged_sha256s(config)),
         )
         for number in "0134"
     ]

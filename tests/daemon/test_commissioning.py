@@ -20,12 +20,12 @@ from shearloop.daemon.commissioning import (
     StageResult,
     Supplied,
     commissioning_of,
-    identity_of,
     measured_widths,
 )
 from shearloop.daemon.config import RehearsedConfig, load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.rig import make_loop
+from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import RobotLostError, WorkerPhase
 from shearloop.drivers.ur.settings import read_settings
@@ -41,7 +41,7 @@ SUPPLIED = Supplied(
     torque_nm=0.4,
     rest_rad_per_s=0.005,
     actuation_s=0.03,
-    reaction_s=0.035,
+    reaction_s=0.045,
     stop_rad=0.15,
     widths=((10.0, 100.0), (60.0, 80.0), (110.0, 60.0), (160.0, 40.0), (210.0, 20.0)),
 )
@@ -62,14 +62,20 @@ def report_of(
     path: Path, stages: str = "01357", supplies: Supplied = NOTHING_SUPPLIED, verdict: str = "passed"
 ) -> Report:
     """Return a report of a rig with these stages; each supplies the same."""
+    config = load_daemon_config(path)
+    hashes = judged_sha256s(config)
     results = [
         StageResult(
-            stage=f"{number} s", operator="O", date=NOW, lines=(Line(what="w", value="v", verdict=verdict),),
+            stage=f"{number} s",
+            operator="O",
+            date=NOW,
+            lines=(Line(what="w", value="v", verdict=verdict),),
             supplies=supplies,
+            judged_sha256s=judged_by(number, hashes),
         )
         for number in stages
-    ]  # fmt: skip
-    return Report(rig=identity_of(load_daemon_config(path), VERSION, SERIAL), stages=tuple(results))
+    ]
+    return Report(rig=identity_of(config, VERSION, SERIAL), stages=tuple(results))
 
 
 def commissioned(folder: Path, report: Report, now: datetime = NOW, **content: object):
@@ -189,7 +195,7 @@ def test_a_report_raises_only_what_its_stages_cover(tmp_path, stages, raised):
 def test_a_report_supplies_rest_delay_stop_margin_and_widths(tmp_path):
     found = commissioned(tmp_path, report_of(write_rig(tmp_path), "013457", SUPPLIED))
     settings = found.settings
-    assert (settings.rest_rad_per_s, settings.reaction_s) == (0.005, 0.035)
+    assert (settings.rest_rad_per_s, settings.reaction_s) == (0.005, 0.045)
     assert settings.limits.joints.margin_rad == 0.15
     config = load_daemon_config(tmp_path / "rig.yaml")
     assert make_loop(config, settings, {}, {}, found.supplied).config.actuation_s == 0.03
@@ -257,6 +263,73 @@ def test_the_key_and_another_experiment_do_not_make_it_another_rig(tmp_path):
     assert identity_of(load_daemon_config(path), VERSION, SERIAL) == plain
     path = write_rig(tmp_path, load_cell={"device": {"serial_number": "7584"}})
     assert identity_of(load_daemon_config(path), VERSION, SERIAL) != plain
+
+
+def rewrite(path: Path, **keys: object) -> None:
+    """Change keys of a YAML file, and write it without its comments."""
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | keys))
+
+
+def limits_of(path: Path, **keys: object) -> dict[str, object]:
+    return {"limits": yaml.safe_load(path.read_text())["limits"] | keys}
+
+
+CELL = {"tare_counts": 0.0, "scale_n_per_count": 0.001}
+
+
+@pytest.mark.parametrize(
+    ("change", "stage", "key"),
+    [
+        (lambda at: rewrite(at / "ur.yaml", reaction_s=0.05), "3", "reaction_s"),
+        (lambda at: rewrite(at / "ur.yaml", rest_rad_per_s=0.02), "3", "rest_rad_per_s"),
+        (
+            lambda at: rewrite(at / "ur.yaml", **limits_of(at / "ur.yaml", torque_nm={"inner": 20.0, "hard": 25.0})),
+            "5",
+            "limits.torque_nm",
+        ),
+        (lambda at: rewrite(at / "cell.yaml", scale_n_per_count=0.002), "6", "load_cell.calibration"),
+        (lambda at: rewrite(at / "cell.yaml", tare_counts=5.0, scale_n_per_count=0.002), "6", "load_cell.calibration"),
+    ],
+)
+def test_what_one_stage_judged_makes_that_stage_old_and_no_other(tmp_path, change, stage, key):
+    (tmp_path / "cell.yaml").write_text(yaml.safe_dump(CELL))
+    cell = {"device": {"serial_number": "7583"}, "calibration": "cell.yaml"}
+    path = write_rig(tmp_path, load_cell=cell, commissioned="report.yaml")
+    save_report(tmp_path / "report.yaml", report_of(path, "0134567", SUPPLIED))
+    config = load_daemon_config(path)
+    assert commissioning_of(config, read_settings(config.robot), NOW).counts
+    before = identity_of(config, VERSION, SERIAL)
+    change(tmp_path)
+    config = load_daemon_config(path)
+    why = commissioning_of(config, read_settings(config.robot), NOW).cap.why
+    assert f"`{key}` changed since stage {stage} s" in why
+    assert f"`--stages {stage}`" in why
+    assert identity_of(config, VERSION, SERIAL) == before, "the other stages count"
+
+
+def test_a_rig_that_was_moved_to_another_folder_is_the_same(tmp_path):
+    one, other = tmp_path / "one", tmp_path / "other"
+    for folder in (one, other):
+        folder.mkdir()
+        (folder / "cell.yaml").write_text(yaml.safe_dump(CELL))
+    cell = {"device": {"serial_number": "7583"}, "calibration": "cell.yaml"}
+    here, there = (load_daemon_config(write_rig(folder, load_cell=cell)) for folder in (one, other))
+    assert identity_of(here, VERSION, SERIAL) == identity_of(there, VERSION, SERIAL)
+    assert judged_sha256s(here) == judged_sha256s(there)
+
+
+def test_a_short_delay_that_was_measured_does_not_shorten_the_way_to_brake(tmp_path):
+    path = write_rig(tmp_path)
+    rewrite(tmp_path / "ur.yaml", reaction_s=0.05)
+    config = load_daemon_config(path)
+    assert SUPPLIED.reaction_s < 0.05
+    report = report_of(path, "01357", SUPPLIED)
+    save_report(tmp_path / "report.yaml", report)
+    found = commissioning_of(
+        config.model_copy(update={"commissioned": tmp_path / "report.yaml"}), read_settings(config.robot), NOW
+    )
+    assert found.counts
+    assert found.settings.reaction_s == 0.05
 
 
 def test_the_robots_process_starts_again_with_the_limits_for_its_controller(tmp_path):

@@ -6,9 +6,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from shearloop.daemon.commissioning import Report, StageResult, identity_of
+from shearloop.daemon.commissioning import Report, StageResult
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.rig import gripper_calibration, open_settings
+from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.errors import UserError
@@ -61,6 +62,7 @@ def commission(
         devices = rig or ConnectedRig(config, settings)
         controller = devices.controller()
         report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)
+        report = _without_changed(report, config, operator)
         context = Context(config, settings, devices, controller, operator, report, counts, opened)
         return _run(context, out, only)
 
@@ -72,6 +74,16 @@ def _open_files(config: DaemonConfig) -> None:
         load_cell_calibration(config.load_cell)
     if config.gripper is not None:
         gripper_calibration(config.gripper)
+
+
+def _without_changed(report: Report, config: DaemonConfig, operator: Operator) -> Report:
+    """Return the report without the stages that judged something which has changed since."""
+    hashes = judged_sha256s(config)
+    for stage in report.stages:
+        if differs := stage.changed_since(hashes):
+            operator.say(f"Stage {stage.stage} is measured again, because {' and '.join(differs)} changed.")
+            report = report.without_stage(stage)
+    return report
 
 
 def _run(context: Context, out: Path, only: Sequence[str]) -> tuple[Report, Path]:
@@ -89,7 +101,12 @@ def _run(context: Context, out: Path, only: Sequence[str]) -> tuple[Report, Path
         operator.say(f"Stage {stage}")
         measured = measure(context)
         result = StageResult(
-            stage=stage, operator=name, date=datetime.now(UTC), lines=tuple(measured.lines), supplies=measured.supplies
+            stage=stage,
+            operator=name,
+            date=datetime.now(UTC),
+            lines=tuple(measured.lines),
+            supplies=measured.supplies,
+            judged_sha256s=judged_by(stage, judged_sha256s(context.config)),
         )
         context.report = context.report.with_stage(result)
         save_report(out, context.report, not_measured(context.report))

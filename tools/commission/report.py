@@ -9,16 +9,8 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 
-from shearloop.daemon.commissioning import (
-    MOST_AGE_DAYS,
-    NOTHING_SUPPLIED,
-    Line,
-    Report,
-    RigIdentity,
-    Supplied,
-    Verdict,
-    load_report,
-)
+from shearloop.daemon.commissioning import MOST_AGE_DAYS, NOTHING_SUPPLIED, Line, Report, Supplied, Verdict, load_report
+from shearloop.daemon.rig_identity import RigIdentity
 from shearloop.errors import UserError
 from shearloop.yaml_files import save_yaml
 

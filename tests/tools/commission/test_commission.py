@@ -13,8 +13,9 @@ import yaml
 
 from shearloop.cli import main
 from shearloop.cli.init import packaged_files
-from shearloop.daemon.commissioning import Line, Report, RigIdentity, StageResult
+from shearloop.daemon.commissioning import Line, Report, StageResult
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.rig_identity import RigIdentity
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import RtdeOutputs

@@ -1,11 +1,12 @@
 """The order of the stages: what is measured is kept, a failed stage ends it, and a later run continues."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 
 import pytest
+import yaml
 
-from shearloop.daemon.commissioning import Line, load_report
+from shearloop.daemon.commissioning import Line, Verdict, load_report
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.script import UPPER
@@ -18,10 +19,12 @@ from tests.tools.commission.test_commission import write_rig
 CONTROLLER = ControllerInfo("5.17.3.0", "1", "RUNNING", "NORMAL", remote=True, registers=UPPER)
 
 
-@pytest.mark.usefixtures("ur_rtde")
-def test_stages_are_kept_blocked_and_continued(tmp_path, monkeypatch):
+RIG = SimpleNamespace(controller=lambda: CONTROLLER)
+
+
+def play_stages(monkeypatch: pytest.MonkeyPatch, verdicts: Mapping[str, Verdict]) -> list[str]:
+    """Put stages with these verdicts in the place of the real ones; return the names of those that ran."""
     ran: list[str] = []
-    verdicts = {"0 a": "passed", "1 b": "failed", "2 c": "passed"}
 
     def stage(name: str) -> Callable[[Context], Measured]:
         def measure(context: Context) -> Measured:
@@ -32,13 +35,43 @@ def test_stages_are_kept_blocked_and_continued(tmp_path, monkeypatch):
         return measure
 
     monkeypatch.setattr(procedure, "STAGES", {name: stage(name) for name in verdicts})
-    rig = SimpleNamespace(controller=lambda: CONTROLLER)
+    return ran
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_setting_that_one_stage_judges_makes_only_that_stage_run_again(tmp_path, monkeypatch):
+    ran = play_stages(monkeypatch, dict.fromkeys(("0 a", "3 b", "4 c", "5 d", "6 e"), "passed"))
+    path, out, said = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml", []
+
+    def run() -> list[str]:
+        ran.clear()
+        procedure.commission(
+            load_daemon_config(path), path, out, Operator(lambda _: WORD, said.append), Counts(), (), RIG
+        )
+        return list(ran)
+
+    assert run() == ["0 a", "3 b", "4 c", "5 d", "6 e"]
+    settings = yaml.safe_load((tmp_path / "ur.yaml").read_text())
+    settings["limits"]["torque_nm"] = {"inner": 9.0, "hard": 10.0}
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump(settings))
+    assert run() == ["5 d"]
+    assert "Stage 5 d is measured again, because `limits.torque_nm` changed." in said
+    settings["rest_rad_per_s"] = 0.02
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump(settings))
+    assert run() == ["3 b", "4 c"]
+    assert run() == []
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_stages_are_kept_blocked_and_continued(tmp_path, monkeypatch):
+    verdicts: dict[str, Verdict] = {"0 a": "passed", "1 b": "failed", "2 c": "passed"}
+    ran = play_stages(monkeypatch, verdicts)
     path, out, allowed = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml", {"0 a"}
 
     def run(only: str = "") -> list[str]:
         ran.clear()
         operator = Operator(lambda question: WORD if any(one in question for one in allowed) else "no", lambda _: None)
-        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only, rig)
+        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only, RIG)
         return list(ran)
 
     with pytest.raises(DeclinedError, match="not allowed: 1 b"):

@@ -17,6 +17,7 @@ from shearloop.drivers.ur.messages import (
     STOPPED_ON_COMMAND,
     MotionKind,
     MoveLinear,
+    RtdeOutputs,
     RtdeSample,
     Stop,
     WristSpeed,
@@ -527,7 +528,7 @@ def slowed_sentence(sample: RtdeSample) -> str:
     return ""
 
 
-def tool_difference(sample: RtdeSample, tool: InstalledTool) -> str:
+def tool_difference(sample: RtdeOutputs, tool: InstalledTool) -> str:
     """Return how payload, centre of gravity or tool centre point differ from the settings, or the empty string.
 
     A value that the controller does not report is NaN and differs.

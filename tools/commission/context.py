@@ -85,19 +85,35 @@ class Context:
 
     @property
     def mover(self) -> Mover:
-        """What drives the robot, which is started when it is first needed."""
+        """What drives the robot, which is started when it is first needed.
+
+        It stays near the confirmed pose; before the confirmation, near the pose in which it is started.
+        """
         if self._mover is None:
-            here_rad = self.observer.latest().wrist_rad
-            self._mover = self.opened.enter_context(self.rig.mover(bounded(self.settings, here_rad)))
+            about = self._confirmed or self.observer.latest()
+            self._mover = self.opened.enter_context(self.rig.mover(bounded(self.settings, about.wrist_rad)))
         return self._mover
 
     def confirm(self) -> Seen:
         """Have the operator confirm the pose about which motions are allowed, once; return a sample of it.
 
-        An arm that was moved between the question and the answer stands in a pose that is not confirmed: the
-        question comes again.
+        Worker and script enforce the bounds about this pose, also where they were started in another one.
         """
-        while self._confirmed is None:
+        if self._confirmed is None:
+            self._confirmed = self._confirmed_pose()
+            if self._mover is not None:
+                self._bound_about(self._confirmed.wrist_rad, self._mover)
+        return self._confirmed
+
+    def _bound_about(self, wrist_rad: float, mover: Mover) -> None:
+        bounds = bounded(self.settings, wrist_rad)
+        if mover.settings != bounds:
+            mover.restart(settings=bounds)
+            self.ready()
+
+    def _confirmed_pose(self) -> Seen:
+        """Ask until the arm stands at the answer as it did at the question; return a sample of that pose."""
+        while True:
             here = self.observer.latest()
             self.operator.act(
                 f"Wrist 3 stands at {here.wrist_rad:.3f} rad. Check that the arm stands free, that the tool may turn "
@@ -105,10 +121,8 @@ class Context:
             )
             pairs = zip(here.outputs.q_rad, self.observer.latest().outputs.q_rad, strict=True)
             if all(abs(now_rad - asked_rad) <= _SAME_POSE_RAD for asked_rad, now_rad in pairs):
-                self._confirmed = here
-            else:
-                self.operator.say("The arm has moved since the question; the pose is asked for again.")
-        return self._confirmed
+                return here
+            self.operator.say("The arm has moved since the question; the pose is asked for again.")
 
     @property
     def pose_rad(self) -> float:

@@ -1,13 +1,14 @@
 """Stage 0: which robot, which software and which settings the report is about. Nothing moves."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from shearloop.daemon.commissioning import Line
 from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.drivers.ur.control_box import ControllerInfo, untested_sentence
 from shearloop.drivers.ur.messages import RtdeOutputs
-from shearloop.drivers.ur.settings import UrSettings
+from shearloop.drivers.ur.motion import PAYLOAD_KG, tool_difference
+from shearloop.drivers.ur.settings import InstalledTool, UrSettings
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
@@ -15,34 +16,48 @@ from shearloop.tools.commission.report import Measured, judged
 STAGE = "0 identity"
 CHECKSUM_QUESTION = "The safety checksum, as the pendant shows it at the top right (CB3: under Safety):"
 EMULATED_CHECKSUM = "0000"
-# The wrench and the protective stops of the arm depend on its payload.
-PAYLOAD_TOLERANCE_KG = 0.1
+SHOWN_QUESTION = "This controller does not report its payload. The payload in kg that the pendant shows"
+MOUNTED_QUESTION = "The mass in kg of all that is mounted at the flange, weighed or from data sheets"
+# The wrench and the protective stops of the arm depend on its payload. This is for typed values: of those that the
+# controller reports, the daemon refuses motion at a smaller difference.
+TYPED_TOLERANCE_KG = 0.1
+_HEAVIEST_KG = 35.0
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What the robot and this computer report, and what the operator read from the pendant."""
+    """What the robot and this computer report, and what the operator typed.
+
+    `typed_kg` is the payload at the pendant and the mounted mass, where the controller reports no payload.
+    """
 
     controller: ControllerInfo
     outputs: RtdeOutputs
     safety_checksum: str
+    typed_kg: tuple[float, float] | None = None
 
 
 def measure(context: Context) -> Measured:
     """Return the stage's lines; raises RobotLostError if the controller does not answer."""
+    outputs = context.rig.outputs(context.registers)
+    if untested := untested_sentence(context.controller.version):
+        context.operator.accept(untested)
     checksum = context.operator.ask(CHECKSUM_QUESTION, Played(f"the pendant shows {EMULATED_CHECKSUM}"))
-    found = Identity(context.controller, context.rig.outputs(context.registers), checksum)
+    typed_kg = None
+    if math.isnan(outputs.payload_kg) and context.settings.tool.payload_kg is None:
+        shown_kg = context.operator.number(SHOWN_QUESTION, 0.0, _HEAVIEST_KG)
+        typed_kg = shown_kg, context.operator.number(MOUNTED_QUESTION, 0.0, _HEAVIEST_KG)
+    found = Identity(context.controller, outputs, checksum, typed_kg)
     return Measured(judge_identity(found, context.settings, context.config))
 
 
 def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfig) -> tuple[Line, ...]:
     """Return the stage's lines: versions and modes are known, payload and tool centre point are as in the settings."""
     outputs, tool, seen = identity.outputs, settings.tool, identity.controller
-    untested = untested_sentence(seen.version)
     major = int(seen.version.split(".", maxsplit=1)[0])
     slider = outputs.speed_slider
     lines = [
-        judged("PolyScope", seen.version, "a version that ur-rtde is tested on", "known versions", passed=not untested),
+        _polyscope(seen.version),
         judged(
             "generation",
             f"PolyScope {major}",
@@ -62,7 +77,7 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
         judged(
             "speed slider", f"{slider:.0%}", "100%", "the loop's gain", passed=math.isclose(slider, 1.0, abs_tol=1e-6)
         ),
-        _payload(outputs.payload_kg, tool.payload_kg),
+        _payload(identity, tool.payload_kg),
         judged(
             "safety checksum",
             identity.safety_checksum or "not given",
@@ -70,7 +85,7 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
             "the rated limits are known",
             passed=bool(identity.safety_checksum),
         ),
-        Line(what="tool centre point", value=" ".join(f"{value:.4g}" for value in outputs.tcp_offset)),
+        _tool_centre(outputs, tool),
     ]
     lines += [
         Line(what=f"serial number of {key}", value=section.serial_number)
@@ -80,11 +95,45 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
     return tuple(lines)
 
 
-def _payload(set_kg: float, wanted_kg: float | None) -> Line:
-    value = "not reported" if math.isnan(set_kg) else f"{set_kg:.3f} kg"
+def _polyscope(version: str) -> Line:
+    """Return the line on the version; a newer one than the tested ones is noted, after the operator went on with it."""
+    if untested := untested_sentence(version):
+        return Line(what="PolyScope", value=f"{untested} The operator went on with it.")
+    return judged("PolyScope", version, "a version that ur-rtde is tested on", "known versions", passed=True)
+
+
+def _payload(identity: Identity, wanted_kg: float | None) -> Line:
+    """Return the line on the payload: within the daemon's own tolerance, else the daemon refuses every motion."""
+    set_kg, promise = identity.outputs.payload_kg, "forces and protective stops fit the load"
+    if math.isnan(set_kg):
+        return _unreported_payload(identity.typed_kg, wanted_kg, promise)
+    value = f"{set_kg:.3f} kg"
     if wanted_kg is None:
         limit = "`tool.payload_kg` of the robot's settings, which is absent"
-        return judged("payload", value, limit, "payload", passed=False)
-    limit = f"{wanted_kg:g} ± {PAYLOAD_TOLERANCE_KG:g} kg"
+        return judged("payload", value, limit, promise, passed=False)
+    limit = f"{wanted_kg:g} ± {PAYLOAD_KG:g} kg; else the daemon refuses motion"
+    differs = tool_difference(identity.outputs, InstalledTool(payload_kg=wanted_kg))
+    return judged("payload", value, limit, promise, passed=not differs)
+
+
+def _unreported_payload(typed_kg: tuple[float, float] | None, wanted_kg: float | None, promise: str) -> Line:
+    if wanted_kg is not None or typed_kg is None:
+        value = "not reported: PolyScope has it from 3.12 and 5.5.1 on"
+        limit = "no `tool.payload_kg` in the robot's settings: with it the daemon refuses motion on this controller"
+        return judged("payload", value, limit, promise, passed=False)
+    shown_kg, mounted_kg = typed_kg
+    limit = f"the mounted mass, {mounted_kg:g} ± {TYPED_TOLERANCE_KG:g} kg; both typed by the operator"
     # The sum keeps a payload at the edge inside.
-    return judged("payload", value, limit, "payload", passed=abs(set_kg - wanted_kg) <= PAYLOAD_TOLERANCE_KG + 1e-9)
+    passed = abs(shown_kg - mounted_kg) <= TYPED_TOLERANCE_KG + 1e-9
+    return judged("payload", f"{shown_kg:.3f} kg, typed from the pendant", limit, promise, passed=passed)
+
+
+def _tool_centre(outputs: RtdeOutputs, tool: InstalledTool) -> Line:
+    """Return the line on the tool centre point and the centre of gravity, which the daemon compares if they are set."""
+    what, value = "tool centre point", " ".join(f"{value:.4g}" for value in outputs.tcp_offset)
+    compared = replace(tool, payload_kg=None)
+    if compared == InstalledTool():
+        return Line(what=what, value=value)
+    differs = tool_difference(outputs, compared)
+    limit = "as in the robot's settings; else the daemon refuses motion"
+    return judged(what, differs or value, limit, "positions are of the tool", passed=not differs)

@@ -10,6 +10,7 @@ import threading
 from abc import ABC, abstractmethod
 from typing import Any, Final
 
+from shearloop.drivers.ur.client import WORKER
 from shearloop.drivers.ur.messages import encode
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
@@ -20,6 +21,7 @@ Event = dict[str, Any]
 # A controller unlocks a protective stop after 5 s; a worker starts and connects within some seconds more.
 READY_WITHIN_S: Final = 30.0
 _AGAIN_S: Final = 1.0
+# With a long deadline: the robot's watchdog alone ends its straight moves in time.
 WATCHDOG_WORKER: Final = "shearloop.tools.commission.watchdog_worker"
 _ENDS_WITHIN_S: Final = 6.0
 
@@ -37,10 +39,10 @@ class Mover(ABC):
         self.events: Arrivals[Event] = Arrivals(lambda event: int(event["t_ns"]), clock)
 
     @abstractmethod
-    def start(self, *, watchdog_alone: bool = False) -> None:
+    def start(self, *, worker: str = WORKER) -> None:
         """Start what drives the robot; it sends the program to the robot where the robot is ready.
 
-        `watchdog_alone`: without a worker, only the robot's watchdog ends a straight move in time.
+        `worker` is the module of the worker, by default the daemon's own.
         """
 
     @abstractmethod
@@ -55,10 +57,11 @@ class Mover(ABC):
     def send(self, request: Event) -> None:
         """Send a request."""
 
-    def restart(self, *, watchdog_alone: bool = False) -> None:
-        """End what drives the robot, and start it again."""
+    def restart(self, *, worker: str = WORKER, settings: UrSettings | None = None) -> None:
+        """End what drives the robot, and start it again, from here on with these settings if there are any."""
         self.kill()
-        self.start(watchdog_alone=watchdog_alone)
+        self.settings = settings or self.settings
+        self.start(worker=worker)
 
     def event(self, kind: str, since_ns: int, within_s: float) -> Event | None:
         """Return the first event of a kind since a moment, or None after `within_s`."""
@@ -120,10 +123,9 @@ class MoverProcess(Mover, Opened):
                 self._process.wait(_ENDS_WITHIN_S)
         self.kill()
 
-    def start(self, *, watchdog_alone: bool = False) -> None:
+    def start(self, *, worker: str = WORKER) -> None:
         """Start a process and its worker."""
-        command = [sys.executable, "-m", "shearloop.tools.commission.mover_process"]
-        command += [WATCHDOG_WORKER] if watchdog_alone else []
+        command = [sys.executable, "-m", "shearloop.tools.commission.mover_process", worker]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._write(encode(self.settings).decode())
         self._reader = threading.Thread(target=self._read, args=(self._process,), name="mover", daemon=True)

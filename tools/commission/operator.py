@@ -10,6 +10,8 @@ from shearloop.errors import UserError
 # The word that allows one motion or one action of the operator.
 WORD: Final = "move"
 DONE: Final = "done"
+# The word that takes note of something that is not as it was tried.
+GO_ON: Final = "continue"
 # Answers that end the commissioning at once, an empty line among them.
 _NO: Final = ("", "no")
 # Wrong answers until the commissioning ends.
@@ -17,7 +19,7 @@ _MOST_TRIES: Final = 3
 
 
 class DeclinedError(UserError):
-    """The operator did not allow a motion."""
+    """The operator did not allow a motion, or did not go on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,10 @@ class Operator:
         question = f"MOTION: {motion}. Keep clear, one hand at the emergency stop. Type `{WORD}` to allow it:"
         self._confirm(question, WORD, f"not allowed: {motion}")
 
+    def accept(self, warning: str) -> None:
+        """Show a warning, a whole sentence, and return once the operator goes on; raises DeclinedError."""
+        self._confirm(f"{warning} Type `{GO_ON}` to go on with it:", GO_ON, f"not accepted: {warning}")
+
     def act(self, action: str, played: Played = NOTHING_TO_DO) -> None:
         """Have the operator do something; raises DeclinedError where it is not done."""
         question = f"{self._with_hint(f'{action}.', played)} Type `{DONE}`:"
@@ -97,7 +103,7 @@ class Operator:
             if answer in _NO:
                 break
             self.say(f"{answer!r} is not `{word}`, so that nothing was done. `no` ends the commissioning here.")
-        raise DeclinedError(f"{declined}. What is measured so far is kept; run it again to continue")
+        raise DeclinedError(f"{declined.removesuffix('.')}. What is measured so far is kept; run it again to continue")
 
     def _with_hint(self, question: str, played: Played | None) -> str:
         """Return the question with what the emulated devices do, if there are any, before its last character."""

@@ -11,6 +11,7 @@ from shearloop.drivers.ur.settings import Six
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S, LARGEST_RAD
 from shearloop.tools.commission.context import STOPS_NEEDED, Context
+from shearloop.tools.commission.mover import WATCHDOG_WORKER
 from shearloop.tools.commission.mover_process import CAUSES
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.operator import Played
@@ -287,7 +288,7 @@ def _watchdog_in_motion(context: Context) -> Line:
     for _ in range(count):
         motion.prepare()
         context.comes_to_rest(_RESTS_WITHIN_S)
-        context.mover.restart(watchdog_alone=True)
+        context.mover.restart(worker=WATCHDOG_WORKER)
         mover = context.ready()
         asked_ns = motion.begin("worker stopped")
         cause = mover.event("cause", asked_ns, _RESTS_WITHIN_S)

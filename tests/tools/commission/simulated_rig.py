@@ -16,6 +16,7 @@ from shearloop.drivers.load_cell import LoadCalibration, LoadParser, LoadSample
 from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand, GripperState, ObjectStatus, fault_of
 from shearloop.drivers.robotiq.models import MODELS
+from shearloop.drivers.ur.client import WORKER
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import (
@@ -36,7 +37,7 @@ from shearloop.emulators.synthetic_frames import RigFrames
 from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, ControllerSpec
 from shearloop.emulators.ur_rtde import variable
 from shearloop.tools.commission.arrivals import Arrivals
-from shearloop.tools.commission.mover import Mover
+from shearloop.tools.commission.mover import WATCHDOG_WORKER, Mover
 from shearloop.tools.commission.mover_process import CAUSES, Driver
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
@@ -147,8 +148,8 @@ class SimulatedMover(Mover):
         self._running: Coroutine[Any, Any, None] | None = None
         self._daemon_runs = False
 
-    def start(self, *, watchdog_alone: bool = False) -> None:
-        settings = for_watchdog_alone(self.settings) if watchdog_alone else self.settings
+    def start(self, *, worker: str = WORKER) -> None:
+        settings = for_watchdog_alone(self.settings) if worker == WATCHDOG_WORKER else self.settings
         self._robot = SimulatedRobot(self._rig, settings)
         self._driver, self._daemon_runs = Driver(settings, self._robot, self), True
 
@@ -336,6 +337,11 @@ class SimulatedRig:
                 self.emulated.command(command)
         # As an operator does, until everything rests.
         self.clock.sleep(0.5)
+
+    def bounds_rad(self) -> tuple[float, float]:
+        """Return the lowest and the highest angle of the wrist for whoever drives the robot."""
+        joints = self._mover.settings.limits.joints
+        return joints.lower_rad[5] + joints.margin_rad, joints.upper_rad[5] - joints.margin_rad
 
     # The devices.
     def controller(self) -> ControllerInfo:

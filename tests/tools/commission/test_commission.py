@@ -2,11 +2,14 @@
 
 import io
 import json
+import math
 import re
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -19,10 +22,14 @@ from shearloop.daemon.rig_identity import RigIdentity
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.drivers.ur.motion import tool_difference
 from shearloop.drivers.ur.script import UPPER
-from shearloop.drivers.ur.settings import read_settings
+from shearloop.drivers.ur.settings import InstalledTool, read_settings
 from shearloop.errors import UserError
+from shearloop.tools.commission import identity
+from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.identity import EMULATED_CHECKSUM, Identity, judge_identity
+from shearloop.tools.commission.operator import DeclinedError, Operator
 from shearloop.tools.commission.report import earlier_report, report_for, save_report
 from tests.emulator_process import EmulatorProcess
 
@@ -57,16 +64,16 @@ def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
     ("found", "failed"),
     [
         (GOOD, []),
-        (seen(version="5.99.0.0"), ["PolyScope"]),
+        (seen(version="5.99.0.0"), []),
         (seen(version="3.15.8.0"), ["generation"]),
         (seen(robot_mode="IDLE"), ["robot mode"]),
         (seen(safety_mode="PROTECTIVE_STOP"), ["safety mode"]),
         (seen(registers=None), ["registers"]),
         (replace(GOOD, safety_checksum=""), ["safety checksum"]),
         (replace(GOOD, outputs=replace(OUTPUTS, speed_slider=0.5)), ["speed slider"]),
-        (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.5)), []),
-        (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.51)), ["payload"]),
-        (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=float("nan"))), ["payload"]),
+        (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.409)), []),
+        (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.42)), ["payload"]),
+        (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=math.nan)), ["payload"]),
     ],
 )
 def test_a_fault_fails_exactly_its_own_line(tmp_path, found, failed):
@@ -74,6 +81,52 @@ def test_a_fault_fails_exactly_its_own_line(tmp_path, found, failed):
     lines = judge_identity(found, read_settings(config.robot), config)
     assert [line.what for line in lines if line.verdict == "failed"] == failed
     assert "7583" in [line.value for line in lines]
+
+
+def test_stage_0_and_the_daemon_refuse_the_same_tools(tmp_path):
+    settings = read_settings(load_daemon_config(write_rig(tmp_path)).robot)
+    settings = replace(settings, tool=InstalledTool(payload_kg=1.4, tcp_offset=SIX))
+    config = load_daemon_config(tmp_path / "rig.yaml")
+    for changed in ({}, {"payload_kg": 1.42}, {"payload_kg": 1.45}, {"tcp_offset": (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)}):
+        outputs = replace(OUTPUTS, **changed)
+        lines = judge_identity(replace(GOOD, outputs=outputs), settings, config)
+        assert any(line.verdict == "failed" for line in lines) is bool(tool_difference(outputs, settings.tool))
+
+
+def stage_0(tmp_path: Path, answers: list[str], version: str, tool: InstalledTool, **changed: object):
+    """Run stage 0 with scripted answers; return its lines by name, and what was asked."""
+    config = load_daemon_config(write_rig(tmp_path))
+    asked: list[str] = []
+
+    def answer(question: str) -> str:
+        asked.append(question)
+        return answers.pop(0)
+
+    rig = SimpleNamespace(outputs=lambda _: replace(OUTPUTS, **changed))
+    settings, controller = replace(read_settings(config.robot), tool=tool), replace(CONTROLLER, version=version)
+    operator = Operator(answer, lambda _: None)
+    measured = identity.measure(Context(config, settings, rig, controller, operator, None, Counts(), ExitStack()))
+    assert answers == []
+    return {line.what: line for line in measured.lines}, asked
+
+
+def test_a_polyscope_above_the_tried_ones_is_noted_once_the_operator_goes_on(tmp_path):
+    tool = InstalledTool(payload_kg=1.4)
+    lines, asked = stage_0(tmp_path, ["continue", "A1B2"], "5.99.0.0", tool)
+    assert lines["PolyScope"].verdict == "noted"
+    for text in (asked[0], lines["PolyScope"].value):
+        assert "5.99.0.0" in text
+        assert "5.17.3" in text
+    with pytest.raises(DeclinedError, match=r"5\.99\.0\.0"):
+        stage_0(tmp_path, ["no"], "5.99.0.0", tool)
+
+
+@pytest.mark.parametrize(("mounted_kg", "verdict"), [("1.3", "passed"), ("1.15", "failed")])
+def test_a_payload_that_the_controller_does_not_report_is_typed(tmp_path, mounted_kg, verdict):
+    unreported = {"payload_kg": math.nan, "tcp_offset": (math.nan,) * 6}
+    lines, _ = stage_0(tmp_path, ["A1B2", "1.4", mounted_kg], "5.4.0.0", InstalledTool(), **unreported)
+    assert lines["payload"].verdict == verdict
+    assert "typed" in lines["payload"].limit
 
 
 def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
@@ -163,7 +216,7 @@ def test_a_commissioning_is_rehearsed_on_emulated_devices_and_every_line_says_so
     monkeypatch.setattr(sys, "stdin", io.StringIO(f"Ada\n{EMULATED_CHECKSUM}\n"))
     assert main(["commission", str(path), "--out", str(out), "--stages", "0", "--emulate"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "EMULATED: passed payload: 1.400 kg (limit: 1.4 ± 0.1 kg)" in lines
+    assert "EMULATED: passed payload: 1.400 kg (limit: 1.4 ± 0.01 kg; else the daemon refuses motion)" in lines
     assert any(f"[emulated: the pendant shows {EMULATED_CHECKSUM}]:" in line for line in lines)
     assert [line for line in lines if not line.startswith("EMULATED: ")] == []
     assert (

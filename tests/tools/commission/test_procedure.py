@@ -13,6 +13,7 @@ from shearloop.bank.bank_file import Bank
 from shearloop.daemon.commissioning import commissioning_of
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.rig import open_settings
+from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Counts
 from shearloop.tools.commission.operator import DeclinedError
 from shearloop.tools.commission.procedure import STAGES, commission
@@ -68,6 +69,16 @@ class Lab:
 
     def close(self) -> None:
         del self.rig, self.operator
+
+    def move_by_hand(self, rad: float, before: str) -> None:
+        """Have the wrist moved by hand before the rig gets this command."""
+
+        def order(command: str) -> None:
+            if command == before:
+                self.rig.robot.arm.q_rad = self.rig.robot.arm.q_rad + np.array([0.0] * 5 + [rad])
+            self.rig.order(command)
+
+        self.operator = ScriptedOperator(order, self.rig.stop_program)
 
     def run(self, only: str = "", counts: Counts = COUNTS):
         config, out = load_daemon_config(self.path), self.path.with_name("report.yaml")
@@ -147,6 +158,14 @@ def test_each_seeded_fault_turns_its_own_line_red(lab, fault, stage, line):
     lab.rig.order(fault)
     report, _ = lab.run(stage)
     assert failed(report) == [line]
+
+
+def test_the_bounds_are_about_the_confirmed_pose_also_where_the_arm_was_moved_by_hand_before(lab):
+    """The robot is driven from stage 1 on, and the pose is confirmed in stage 3."""
+    lab.move_by_hand(0.08, before="object none")
+    report, _ = lab.run("1234")
+    assert failed(report) == []
+    assert lab.rig.bounds_rad() == pytest.approx((0.08 - LARGEST_RAD, 0.08 + LARGEST_RAD))
 
 
 def test_a_faster_stop_is_raised_by_five_of_each_layer(lab):

@@ -57,6 +57,32 @@ class Remembered:
     wrench_zero: Six | None = None
     wrench_tared: bool = False
 
+    @property
+    def grip(self) -> Grip:
+        """What is known of the grip."""
+        return Grip(self.origin_rad, self.force_n, self.width_mm, self.requested_counts)
+
+    @property
+    def grips(self) -> bool:
+        """Whether a tool may be held."""
+        return self.grip != NO_GRIP or self.load_zero is not None or self.wrench_zero is not None
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """The faults of the stop that waits for the operator, one for each code; an experiment that ran is one."""
+        entries = list(self.stop)
+        if self.running:
+            ended = f"it was killed, it crashed or the power failed while {self.running!r} was under way"
+            entries.append((FaultCode.DAEMON_ENDED.name, ended))
+        details: dict[FaultCode, list[str]] = {}
+        for name, detail in entries:
+            code = FaultCode.__members__.get(name, FaultCode.DAEMON_ENDED)
+            of_code = details.setdefault(code, [])
+            # A stop that was stored has what the program before has joined.
+            if not any(detail in one for one in of_code):
+                of_code.append(detail)
+        return tuple(Fault(code, "; ".join(of_code)) for code, of_code in details.items())
+
     @classmethod
     def of(cls, loop: ControlLoop) -> "Remembered":
         """Return the present state of a control loop."""
@@ -66,15 +92,10 @@ class Remembered:
 
     def restore(self, loop: ControlLoop, on_judged: OnJudged = lambda _: None) -> None:
         """Give the stored state to a new control loop; a restored stop keeps the grip, even if it had opened it."""
-        for name, detail in self.stop:
-            known = name in FaultCode.__members__
-            loop.safety.stop(Fault(FaultCode[name], detail) if known else Fault(FaultCode.DAEMON_ENDED, detail))
-        if self.running:
-            ended = f"it was killed, it crashed or the power failed while {self.running!r} was under way"
-            loop.safety.stop(Fault(FaultCode.DAEMON_ENDED, ended))
-        grip = Grip(self.origin_rad, self.force_n, self.width_mm, self.requested_counts)
-        if grip != NO_GRIP or self.load_zero is not None or self.wrench_zero is not None:
-            loop.restore_grip(grip, on_judged)
+        for fault in self.faults:
+            loop.safety.stop(fault)
+        if self.grips:
+            loop.restore_grip(self.grip, on_judged)
 
 
 @dataclass(slots=True)
@@ -107,7 +128,9 @@ class RigMemory:
         """Restore what the last daemon of this robot has left."""
         remembered = read_memories(self.files)
         remembered.restore(self.loop, self._on_judged)
-        if len(self.files.states) == 1 and not any(path.exists() for path in self.files.other_states):
+        files = self.files
+        elsewhere = (*files.other_states, *files.lapsed_states)
+        if len(files.states) == 1 and not any(path.exists() for path in elsewhere):
             self._written = remembered
         # Until the gripper answers, its grip counts as the one before.
         cell, zero = self.load_cell, remembered.load_zero
@@ -235,19 +258,45 @@ def read_memory(path: Path) -> Remembered:
 def read_memories(files: RobotFiles) -> Remembered:
     """Return the state in the files of one robot: of its stops none is missed, and of its grips the latest counts.
 
-    Where a name has no known address, the state under that address is not found: this counts as a stop.
+    Where a name has no known address, the state under that address is not found: this counts as a stop. So does another
+    address: the robot there may be another one. Its own grip then counts before one that was left at that address.
     """
-    found = [(_written_ns(path), read_memory(path)) for path in (*files.states, *files.other_states)]
-    newest_first = [state for _, state in sorted(found, key=lambda one: one[0], reverse=True)]
+    newest_first = _newest_first(files)
     stops = [fault for state in newest_first for fault in state.stop]
+    if why := _why_unsure(files):
+        stops.append((FaultCode.DAEMON_ENDED.name, why))
+    running = next((state.running for state in newest_first if state.running), "")
+    grip = newest_first[0]
+    if files.earlier:
+        own = read_memory(files.own_state)
+        grip = next((state for state in (own, *newest_first) if state.grips), grip)
+    return replace(grip, running=running, stop=tuple(dict.fromkeys(stops)))
+
+
+def _newest_first(files: RobotFiles) -> list[Remembered]:
+    """Return the states that count for one robot."""
+    paths = [*files.states, *files.other_states]
+    if not files.own_state.exists():
+        paths.extend(files.earlier_states)
+    latest_ns = max(map(_written_ns, paths))
+    paths.extend(path for path in files.lapsed_states if _written_ns(path) > latest_ns)
+    return [read_memory(path) for path in sorted(paths, key=_written_ns, reverse=True)]
+
+
+def _why_unsure(files: RobotFiles) -> str:
+    """Return why it is not certain which robot a name means, or an empty string."""
     if not files.known:
-        unknown = (
+        return (
             f"what it left is kept under the robot's address, and the name {files.host!r} has none at present: see "
             "that the name is right and the network is up"
         )
-        stops.append((FaultCode.DAEMON_ENDED.name, unknown))
-    running = next((state.running for state in newest_first if state.running), "")
-    return replace(newest_first[0], running=running, stop=tuple(dict.fromkeys(stops)))
+    if files.earlier:
+        before, present = (", ".join(addresses) for addresses in (files.earlier, files.keys))
+        return (
+            f"the name {files.host!r} had the address {before} then and has {present} at present: see that this is the "
+            "same robot"
+        )
+    return ""
 
 
 def _written_ns(path: Path) -> int:
@@ -263,6 +312,8 @@ def write_memories(files: RobotFiles, state: Remembered) -> None:
         write_memory(path, state)
     for path in files.other_states:
         path.unlink(missing_ok=True)
+    if files.earlier:
+        files.note_addresses()
 
 
 def write_memory(path: Path, state: Remembered) -> None:

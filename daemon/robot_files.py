@@ -22,12 +22,19 @@ SUFFIXES = (".json", ".lock", ADDRESSES_SUFFIX)
 class RobotFiles:
     """One robot's keys in the folder of states: its addresses, or its name where no address is known.
 
-    `others` are other spellings that have files, such as its name: their state is of this robot as well.
+    Its names have files as well, so that a robot with a new address is found by its name.
     """
 
     host: str
     keys: tuple[str, ...]
+    # Names that are found at its addresses.
+    names: tuple[str, ...] = ()
+    # Other spellings that have files: their state is of this robot as well.
     others: tuple[str, ...] = ()
+    # Names that are not found at present, and had its addresses: what they have is of this robot, or of another one.
+    lapsed: tuple[str, ...] = ()
+    # The addresses that its name had when its state was last written, if none of them is left.
+    earlier: tuple[str, ...] = ()
     # Whether it is known which robot the name means; it need not be an address of the present look-up.
     known: bool = True
 
@@ -36,23 +43,30 @@ class RobotFiles:
         """Look up the robot at a name or address, and the other names that have files here; takes at most 2 s."""
         name, stored = one_spelling(host), _stored_spellings()
         addresses = addresses_of((name, *stored))
-        own = addresses[name] or _last_addresses(name)
-        keys = tuple(sorted(own)) or (name,)
-        same = {
-            spelling
-            for spelling, found in addresses.items()
-            if one_spelling(spelling) == name or own & (found or _last_addresses(spelling))
-        }
-        others = tuple(sorted({host, name, *same} - set(keys)))
-        files = cls(host, keys, others, known=bool(own))
-        if own and not is_address(name):
+        last = _last_addresses(name)
+        own = addresses[name] or last
+        keys = set(own) or {name}
+        found = {one_spelling(spelling) for spelling in stored if own & addresses[spelling]}
+        names = {spelling for spelling in {name, *found} if not is_address(spelling)} - keys
+        lapsed = {spelling for spelling in stored if not addresses[spelling] and own & _last_addresses(spelling)}
+        spelt = {spelling for spelling in stored if one_spelling(spelling) in keys | names}
+        files = cls(
+            host,
+            keys=tuple(sorted(keys)),
+            names=tuple(sorted(names)),
+            others=tuple(sorted({host, *spelt} - keys - names)),
+            lapsed=tuple(sorted(lapsed - keys - names - spelt)),
+            earlier=() if own & last else tuple(sorted(last)),
+            known=bool(own),
+        )
+        if files.known and not files.earlier:
             files.note_addresses()
         return files
 
     @property
     def states(self) -> tuple[Path, ...]:
-        """The files of its state, which are written."""
-        return tuple(memory_path(key) for key in self.keys)
+        """The files of its state, which are written; that of a name is the latest of them."""
+        return tuple(memory_path(spelling) for spelling in (*self.keys, *self.names))
 
     @property
     def other_states(self) -> tuple[Path, ...]:
@@ -60,13 +74,34 @@ class RobotFiles:
         return tuple(memory_path(other) for other in self.others)
 
     @property
+    def lapsed_states(self) -> tuple[Path, ...]:
+        """Files that may be another robot's: they are read where they are the latest, and never written."""
+        return tuple(memory_path(name) for name in self.lapsed)
+
+    @property
+    def earlier_states(self) -> tuple[Path, ...]:
+        """Files of the addresses before, which are read where the name has no file of its own, and never written."""
+        return tuple(memory_path(address) for address in self.earlier)
+
+    @property
+    def own_state(self) -> Path:
+        """The file of its state under the name that it was asked for."""
+        return memory_path(one_spelling(self.host))
+
+    @property
     def locks(self) -> tuple[Path, ...]:
         """The files of its lock; the order is the same for all daemons."""
-        return tuple(_file(spelling, ".lock") for spelling in sorted({*self.keys, *self.others}))
+        spellings = {*self.keys, *self.names, *self.others, *self.lapsed}
+        return tuple(_file(spelling, ".lock") for spelling in sorted(spellings))
 
     def note_addresses(self) -> bool:
-        """Keep the addresses of its name for a start without a network; return whether it has any now."""
+        """Keep the addresses of its name, for a start without a network; return whether it has any now.
+
+        A name whose addresses have changed keeps the earlier ones until the state is written under the new ones.
+        """
         name = one_spelling(self.host)
+        if is_address(name):
+            return True
         found = addresses_of((name,))[name] if not self.known else frozenset(self.keys)
         # A folder that cannot be written keeps experiments from their start, and says so.
         with contextlib.suppress(OSError):

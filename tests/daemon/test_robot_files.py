@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memory
+from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memories, write_memory
 from shearloop.daemon.robot_files import RobotFiles, lock_robot, memory_path
 from shearloop.drivers import hosts
 from shearloop.errors import UserError
@@ -74,7 +74,7 @@ async def test_a_stop_that_was_kept_under_a_name_is_found_and_moves_to_the_addre
     memory = RigMemory(RobotFiles.of(now), loop := new_loop())
     assert [fault.code.name for fault in loop.safety.stop_faults] == [STOP[0]]
     await memory.save_present()
-    assert not memory_path(earlier).exists()
+    assert read_memory(memory_path("192.168.1.10")).stop[0][0] == STOP[0]
     loop.acknowledge()
     await memory.save_present()
     for spelling in ("ur.lab", "192.168.1.10", earlier, now):
@@ -96,6 +96,75 @@ def test_a_name_that_has_moved_is_the_robot_at_its_present_address(names):
     names["ur.lab"] = ["192.168.1.20"]
     with lock_robot(RobotFiles.of("ur.lab")), lock_robot(RobotFiles.of("192.168.1.10")):
         pass
+
+
+GRIP = Remembered(running="loosen", stop=(STOP,), origin_rad=0.3, force_n=60.0, width_mm=30.0)
+OTHERS_GRIP = Remembered(origin_rad=1.0, force_n=20.0, width_mm=80.0)
+
+
+@pytest.mark.parametrize("has_own_file", [False, True])
+async def test_a_robot_with_a_new_address_keeps_stop_crash_and_grip(names, has_own_file):
+    files = RobotFiles.of("ur.lab")
+    if has_own_file:
+        write_memories(files, GRIP)
+    else:
+        write_memory(memory_path("192.168.1.10"), GRIP)
+    names["ur.lab"] = ["192.168.1.20"]
+    memory = RigMemory(RobotFiles.of("UR.lab"), loop := new_loop())
+    details = [fault.detail for fault in loop.safety.stop_faults]
+    assert details[0] == STOP[1]
+    assert any("'loosen' was under way" in detail for detail in details)
+    assert any("had the address 192.168.1.10 then and has 192.168.1.20 at present" in detail for detail in details)
+    assert (loop.grip.origin_rad, loop.grip.force_n) == (0.3, 60.0)
+    # Until it is written, the next program meets the same.
+    assert read_memories(RobotFiles.of("ur.lab")).running == "loosen"
+    loop.acknowledge()
+    await memory.save_present()
+    after = read_memories(RobotFiles.of("ur.lab"))
+    assert (after.stop, after.running, after.origin_rad) == ((), "", 0.3)
+
+
+def test_a_new_address_with_nothing_to_remember_waits_for_the_operator(names):
+    write_memories(RobotFiles.of("ur.lab"), Remembered())
+    names["ur.lab"] = ["192.168.1.20"]
+    assert "see that this is the same robot" in read_memories(RobotFiles.of("ur.lab")).stop[0][1]
+
+
+def test_a_name_with_a_further_address_is_the_same_robot(names):
+    write_memories(RobotFiles.of("ur.lab"), Remembered())
+    names["ur.lab"] = ["192.168.1.10", "192.168.1.20"]
+    assert read_memories(RobotFiles.of("ur.lab")) == Remembered()
+
+
+@pytest.mark.parametrize("both_are_found", [True, False])
+def test_two_robots_with_exchanged_addresses_keep_their_own_grips_and_stops(names, both_are_found):
+    write_memories(RobotFiles.of("ur.lab"), GRIP)
+    write_memories(RobotFiles.of("other.lab"), OTHERS_GRIP)
+    names["ur.lab"] = ["192.168.1.11"]
+    if both_are_found:
+        names["other.lab"] = ["192.168.1.10"]
+    else:
+        del names["other.lab"]
+    files = RobotFiles.of("ur.lab")
+    own = read_memories(files)
+    assert (own.origin_rad, own.running) == (0.3, "loosen")
+    write_memories(files, Remembered())
+    assert read_memories(RobotFiles.of("ur.lab")) == Remembered()
+    names["other.lab"] = ["192.168.1.10"]
+    other = RobotFiles.of("other.lab")
+    assert read_memories(other).origin_rad == 1.0
+    assert read_memories(other).stop
+    write_memories(other, OTHERS_GRIP)
+    assert read_memories(RobotFiles.of("other.lab")) == OTHERS_GRIP
+
+
+def test_a_stop_under_a_name_that_is_not_found_for_now_is_acknowledged_by_number_once(names):
+    write_memories(RobotFiles.of("ur.lab"), Remembered(stop=(STOP,)))
+    names.clear()
+    files = RobotFiles.of("192.168.1.10")
+    assert read_memories(files).stop == (STOP,)
+    write_memories(files, Remembered())
+    assert read_memories(RobotFiles.of("192.168.1.10")) == Remembered()
 
 
 async def test_a_name_that_was_never_found_waits_for_the_operator_until_it_was(names):

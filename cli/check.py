@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     parts = _check_experiment(args.config, args.rig) if is_experiment else _check_configuration(args.config)
     plan_lines = [line for plan in parts.plans for line in plan.sentences()]
     if parts.mistakes:
-        if is_experiment and not args.json:
+        if is_experiment and plan_lines and not args.json:
             # A rehearsal shows where in the plan the refused steps are.
             print(*plan_lines, sep="\n", flush=True)
         raise UserError("\n".join(dict.fromkeys(parts.mistakes.values())))

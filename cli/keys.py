@@ -2,6 +2,7 @@
 
 import argparse
 import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -47,7 +48,7 @@ def _server(args: argparse.Namespace) -> int:
     sentences = [
         f"{secret}: the daemon's secret key; only the daemon may read it",
         f"{public}: give this file to every client, as ~/.config/shearloop/server.key",
-        "next: `shearloop keys allow CLIENT.key` for each client, then add to the configuration:",
+        f"next: `{_allow_command(args.dir)}` for each client's .key, then add to the configuration:",
         f"curve: {{server_key: {secret}, clients: {clients}}}",
     ]
     content = {"secret_file": str(secret), "public_file": str(public), "clients": str(clients)}
@@ -103,8 +104,15 @@ def _list(args: argparse.Namespace) -> int:
     clients = {name: key.decode() for key, name in allowed.names.items()}
     sentences = [f"{server}  the daemon", *(f"{key}  {name}" for name, key in clients.items()), *allowed.unusable]
     if not clients:
-        sentences.append("no client may connect yet; see `shearloop keys allow`")
+        sentences.append(f"no client may connect yet; allow one with `{_allow_command(args.dir)}`")
     return print_result({"server": server, "clients": clients}, sentences, as_json=args.json)
+
+
+def _allow_command(folder: Path) -> str:
+    """Return the command that allows a client in the folder of the daemon's keys; root writes the usual one."""
+    if folder == SERVER_FOLDER:
+        return "sudo shearloop keys allow FILE"
+    return f"shearloop keys allow FILE --dir {shlex.quote(str(folder))}"
 
 
 def _check_name(name: str) -> None:

@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from shearloop.daemon.config_file import ConfigModel, either, load_yaml_model, not_of_kind
+from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, FileKind, either, load_yaml_model, not_of_kind
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging import addresses
 from shearloop.drivers import ranges
@@ -89,7 +89,7 @@ Host = Annotated[str, AfterValidator(_valid_host)]
 
 
 class CurveConfig(ConfigModel):
-    """Keys for addresses that are open to the network; made by `shearloop keys`."""
+    """Keys for addresses that are open to the network; made by `shearloop keys server`."""
 
     server_key: Path = Field(description="the daemon's own .key_secret; under systemd its credential of this name")
     clients: Path = Field(description="the allow-list: a folder with the .key of each client")
@@ -260,13 +260,13 @@ class DaemonConfig(ConfigModel):
     """A whole configuration."""
 
     _kind = not_of_kind(
-        "an experiment",
-        "name it in a configuration as `experiment`, or start it with `shearloop command start --experiment FILE`",
-        "steps",
+        FileKind(
+            "an experiment",
+            "name it in a configuration as `experiment`, or start it with `shearloop command start --experiment FILE`",
+            ("steps",),
+        ),
+        *NAMED_FILES,
     )
-    _of_robot = not_of_kind("the robot's settings", "name this file in a configuration as `robot`", "host")
-    _of_fingertip = not_of_kind("a fingertip's description", "name it in a bank's as `fingertip`", "electrodes")
-    _of_bank = not_of_kind("a bank's description", "`shearloop bank build --config FILE` takes it", "sigma")
 
     name: str = Field("", max_length=60, description="name of the rig, for the page; default: that of this file")
     publish: Address = Field(addresses.PUBLISH_ADDRESS, description="ZeroMQ address of the messages")

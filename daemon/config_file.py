@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_args
+from typing import Any, ClassVar, NamedTuple, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
@@ -79,12 +79,37 @@ def _located(value: object, folder: Path) -> object:
 Model = TypeVar("Model", bound=ConfigModel)
 
 
-def not_of_kind(kind: str, cure: str, *keys: str) -> Any:
-    """Return a model's validator: content with one of these keys is of another kind."""
+class FileKind(NamedTuple):
+    """A kind of file: what it is, where it belongs, and keys that show it."""
+
+    what: str
+    cure: str
+    keys: tuple[str, ...]
+
+
+# Files that a configuration names, or that another command takes.
+NAMED_FILES = (
+    FileKind("the robot's settings", "name this file in a configuration as `robot`", ("host",)),
+    FileKind("a fingertip's description", "name it in a bank's as `fingertip`", ("electrodes",)),
+    FileKind("a bank's description", "`shearloop bank build --config FILE` takes it", ("sigma",)),
+    FileKind("a skin's calibration", "name it in a configuration as `skin.calibration`", ("gauge_angle_deg",)),
+    FileKind(
+        "a load cell's calibration", "name it in a configuration as `load_cell.calibration`", ("scale_n_per_count",)
+    ),
+    FileKind("a gripper's calibration", "name it in a configuration as `gripper.calibration`", ("open_counts",)),
+    FileKind("a commissioning report", "name it in a configuration as `commissioned`", ("stages",)),
+)
+
+
+def not_of_kind(*others: FileKind) -> Any:
+    """Return a model's validator: content with a key of one of these kinds is of that kind."""
 
     def check(content: object) -> object:
-        if isinstance(content, dict) and not content.keys().isdisjoint(keys):
-            raise ValueError(f"this is {kind}; {cure}")
+        if not isinstance(content, dict):
+            return content
+        for one in others:
+            if not content.keys().isdisjoint(one.keys):
+                raise ValueError(f"this is {one.what}; {one.cure}")
         return content
 
     return model_validator(mode="before")(check)

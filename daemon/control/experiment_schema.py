@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema, model_validator
 
 from shearloop.daemon.commissioning import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD_PER_S
-from shearloop.daemon.config_file import ConfigModel, either, not_of_kind
+from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, FileKind, either, not_of_kind
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
 from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S, GripperModel
@@ -225,11 +225,19 @@ class ExperimentFile(ConfigModel):
 
     what: ClassVar[str] = "experiment"
 
-    _kind = not_of_kind("a configuration", "name this experiment in it as `experiment`", "fingertips", "skin")
+    _kind = not_of_kind(
+        FileKind(
+            "a configuration",
+            "start it with `shearloop run FILE`, and name an experiment in it as `experiment`",
+            ("fingertips", "skin"),
+        ),
+        *NAMED_FILES,
+    )
 
     name: str = Field(min_length=1, max_length=80, description="shown in messages and recordings")
     torque_source: Annotated[str, Field(min_length=1)] = Field(
-        "right", description="torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
+        "right",
+        description="torque that drives the loop: a fingertip's name, `combined`, `skin`, `load_cell` or `wrench`",
     )
     limits: ExperimentLimits = Field(ExperimentLimits(), description="limits of all steps")
     tool_mm: float | None = Field(None, gt=0, lt=LARGEST_STROKE_MM, description="diameter of the tool, for recordings")

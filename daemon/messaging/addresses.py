@@ -85,7 +85,7 @@ def network_refusal(address: str, key: str) -> str:
     """Return the error for a network address without keys; `key` is its key in the configuration."""
     return (
         f"`{key}: {address}` would open the robot to the network: use ipc or a loopback address such as "
-        "tcp://127.0.0.1:7761, or add `curve` with keys from `shearloop keys`"
+        "tcp://127.0.0.1:7761, or add `curve` with keys from `sudo shearloop keys server`"
     )
 
 

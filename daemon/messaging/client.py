@@ -157,8 +157,8 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = N
         keys.apply(socket)
     elif needs_keys(address):
         raise UserError(
-            f"{address} is not on this machine: give your key with --key and the daemon's with --server-key, "
-            "made by `shearloop keys`"
+            f"{address} is not on this machine: give your key with --key and the daemon's with --server-key; "
+            "`shearloop keys client` makes yours, docs/security.md shows the rest"
         )
     try:
         socket.connect(address)
@@ -172,4 +172,4 @@ def keys_hint(keys: ClientKeys | None) -> str:
     """Return a hint about keys: a daemon on the network does not answer a wrong key at all."""
     if keys is None:
         return "; a daemon with a network address answers only with --key and --server-key"
-    return "; it answers only keys that `shearloop keys allow` has added"
+    return "; it answers only keys that `sudo shearloop keys allow FILE` has added"

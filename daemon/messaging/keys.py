@@ -28,6 +28,7 @@ from shearloop.files import read_file
 
 # The unit's `SetCredential` gives this value until the server key exists.
 _NO_CREDENTIAL = "none"
+_WHO_MAKES_KEYS = "`sudo shearloop keys server` makes the daemon's keys, `shearloop keys client` a client's"
 ZAP_DOMAIN = "shearloop"
 _LARGEST_KEY_BYTES = 1 << 14
 # New clients that are admitted at once, and then per second.
@@ -81,10 +82,10 @@ def load_key_pair(path: Path) -> KeyPair:
     if path.stat().st_mode & stat.S_IROTH:
         raise UserError(
             f"{path}: every user of this machine can read the secret key: run `chmod 600 {path}`, and make a new pair "
-            "with `shearloop keys` if another user may have read it"
+            f"if another user may have read it; {_WHO_MAKES_KEYS}"
         )
     if zmq.curve_public(secret) != public:
-        raise UserError(f"{path}: its public and its secret key do not match; make new ones with `shearloop keys`")
+        raise UserError(f"{path}: its public and its secret key do not match; {_WHO_MAKES_KEYS}")
     return KeyPair(public, secret)
 
 
@@ -153,7 +154,8 @@ def allowed_clients(folder: Path) -> AllowedClients:
         paths = sorted(path for path in folder.iterdir() if path.suffix == ".key")
     except OSError as error:
         raise UserError(
-            f"{folder}: the allowed clients' keys cannot be read: {error.strerror}; `shearloop keys server` makes it"
+            f"{folder}: the allowed clients' keys cannot be read: {error.strerror}; "
+            "`sudo shearloop keys server` makes the folder"
         ) from error
     names: dict[bytes, str] = {}
     unusable: list[str] = []
@@ -170,7 +172,7 @@ def check_allowed_clients(folder: Path) -> AllowedClients:
     clients = allowed_clients(folder)
     if not clients.names:
         why = "; ".join(clients.unusable) or f"{folder} holds no key"
-        raise UserError(f"{why}, so no client could connect; see `shearloop keys allow`")
+        raise UserError(f"{why}, so no client could connect; allow one with `sudo shearloop keys allow FILE`")
     return clients
 
 
@@ -242,15 +244,15 @@ def _load(path: Path) -> tuple[bytes, bytes | None]:
         raise UserError(f"{path}: this user may not read the key; run as its owner, or with sudo") from error
     except OSError as error:
         reason = error.strerror or "there is no such file"
-        raise UserError(f"{path}: the key cannot be read: {reason}; make it with `shearloop keys`") from error
+        raise UserError(f"{path}: the key cannot be read: {reason}; {_WHO_MAKES_KEYS}") from error
     except ValueError as error:
-        raise UserError(f"{path} is no key file; make one with `shearloop keys`") from error
+        raise UserError(f"{path} is no key file; {_WHO_MAKES_KEYS}") from error
     try:
         sizes = {len(z85.decode(key)) for key in (public, secret) if key is not None}
     except (KeyError, ValueError, struct.error):
         sizes = set()
     if sizes != {32}:
-        raise UserError(f"{path} holds a damaged key; make a new one with `shearloop keys`")
+        raise UserError(f"{path} holds a damaged key; {_WHO_MAKES_KEYS}")
     return public, secret
 
 

@@ -64,6 +64,16 @@ def fingertip(**changes: Any) -> dict[str, Any]:
     return {"fingertips": {"right": {"device": {"path": "eit"}, "bank": "no.bank", **changes}}}
 
 
+@pytest.mark.parametrize(
+    "name", ["ur.yaml", "fingertips/paper.yaml", "banks/paper.yaml", "calibrations/skin_demo.yaml"]
+)
+def test_check_and_run_say_the_same_of_a_file_of_another_kind(name, mistake):
+    path = Path(__file__).parents[2] / "config" / name
+    said = mistake("run", str(path))
+    assert said.startswith(f"shearloop run: {path}:1: this is ")
+    assert mistake("check", str(path)).partition(": ")[2] == said.partition(": ")[2]
+
+
 @pytest.mark.parametrize("command", ["run", "check"])
 @pytest.mark.parametrize(
     ("changes", "parts"),

@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, ValidationError, create_model, model_vali
 
 from shearloop.cli.config_schema import MODELS, schema_of
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.config_file import ConfigModel, load_yaml_model
+from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
@@ -178,8 +178,14 @@ steps:
 def test_a_file_of_another_kind_is_recognised(tmp_path):
     sentence = "1: this is an experiment; name it in a configuration"
     assert sentence in refused(tmp_path, "name: one\nsteps: [{do: tare}]\n", DaemonConfig)
-    sentence = "1: this is a configuration; name this experiment in it"
+    sentence = "1: this is a configuration; start it with `shearloop run FILE`"
     assert sentence in refused(tmp_path, "fingertips: {}\n", ExperimentFile)
+    for kind in NAMED_FILES:
+        for model in (DaemonConfig, ExperimentFile):
+            # One mistake, and none of the keys that the other kind lacks.
+            said = refused(tmp_path, f"name: one\n{kind.keys[0]}: 1\nlimits: {{force_n: 1}}\n", model)
+            assert said.endswith(f"a.yaml:1: this is {kind.what}; {kind.cure}")
+            assert len(said.splitlines()) == 1
     with pytest.raises(UserError, match=r"b\.yaml: the experiment cannot be read: No such file"):
         load_yaml_model(tmp_path / "b.yaml", ExperimentFile)
 

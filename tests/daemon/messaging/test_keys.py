@@ -70,7 +70,7 @@ def test_a_network_address_needs_existing_keys(config, keys, ran, mistake):
     missing = {"server_key": str(keys / "none.key_secret"), "clients": str(keys / "keys/clients")}
     path = str(config(commands=NETWORK, curve=missing))
     for command in ("run", "check"):
-        assert "make it with `shearloop keys`" in mistake(command, path)
+        assert "`sudo shearloop keys server` makes the daemon's keys" in mistake(command, path)
     ran("keys", "revoke", "ada", "--dir", keys / "keys")
     assert "holds no key, so no client could connect" in mistake("run", config(commands=NETWORK, curve=curve(keys)))
 
@@ -152,7 +152,8 @@ def test_keys_are_made_listed_and_revoked(keys, ran, mistake, result_of):
     ):
         assert why in mistake("keys", *arguments, "--dir", folder)
     assert result_of("keys", "revoke", "ada", "--dir", folder) == {"revoked": "ada"}
-    assert "no client may connect yet" in ran("keys", "list", "--dir", folder).out
+    advice = f"no client may connect yet; allow one with `shearloop keys allow FILE --dir {folder}`"
+    assert advice in ran("keys", "list", "--dir", folder).out
 
 
 def test_a_damaged_key_is_an_error(keys):

@@ -243,6 +243,11 @@ class RobotiqGripper:
         self.latest = self._state(*await self._read(whole=True))
         return self.latest
 
+    async def poll(self) -> messages.GripperState:
+        """Return a state as `states` reads it: object and position are of now, the other values come in turn."""
+        self.latest = self._state(*await self._read())
+        return self.latest
+
     async def activate(self, *, operator_confirmed: bool = False, may_drop: bool = False) -> messages.GripperState:
         """Return the state of the active gripper; one that is not active opens and closes its fingers once.
 
@@ -359,8 +364,7 @@ class RobotiqGripper:
 
     async def _next_state(self) -> messages.GripperState:
         if self.connected:
-            self.latest = self._state(*await self._read())
-            return self.latest
+            return await self.poll()
         if self._loss is not None:
             raise self._loss
         state = await self.connect()

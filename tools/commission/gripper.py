@@ -6,8 +6,9 @@ from typing import Final
 from shearloop.daemon.commissioning import Line, Supplied
 from shearloop.daemon.config import GripperConfig
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.robotiq.gripper import WidthCalibration
+from shearloop.drivers.robotiq.gripper import ACTIVATION_DEADLINE_NS, PAUSE_NS, RESET_DEADLINE_NS, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperState
+from shearloop.drivers.robotiq.models import MODELS
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GENTLE_N, Hand, close_fingers, open_fingers
 from shearloop.tools.commission.operator import Played
@@ -15,6 +16,8 @@ from shearloop.tools.commission.report import Measured, judged, percentile_99
 
 STAGE: Final = "2 gripper"
 WIDTH_MM: Final = 1.0
+# The driver gives up then: a reset, its pause, and twice the stroke.
+LONGEST_ACTIVATION_S: Final = (RESET_DEADLINE_NS + PAUSE_NS + ACTIVATION_DEADLINE_NS) / 1e9
 # Emulated objects, as fractions of the stroke.
 _OBJECTS: Final = (0.05, 0.6, 0.25, 0.4)
 
@@ -24,24 +27,44 @@ def measure(context: Context) -> Measured:
     config = context.config.gripper
     if config is None:
         return Measured([Line(what="gripper", value="none is configured")])
+    model = MODELS[config.model]
     context.operator.allow(
-        "the gripper opens and closes its fingers once over the whole stroke, unless it is active already; nothing is "
+        f"the gripper is activated, also where it is active already: its fingers open and close once over the whole "
+        f"stroke of {model.stroke_mm:g} mm, at a speed of their own of up to {model.speed_mm_s[1]:g} mm/s; nothing is "
         "between them"
     )
     with context.rig.hand() as hand:
-        hand.activate(operator_confirmed=True)
-        lines = [_exchanges(context, hand)]
+        lines = [_activation(context, hand), _exchanges(context, hand)]
         width_line, supplies = judge_widths(_gauges(context, hand), config)
         return Measured([*lines, width_line, *_objects(context, hand)], supplies)
 
 
+def _activation(context: Context, hand: Hand) -> Line:
+    """Activate the gripper, and return the line on the time that it took."""
+    begun_ns = context.clock.now_ns()
+    hand.activate(operator_confirmed=True)
+    time_s = (context.clock.now_ns() - begun_ns) / 1e9
+    return judged(
+        "activation",
+        f"{time_s:.1f} s, with the reset before it",
+        f"at most {LONGEST_ACTIVATION_S:g} s",
+        "the gripper is ready after a start",
+        passed=time_s <= LONGEST_ACTIVATION_S,
+    )
+
+
 def _exchanges(context: Context, hand: Hand) -> Line:
-    count, longest_s = context.counts.exchanges, context.limits.longest_exchange_s
+    """Return the line on the time of an exchange, as the daemon has it ten times a second."""
     times_s = []
-    for _ in range(count):
+    for _ in range(context.counts.exchanges):
         begun_ns = context.clock.now_ns()
-        hand.read()
+        hand.poll()
         times_s.append((context.clock.now_ns() - begun_ns) / 1e9)
+    return judge_exchanges(times_s, context.limits.longest_exchange_s)
+
+
+def judge_exchanges(times_s: Sequence[float], longest_s: float) -> Line:
+    """Return the line on the times of exchanges."""
     p99_s = percentile_99(times_s)
     return judged(
         "exchange with the gripper, p99",
@@ -49,7 +72,7 @@ def _exchanges(context: Context, hand: Hand) -> Line:
         f"below {1e3 * longest_s:g} ms",
         "its state is younger than 0.25 s",
         passed=p99_s < longest_s,
-        count=count,
+        count=len(times_s),
     )
 
 

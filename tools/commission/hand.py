@@ -24,8 +24,8 @@ class Hand(Protocol):
     def activate(self, *, operator_confirmed: bool = False) -> None:
         """Return once the gripper is active; see `RobotiqGripper.activate`."""
 
-    def read(self) -> GripperState:
-        """Return the gripper's present state."""
+    def poll(self) -> GripperState:
+        """Return the gripper's state as the daemon polls it."""
 
     def move(self, command: GripperCommand) -> GripperState:
         """Move the fingers, and return the state at their target or on an object."""
@@ -57,9 +57,9 @@ class ConnectedHand(Opened):
         """Return once the gripper is active."""
         self._runner.run(self._gripper.activate(operator_confirmed=operator_confirmed))
 
-    def read(self) -> GripperState:
-        """Return the gripper's present state."""
-        return self._runner.run(self._gripper.read())
+    def poll(self) -> GripperState:
+        """Return the gripper's state as the daemon polls it."""
+        return self._runner.run(self._gripper.poll())
 
     def move(self, command: GripperCommand) -> GripperState:
         """Move the fingers, and return the state at their target or on an object."""

@@ -75,8 +75,9 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
         found = f"{client.name} answers, with fault {state.flt}: {fault_of(state.flt).sentence}"
         return [from_error("gripper", found, "it does not move", "`shearloop command unlock`")]
     if state.sta is not ActivationStatus.ACTIVE:
-        cure = "keep fingers and tools away when the daemon starts"
-        return [note("gripper", f"{client.name} answers; not activated", "it opens and closes once at the start", cure)]
+        found = f"{client.name} answers; not activated"
+        cure = "keep fingers and tools away from its first grip or release"
+        return [note("gripper", found, "its next motion opens and closes the fingers once before", cure)]
     return [good("gripper", f"{client.name} answers and is activated")]
 
 

@@ -14,6 +14,8 @@ from shearloop.drivers.robotiq import socket_client
 from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperAction, GripperCommand, GripperMove
 from shearloop.drivers.robotiq.socket_client import ALWAYS, IN_TURN, SocketClient
+from shearloop.tools.commission.gripper import judge_exchanges
+from shearloop.tools.commission.limits import REAL
 
 VALUES = {"ACT": 1, "STA": 3, "GTO": 1, "PRE": 100, "OBJ": 3, "POS": 100, "FLT": 0, "COU": 7}
 
@@ -102,6 +104,30 @@ async def test_a_slow_connection_asks_for_object_and_position_each_time_and_for_
         peer.lines.clear()
         await client.read(whole=True)
         assert len(peer.lines) == len(IN_TURN) + len(ALWAYS)
+
+
+@pytest.mark.parametrize(("answer_s", "verdict"), [(0.001, "passed"), (0.012, "passed"), (0.032, "failed")])
+async def test_commissioning_judges_the_exchange_that_the_daemon_polls_with(answer_s, verdict, monkeypatch):
+    """A slow connection answers within the limit where the daemon's poll does, not where all eight variables would."""
+    now_s = 0.0
+
+    def slow(line: str) -> bytes:
+        nonlocal now_s
+        now_s += answer_s
+        return usual(line)
+
+    async with connected(Peer(slow)) as client:
+        own_time = SimpleNamespace(get_running_loop=lambda: SimpleNamespace(time=lambda: now_s))
+        monkeypatch.setattr(socket_client, "asyncio", own_time)
+        gripper = RobotiqGripper(client, WidthCalibration.nominal())
+        await gripper.read()
+        times_s = []
+        for _ in range(20):
+            begun_s = now_s
+            await gripper.poll()
+            times_s.append(now_s - begun_s)
+        monkeypatch.undo()
+    assert judge_exchanges(times_s, REAL.longest_exchange_s).verdict == verdict
 
 
 @pytest.mark.usefixtures("slow_link")

@@ -16,6 +16,7 @@ from shearloop.drivers.load_cell import LoadCalibration, LoadParser, LoadSample
 from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand, GripperState, ObjectStatus, fault_of
 from shearloop.drivers.robotiq.models import MODELS
+from shearloop.drivers.robotiq.socket_client import ALWAYS, IN_TURN, IN_TURN_S
 from shearloop.drivers.ur.client import WORKER
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import ControllerInfo
@@ -217,9 +218,11 @@ class SimulatedHand:
         self._gripper.write(registers)
         self._rig.run_until(lambda: self._gripper.taken == registers)
 
-    def read(self) -> GripperState:
-        # Eight values, one after the other.
-        self._rig.clock.sleep(8 * self._rig.emulated.commanded["gripper"].server.answer_s)
+    def poll(self) -> GripperState:
+        answer_s = self._rig.emulated.commanded["gripper"].server.answer_s
+        # As `SocketClient.read` asks for them, one after the other.
+        in_turn = min(len(IN_TURN), 1 + int(IN_TURN_S / answer_s)) if answer_s else len(IN_TURN)
+        self._rig.clock.sleep((in_turn + len(ALWAYS)) * answer_s)
         counts = self._gripper.pos
         return GripperState(
             t_ns=self._rig.now_ns(),
@@ -244,7 +247,7 @@ class SimulatedHand:
             )
         )
         self._rig.run_until(lambda: self._gripper.obj != ObjectStatus.MOVING)
-        return self.read()
+        return self.poll()
 
 
 class SimulatedBoard:

@@ -160,6 +160,21 @@ def test_each_seeded_fault_turns_its_own_line_red(lab, fault, stage, line):
     assert failed(report) == [line]
 
 
+def test_an_answer_of_12_ms_a_variable_is_fast_enough_for_the_daemon(lab):
+    lab.rig.order("gripper slow 12")
+    report, _ = lab.run("2")
+    assert failed(report) == []
+
+
+def test_an_active_gripper_is_activated_as_its_question_says_and_the_time_is_measured(lab):
+    lab.run("2")
+    lab.operator.asked.clear()
+    report, _ = lab.run("2")
+    assert "also where it is active already" in lab.operator.asked[1]
+    (line,) = (line for line in report.stages[0].lines if line.what == "activation")
+    assert float(line.value.split()[0]) > 0.1
+
+
 def test_the_bounds_are_about_the_confirmed_pose_also_where_the_arm_was_moved_by_hand_before(lab):
     """The robot is driven from stage 1 on, and the pose is confirmed in stage 3."""
     lab.move_by_hand(0.08, before="object none")

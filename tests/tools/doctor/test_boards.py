@@ -17,6 +17,8 @@ from shearloop.drivers.calibration_files import save_calibration
 from shearloop.drivers.eit_kit import ADC_STEP_V, FrameParser
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.emulators.boards import EitKitBoard, EmulatedBoard, Hx711Board, Sketch, format_line
+from shearloop.emulators.gripper import Gripper, UrcapSession
+from shearloop.emulators.ports import SocketServer
 from shearloop.tools.doctor.devices import check_daemon, check_devices, check_task
 from shearloop.tools.doctor.findings import Finding
 from tests.running import running
@@ -291,3 +293,17 @@ def test_a_task_that_refuses_lines_has_the_cure_of_the_lines():
     lost = {"alive": True, "connected": False, "last_loss": f"/dev/x has sent nothing of use for 4 s: {refusal}"}
     found = check_task("load_cell", lost)
     assert (found.state, found.next_step) == ("trouble", "load the sketch")
+
+
+async def test_a_gripper_that_is_not_activated_moves_before_its_next_motion_and_not_at_the_daemons_start(tmp_path):
+    """The start of the daemon activates nothing."""
+    server = SocketServer(UrcapSession(Gripper()))
+    await server.restore()
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump({"gripper": {"socket": {"host": "127.0.0.1", "port": server.port}}}))
+    try:
+        found = {one.subject: one for one in await check_devices(load_daemon_config(path), SECONDS)}
+    finally:
+        await server.disconnect()
+    assert "next motion" in found["gripper"].means
+    assert "first grip" in found["gripper"].next_step

@@ -21,6 +21,7 @@ from shearloop.emulators.gripper import Gripper, UrcapSession
 from shearloop.emulators.ports import SocketServer
 from shearloop.tools.doctor.devices import check_daemon, check_devices, check_task
 from shearloop.tools.doctor.findings import Finding
+from tests.fixtures.daemons import robot_at
 from tests.running import running
 
 PERIOD_S = 0.02
@@ -300,7 +301,10 @@ async def test_a_gripper_that_is_not_activated_moves_before_its_next_motion_and_
     server = SocketServer(UrcapSession(Gripper()))
     await server.restore()
     path = tmp_path / "rig.yaml"
-    path.write_text(yaml.safe_dump({"gripper": {"socket": {"host": "127.0.0.1", "port": server.port}}}))
+    cell = {"device": {"path": str(tmp_path / "absent")}}
+    gripper = {"socket": {"host": "127.0.0.1", "port": server.port}}
+    robot_at("127.0.0.9", tmp_path)
+    path.write_text(yaml.safe_dump({"load_cell": cell, "robot": "ur.yaml", "gripper": gripper}))
     try:
         found = {one.subject: one for one in await check_devices(load_daemon_config(path), SECONDS)}
     finally:

@@ -25,17 +25,18 @@ _ACT, _GTO = 1 << 0, 1 << 3
 def command_registers(request: messages.Request, last: messages.GripperMove, *, act: bool) -> list[int]:
     """Return the three registers from 0x03E8 for a request; one without a target keeps the last target.
 
-    `act` is the gripper's present ACT, which a halt keeps: a rising edge would begin an activation.
+    `act` is the gripper's present ACT, which a halt and a move keep: a rising edge would begin an activation.
     """
+    kept = _ACT if act else 0
     match request:
         case messages.GripperAction.RESET:
             action = 0
         case messages.GripperAction.ACTIVATE:
             action = _ACT
         case messages.GripperAction.HALT:
-            action = _ACT if act else 0
+            action = kept
         case messages.GripperMove():
-            action, last = _ACT | _GTO, request
+            action, last = kept | _GTO, request
     return [action << 8, last.position, last.speed << 8 | last.force]
 
 
@@ -70,7 +71,9 @@ class ModbusClient:
         self._deadline_s = reply_deadline_s
         self._client: AsyncModbusSerialClient | None = None
         self._last = messages.GripperMove(0, 0, 0)
-        self._act = False
+        # ACT as it was read last, and as it was written last. A gripper that has restarted has it at 0; a reset that it
+        # has not taken up yet leaves it at 1.
+        self._act_read = self._act_written = False
 
     @property
     def name(self) -> str:
@@ -94,7 +97,7 @@ class ModbusClient:
             await self.close()
             raise
         self._last = messages.GripperMove(readout.pre, self._last.speed, self._last.force)
-        self._act = readout.act
+        self._act_written = readout.act
 
     async def close(self) -> None:
         """Close the port; closing twice is allowed."""
@@ -105,13 +108,21 @@ class ModbusClient:
     async def read(self, *, whole: bool = True) -> messages.Readout:  # noqa: ARG002 - one answer holds them all
         """Return the status registers; DeviceLostError or ProtocolError."""
         response = await self._exchange(None)
-        return readout_of(response.registers)
+        readout = readout_of(response.registers)
+        self._act_read = readout.act
+        return readout
 
     async def write(self, request: messages.Request) -> None:
-        """Write the command registers; DeviceLostError or ProtocolError."""
-        command = command_registers(request, self._last, act=self._act)
+        """Write the command registers; DeviceLostError or ProtocolError.
+
+        Only `ACTIVATE` activates: a gripper that is not active takes a move as a fault, and stays where it is.
+        """
+        if request not in (messages.GripperAction.RESET, messages.GripperAction.ACTIVATE):
+            # It can restart without a loss of the connection.
+            await self.read()
+        command = command_registers(request, self._last, act=self._act_read and self._act_written)
         await self._exchange(command)
-        self._act = bool(command[0] >> 8 & _ACT)
+        self._act_written = bool(command[0] >> 8 & _ACT)
         if isinstance(request, messages.GripperMove):
             self._last = request
 

@@ -9,7 +9,8 @@ import pytest
 from shearloop.drivers.robotiq import messages
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.socket_client import SocketClient
-from tests.drivers.robotiq.gripper_rig import CALIBRATION, STEP_S, WAYS, a_rig
+from shearloop.emulators.gripper import GripperRegisters
+from tests.drivers.robotiq.gripper_rig import CALIBRATION, STEP_S, WAYS, Rig, a_rig
 
 
 @WAYS
@@ -111,6 +112,55 @@ async def test_halting_a_gripper_that_is_not_active_moves_nothing(way, requested
             assert (await rig.driver.read()).activation is messages.ActivationStatus.RESET
             rig.monotonic_ns()
         assert rig.model.width_mm == before_mm
+
+
+@WAYS
+async def test_a_halt_of_a_gripper_that_has_restarted_activates_nothing(way, tmp_path):
+    """Its controller was without power for a moment, and the link was not: its registers are 0, the fingers stay."""
+    async with a_rig(way, tmp_path, active=True) as rig:
+        await _grip(rig)
+        await rig.driver.halt()
+        await _stays(rig)
+
+
+@WAYS
+async def test_a_move_of_a_gripper_that_has_restarted_activates_nothing(way, tmp_path):
+    """The readout before is of before the restart: it shows an active gripper."""
+    async with a_rig(way, tmp_path, active=True) as rig:
+        await _grip(rig)
+        await rig.driver.client.write(messages.GripperMove(200, 255, 100))
+        await _stays(rig)
+
+
+@WAYS
+async def test_a_halt_right_after_a_reset_activates_nothing(way, tmp_path):
+    """The status shows the reset only after the next step."""
+    async with a_rig(way, tmp_path, active=True) as rig:
+        await _grip(rig, restarts=False)
+        rig.stopped = True
+        await rig.driver.client.write(messages.GripperAction.RESET)
+        await rig.driver.client.read(whole=True)
+        await rig.driver.client.write(messages.GripperAction.HALT)
+        rig.stopped = False
+        await _stays(rig)
+
+
+async def _grip(rig: Rig, *, restarts: bool = True) -> None:
+    """Hold an object; then the gripper's controller restarts, unseen by the driver."""
+    rig.model.object_mm = 30.0
+    await rig.driver.finish(await rig.driver.move(messages.GripperCommand(10.0)))
+    if restarts:
+        rig.model.write(GripperRegisters())
+        rig.model.step(STEP_S)
+
+
+async def _stays(rig: Rig) -> None:
+    """Look on while an activation would have opened the fingers."""
+    for _ in range(20):
+        state = await rig.driver.read()
+        assert state.activation is messages.ActivationStatus.RESET
+        assert rig.model.width_mm == pytest.approx(30.0, abs=0.1)
+        rig.monotonic_ns()
 
 
 @WAYS

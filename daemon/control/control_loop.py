@@ -192,13 +192,16 @@ class ControlLoop:
 
     def on_gripper(self, gripper: GripperStatus) -> None:
         """Take a state of the gripper, unless it is older than the latest one."""
-        known = self.inputs.gripper
-        if known is None or gripper.t_ns >= known.t_ns:
-            self.inputs.gripper = gripper
-            if self.running is None:
-                self._judge_grip(gripper)
-            if self._on_judged is None:
-                self._gripped.grip = self._gripped.grip.followed(gripper)
+        known, gripped = self.inputs.gripper, self._gripped
+        if known is not None and gripper.t_ns < known.t_ns:
+            return
+        self.inputs.gripper = gripper
+        if gripped.tightens:
+            gripped.grip = gripped.grip.pressed(gripper)
+        if self.running is None:
+            self._judge_grip(gripper)
+        if self._on_judged is None:
+            gripped.grip = gripped.grip.followed(gripper)
 
     def _judge_grip(self, gripper: GripperStatus) -> None:
         """Forget a grip that the gripper does not have at present: the next one has an angle of its own."""
@@ -257,12 +260,20 @@ class ControlLoop:
         self._forget_tool()
         gripped.unmeasured_since_ns = arm.t_ns if arm is not None else None
         if isinstance(action, GripStep):
-            gripper = self.inputs.gripper
-            if not gripped.tightens:
-                origin_rad = arm.wrist_rad if arm is not None else None
-                gripped.grip = replace(gripped.grip, origin_rad=origin_rad, force_n=action.force_n)
-            # An unexpected object is watched as well.
-            gripped.expected = action.expect_object or (gripper is not None and gripper.holding)
+            self._on_grip_ended(action)
+
+    def _on_grip_ended(self, action: GripStep) -> None:
+        """Take what the fingers have done; fingers that closed tighter keep the grip and its angle."""
+        gripper, arm, gripped = self.inputs.gripper, self.inputs.arm, self._gripped
+        holding = gripper is not None and gripper.holding
+        if isinstance(action, Opening) and not holding:
+            gripped.grip = NO_GRIP
+        elif not gripped.tightens:
+            origin_rad = arm.wrist_rad if arm is not None else None
+            gripped.grip = replace(gripped.grip, origin_rad=origin_rad, force_n=action.force_n)
+        gripped.tightens = False
+        # An unexpected object is watched as well.
+        gripped.expected = action.expect_object or holding
 
     def on_grip_refused(self) -> None:
         """Take that the present `grip` step was refused before the fingers moved: what they hold is as it was."""
@@ -271,6 +282,7 @@ class ControlLoop:
             gripped.grip = before.grip
             gripped.is_earlier = before.is_earlier
             gripped.another = before.another
+            gripped.tightens = False
 
     def on_release_ended(self, error: str | None = None) -> None:
         """Take the end of the release after a stop, and why the gripper did not open, if it did not."""
@@ -377,10 +389,12 @@ class ControlLoop:
 
     def held_note(self, file: ExperimentFile) -> str:
         """Return what the gripper holds as the first step moves, for the operator's question; or an empty string."""
-        held = self.held
-        if held is None or first_motion_before_grip(file) is None:
+        held, unknown, first = self.held, self._unknown_grip, first_gripper_step(file)
+        # A `grip` closes tighter on what is held, and its angle stays as unknown as it is.
+        turns = first_motion_before_grip(file) is not None
+        turns = turns or bool(unknown and first is not None and isinstance(first[1], GripStep))
+        if held is None or not turns:
             return ""
-        unknown = self._unknown_grip
         angle = f" The grip is not known ({unknown}): its angle counts from the start." if unknown else ""
         return f" At present {held}.{angle}"
 
@@ -491,13 +505,11 @@ class ControlLoop:
             return " ".join(refusals)
         if (reason := self._why_not_with_tool(file)) is not None:
             return reason
+        if self._on_judged is not None:
+            return "the fingers move, and an earlier daemon had gripped a tool: wait until they stand still"
         speeds = Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
         self.experiment, self._watched = Experiment(file, t_ns, speeds), watched
         self.wrist = self._wrists[file.torque_source]
-        if self._on_judged is not None:
-            # No state of the gripper has shown it, and the experiment may grip again.
-            self._on_judged("an experiment began before its state was known")
-            self._on_judged = None
         # What the last experiment knew of the tool may be wrong by now.
         self.wrist.reset()
         self._gripped = self._gripped_at_start(t_ns)
@@ -549,15 +561,14 @@ class ControlLoop:
     def _gripped_at_start(self, t_ns: int) -> _GrippedTool:
         """Return what is known of the tool as an experiment begins."""
         before, gripper = self._gripped, self.inputs.gripper
-        # The angle since the grip belongs to the grip: a tool that is still held keeps it.
-        still_held = gripper is not None and gripper.holding
         return _GrippedTool(
-            grip=before.grip if still_held else NO_GRIP,
+            # The angle belongs to the grip. The gripper's latest state has shown whether it is another one.
+            grip=before.grip,
             is_earlier=before.is_earlier,
             another=before.another,
             unmeasured_since_ns=t_ns,
             # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
-            expected="gripper" not in self._watched.required or still_held,
+            expected="gripper" not in self._watched.required or (gripper is not None and gripper.holding),
             release_error=before.release_error,
         )
 
@@ -673,14 +684,7 @@ class ControlLoop:
             self._fail(experiment, reason)
             return self._ended(self.safety.report(decision.faults))
         if isinstance(action, GripStep):
-            # A process that dies while the fingers close leaves this force behind.
-            force_n = max(gripped.grip.force_n or 0.0, action.force_n)
-            gripped.before_closing = _KnownGrip(gripped.grip, gripped.is_earlier, gripped.another)
-            gripped.grip = Grip(origin_rad, force_n)
-            gripped.is_earlier = False
-            gripped.another = ""
-            gripper = self.inputs.gripper
-            gripped.tightens = gripper is not None and gripper.holding and not isinstance(action, Opening)
+            self._begin_grip(action, origin_rad)
         if isinstance(action, IdentifyStep):
             wrist.begin_identification(action, limit_nm)
             action = None
@@ -697,6 +701,28 @@ class ControlLoop:
         phase = "held" if held else experiment.phase.value
         self.status = LoopStatus(phase, awaited or experiment.command.activity, velocity, decision)
         return ControlOutput(velocity.speed_rad_per_s, interrupts_motion=still, action=action)
+
+    def _begin_grip(self, action: GripStep, origin_rad: float) -> None:
+        """Note what is known of the tool as the fingers begin to move."""
+        gripped = self._gripped
+        # A process that dies while the fingers close leaves this force behind.
+        force_n = max(gripped.grip.force_n or 0.0, action.force_n)
+        gripped.before_closing = _KnownGrip(gripped.grip, gripped.is_earlier, gripped.another)
+        gripped.tightens = not isinstance(action, Opening) and self._has_grip()
+        # While fingers open, their last width on the tool tells whether they have let it go.
+        width_mm = gripped.grip.width_mm if gripped.tightens or isinstance(action, Opening) else None
+        gripped.grip = Grip(origin_rad, force_n, width_mm)
+        gripped.is_earlier = False
+        gripped.another = ""
+
+    def _has_grip(self) -> bool:
+        """Return whether the fingers hold something, or may still hold it in the grip that is known."""
+        gripper = self.inputs.gripper
+        # An activation opens the fingers before they close.
+        if gripper is None or self._activates():
+            return False
+        was_held = self._gripped.grip.width_mm is not None
+        return gripper.holding or (was_held and (gripper.uncertain or gripper.moving))
 
     def _awaited_torques(self, experiment: Experiment, t_ns: int) -> str | None:
         """Return which torques a step that turns the tool waits for after a grip or a tare, or None.

@@ -43,6 +43,12 @@ class Grip:
             return f"somebody asked it for the position {asked} since then; that grip had {before}"
         return ""
 
+    def pressed(self, gripper: GripperStatus) -> "Grip":
+        """Return this grip with the width of fingers that close tighter: they press a soft tool together."""
+        if self.width_mm is None or not (gripper.moving or gripper.uncertain or gripper.holding):
+            return self
+        return replace(self, width_mm=min(self.width_mm, gripper.width_mm))
+
     def followed(self, gripper: GripperStatus) -> "Grip":
         """Return this grip with what the gripper's present state shows of it."""
         grip = self

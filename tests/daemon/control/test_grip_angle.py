@@ -1,0 +1,110 @@
+"""The angle since the grip belongs to the grip, whatever stops, starts and restarts come between."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from shearloop.daemon.control.experiment import ExperimentPhase
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.grip import Grip
+from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, phase, started, stop
+
+TWIST_AGAIN = {"do": "twist", "angles_rad": [0.25], "return_to_start": False, "speed_rad_per_s": 0.2, "hold_s": 0.1}
+TWISTED = {"limits": {"angle_rad": 0.3, "torque_nm": 0.5}, "torque_source": "load_cell"}
+
+
+def twisted() -> Rig:
+    """Return a rig that holds a tool of 30 mm, twisted by 0.25 of 0.3 rad."""
+    rig = started(Rig(new_loop()), GRIP, TWIST_AGAIN, **TWISTED)
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    return rig
+
+
+def stopped_fingers(rig: Rig, step: dict[str, Any], width_mm: float, sense: dict[str, Any]) -> Rig:
+    """Stop an experiment while its fingers are on their way, and acknowledge the stop."""
+    started(rig, step)
+    while not rig.pending:
+        rig.step()
+    rig.pending.clear()
+    rig.force_n, rig.width_mm, rig.hand = 0.0, width_mm, replace(rig.hand, moving=True)
+    rig.step()
+    stop(rig)
+    rig.hand = replace(rig.hand, **{"moving": False, **sense})
+    rig.run(0.1)
+    rig.control_loop.acknowledge()
+    return rig
+
+
+@pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
+@pytest.mark.parametrize("width_mm", [30.0, 27.0])
+def test_a_tighter_grip_that_was_stopped_keeps_the_angle_of_the_grip(width_mm, sense):
+    """The halt leaves the gripper in doubt. Fingers that close tighter press a soft tool together."""
+    rig = twisted()
+    gripped_rad = rig.control_loop.grip.origin_rad
+    stopped_fingers(rig, {**GRIP, "force_n": 100.0}, width_mm, sense)
+    assert rig.control_loop.grip.origin_rad == gripped_rad
+    started(rig, {**GRIP, "force_n": 100.0}, TWIST_AGAIN, **TWISTED)
+    while not rig.pending:
+        rig.step()
+    rig.hand = replace(rig.hand, moving=True, uncertain=False)
+    while rig.pending:
+        rig.step()
+    rig.hand = replace(rig.hand, moving=False)
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    assert rig.wrist_rad - gripped_rad == pytest.approx(0.25, abs=0.01)
+    assert rig.control_loop.grip == Grip(gripped_rad, 100.0, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("step", "width_mm", "sense"),
+    [
+        ({"do": "release"}, 80.0, {"uncertain": True}),
+        ({"do": "release"}, 140.0, {}),
+        ({**GRIP, "force_n": 100.0}, 10.0, {}),
+    ],
+)
+def test_fingers_that_let_the_tool_go_begin_a_grip_with_an_angle_of_its_own(step, width_mm, sense):
+    rig = stopped_fingers(twisted(), step, width_mm, sense)
+    assert not rig.control_loop.grip.known
+    again_rad = rig.wrist_rad
+    started(rig, GRIP, TWIST_AGAIN, **TWISTED)
+    rig.hand = replace(rig.hand, uncertain=False)
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    assert rig.wrist_rad - again_rad == pytest.approx(0.25, abs=0.01)
+
+
+def test_a_grip_that_was_stopped_before_it_held_anything_is_begun_anew():
+    rig = stopped_fingers(Rig(new_loop()), GRIP, 80.0, {"uncertain": True})
+    rig.wrist_rad += 0.2
+    rig.run(0.1)
+    again_rad = rig.wrist_rad
+    started(rig, GRIP, TWIST_AGAIN, **TWISTED)
+    rig.hand = replace(rig.hand, uncertain=False)
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    assert rig.wrist_rad - again_rad == pytest.approx(0.25, abs=0.01)
+
+
+def test_a_tool_that_is_gripped_again_within_a_run_after_a_release_has_a_new_angle():
+    rig = started(Rig(new_loop()), GRIP, TWIST_AGAIN, {"do": "release"}, GRIP, TWIST_AGAIN, **TWISTED)
+    begun_rad = rig.wrist_rad
+    rig.run(30)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    assert rig.wrist_rad - begun_rad == pytest.approx(0.5, abs=0.02)
+
+
+def test_the_question_before_a_tighter_grip_says_that_the_angle_is_not_known():
+    tighter, after_release = (
+        ExperimentFile.model_validate({"name": "test", "steps": steps})
+        for steps in ([GRIP, TWIST_AGAIN], [{"do": "release"}, GRIP, TWIST_AGAIN])
+    )
+    rig = Rig(new_loop())
+    rig.force_n = 60.0
+    rig.run(0.6)
+    assert "its angle counts from the start" in rig.control_loop.held_note(tighter)
+    assert rig.control_loop.held_note(after_release) == ""
+    assert twisted().control_loop.held_note(tighter) == "", "its angle goes on"

@@ -270,12 +270,7 @@ def build_rig(
     if config.gripper is not None:
         gripper = make_gripper(config.gripper, loop, publisher, clock, patience_of(config), supplied)
     sensors = build_sensors(config, publisher, clock, recorder, sessions, loop, gripper)
-    robot = UrRobot(
-        settings,
-        LinkMonitor(LinkReporter("robot", loop)),
-        warns=not config.emulated,
-        settings_for=commissioning.on_controller,
-    )
+    robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), settings_for=commissioning.on_controller)
     robot.holds = loop.may_hold
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning)

@@ -186,8 +186,7 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
             parts.texts["gripper"] = f"{hand.model}, {own}"
     with parts.of("robot"):
         if (settings := open_settings(config)) is not None:
-            text = f"{settings.host}, limits of {config.robot}"
-            parts.texts["robot"] = f"{text}. {settings.warning}" if settings.warning else text
+            parts.texts["robot"] = f"{settings.host}, limits of {config.robot}"
             with parts.of("commissioned"):
                 commissioning = commissioning_of(config, settings)
                 if sentence := commissioning.sentence:

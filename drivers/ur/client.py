@@ -64,19 +64,16 @@ class UrRobot:
         settings: UrSettings,
         monitor: LinkMonitor | None = None,
         *,
-        warns: bool = True,
         settings_for: SettingsFor | None = None,
         worker: str = WORKER,
     ) -> None:
-        """`warns`: say at each connection that the deadlines are longer than promised.
+        """`settings_for` returns the settings for a controller of this version and serial number, else these.
 
-        `settings_for` returns the settings for a controller of this version and serial number, else these. `worker` is
-        the module of the worker.
+        `worker` is the module of the worker.
         """
         self._worker = worker
         self.settings = settings
         self._settings_for = settings_for
-        self._promise = settings.warning if warns else ""
         self.state: messages.RobotState | None = None
         self.monitor = monitor or LinkMonitor()
         self.losses: Counter[str] = Counter()
@@ -205,7 +202,7 @@ class UrRobot:
                     self._tell_held(self._connection)
                 if before is None:
                     connected = f"The robot at {self.settings.host} is connected."
-                    said = (connected, self._warning, self._promise, message.blocked)
+                    said = (connected, self._warning, message.blocked)
                     self.monitor.connected(" ".join(filter(None, said)), time.monotonic_ns())
                 waiting, self._waiting = self._waiting, []
                 for one in waiting:

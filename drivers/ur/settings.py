@@ -17,8 +17,22 @@ from shearloop.drivers.hosts import is_loopback_host, why_no_host
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
 
+# The change of a speed over 0.04 s judges an acceleration: it needs two states.
+_SLOWEST_HZ = 50.0
+# Two cycles of a CB3, and some rounding: a shorter deadline ends between two commands.
+_SHORTEST_DEADLINE_S = 0.02
 # The arm can move this long without its daemon.
-_Deadline = Annotated[float, Field(gt=0, le=1)]
+_Deadline = Annotated[float, Field(ge=_SHORTEST_DEADLINE_S, le=1)]
+# The connection asks several ports in turn, each for an eighth of the time at least.
+_SHORTEST_CONNECT_S = 1.0
+# A busy computer pauses a process that long; the arm stands by then.
+_SHORTEST_HANG_S = 0.3
+# A protective stop can be cleared after 5 s; power and brakes take some more.
+_SHORTEST_RECOVERY_S = 10.0
+# A controller takes a command in its next cycle, which takes 8 ms on a CB3, 2 ms on an e-Series.
+_SHORTEST_REACTION_S = 0.002
+# The noise of an arm that stands, whose speeds reach 0.003 rad/s: below it, an arm is never at rest.
+_LEAST_REST_RAD_PER_S = 0.002
 # The oldest state that a robot elsewhere may be moved on.
 _LONGEST_STATE_S = 1.0
 # The wrist stands this long after the last decision (docs/safety.md).
@@ -45,6 +59,8 @@ class GenerationFacts:
     name: str
     # PolyScope's major version.
     major: int
+    # The states per second that it can be asked for.
+    most_hz: float
     # The time of a cycle, in URScript.
     step: str
     # Whether the controller can zero its wrench: `zero_ftsensor` ends a CB3's program.
@@ -63,9 +79,11 @@ class GenerationFacts:
 
 GENERATIONS: Final[dict[Generation, GenerationFacts]] = {
     "e-series": GenerationFacts(
-        "an e-Series", 5, "get_steptime()", zeroes_wrench=True, zeroes_at_start=True, noise_n=3.5, noise_nm=0.2
+        "an e-Series", 5, 500.0, "get_steptime()", zeroes_wrench=True, zeroes_at_start=True, noise_n=3.5, noise_nm=0.2
     ),
-    "cb3": GenerationFacts("a CB3", 3, "0.008", zeroes_wrench=False, zeroes_at_start=False, noise_n=10.0, noise_nm=5.0),
+    "cb3": GenerationFacts(
+        "a CB3", 3, 125.0, "0.008", zeroes_wrench=False, zeroes_at_start=False, noise_n=10.0, noise_nm=5.0
+    ),
 }
 
 
@@ -241,24 +259,24 @@ class UrSettings(_Checked):
     """The controller's generation."""
     tool: InstalledTool = InstalledTool()
     """What the pendant must have for motion."""
-    rate_hz: Annotated[float, Field(gt=0, le=500)] = 125.0
-    """Robot states per second."""
+    rate_hz: Annotated[float, Field(ge=_SLOWEST_HZ, le=500)] = 125.0
+    """Robot states per second; up to 125 from a CB3."""
     command_timeout_s: _Deadline = 0.1
     """A wrist speed holds for this long after its decision, and after the robot's last state; then the wrist stops."""
     silence_timeout_s: _Deadline = 0.1
     """Other motion stops when the daemon sends nothing for this long."""
-    state_timeout_s: Annotated[float, Field(gt=0, le=10)] = 0.25
+    state_timeout_s: Annotated[float, Field(ge=_SHORTEST_DEADLINE_S, le=10)] = 0.25
     """An older state blocks motion; at three times this age the connection counts as lost. Above 1 s for an emulated
     robot on this computer alone."""
-    connect_timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0
+    connect_timeout_s: Annotated[float, Field(ge=_SHORTEST_CONNECT_S, le=60)] = 10.0
     """Time for connecting."""
-    hang_timeout_s: Annotated[float, Field(gt=0, le=10)] = 1.5
+    hang_timeout_s: Annotated[float, Field(ge=_SHORTEST_HANG_S, le=10)] = 1.5
     """A longer cycle is a hang, and the worker is ended: calls of ur-rtde block for up to 301 s."""
-    recover_timeout_s: Annotated[float, Field(gt=0, le=300)] = 30.0
+    recover_timeout_s: Annotated[float, Field(ge=_SHORTEST_RECOVERY_S, le=300)] = 30.0
     """Time for one attempt to make the robot ready."""
-    reaction_s: Annotated[float, Field(gt=0, le=0.5)] = 0.04
+    reaction_s: Annotated[float, Field(ge=_SHORTEST_REACTION_S, le=0.5)] = 0.04
     """Delay until a commanded speed takes effect; distances to the joint limits include it."""
-    rest_rad_per_s: Annotated[float, Field(gt=0, le=0.05)] = REST_RAD_PER_S
+    rest_rad_per_s: Annotated[float, Field(ge=_LEAST_REST_RAD_PER_S, le=0.05)] = REST_RAD_PER_S
     """A joint slower than this is at rest."""
 
     def __post_init__(self) -> None:
@@ -271,6 +289,10 @@ class UrSettings(_Checked):
                 f"this computer: give {_LONGEST_STATE_S:g} or less"
             )
         facts = self.facts
+        if self.rate_hz > facts.most_hz:
+            raise ValueError(
+                f"rate_hz: {facts.name} sends {facts.most_hz:g} states a second at most, not {self.rate_hz:g}"
+            )
         for key, inner, noise, unit in (
             ("force_n", self.limits.force_n.inner, facts.noise_n, "N"),
             ("torque_nm", self.limits.torque_nm.inner, facts.noise_nm, "N·m"),
@@ -311,13 +333,14 @@ class UrSettings(_Checked):
         return 1.0 / (_WATCHDOG_FACTOR * self.standstill_s)
 
     @property
-    def warning(self) -> str:
-        """A sentence where a robot elsewhere takes longer than docs/safety.md promises, else empty."""
+    def why_too_slow(self) -> str:
+        """Why a robot elsewhere takes longer to stand than docs/safety.md promises, as a sentence, else empty."""
         if self.standstill_s <= _PROMISED_S or is_loopback_host(self.host):
             return ""
         return (
-            f"With these deadlines and accelerations the wrist may turn for {self.standstill_s:.2g} s after the last "
-            f"decision, longer than {_PROMISED_S:g} s: lower command_timeout_s and silence_timeout_s."
+            f"the wrist may turn for {self.standstill_s:.2g} s after the last decision, longer than {_PROMISED_S:g} s: "
+            "lower command_timeout_s, silence_timeout_s or the inner limit of wrist_speed_rad_per_s, or raise rate_hz "
+            "or the hard limit of wrist_acceleration_rad_per_s2"
         )
 
 
@@ -331,8 +354,12 @@ def read_settings(path: Path) -> UrSettings:
     """Return the robot's settings from a YAML file.
 
     Raises:
-        DriverError: the file cannot be read, or settings are wrong; the message names every mistake.
+        DriverError: the file cannot be read, or settings are wrong; the message names every mistake. So it does for a
+            robot elsewhere that takes longer to stand than docs/safety.md promises.
     """
     from shearloop.yaml_files import load_model
 
-    return load_model(path, UrSettings, DriverError, "robot's settings")
+    settings = load_model(path, UrSettings, DriverError, "robot's settings")
+    if settings.why_too_slow:
+        raise DriverError(f"{path}: {settings.why_too_slow}")
+    return settings

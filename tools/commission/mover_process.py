@@ -237,7 +237,7 @@ async def main(worker_module: str) -> None:
     ((_, settings),) = MessageDecoder().feed(await lines.readline())
     if not isinstance(settings, UrSettings):
         raise SystemExit(2)
-    robot, process = UrRobot(settings, LinkMonitor(), warns=False, worker=worker_module), ThisProcess(worker_module)
+    robot, process = UrRobot(settings, LinkMonitor(), worker=worker_module), ThisProcess(worker_module)
     driver = Driver(settings, robot, process)
     running = [asyncio.create_task(robot.run()), asyncio.create_task(process.watch(robot))]
     handled: list[asyncio.Task[None]] = []

@@ -94,7 +94,7 @@ class Daemon:
             else:
                 sessions = open_sessions(config)
                 self.sensors = build_sensors(config, self.publisher, clock, self.recorder, sessions, torques)
-            tare_refusal = torques.tare_refusal if self.rig is None else self.rig.control_loop.tare_refusal
+            tare_refusal = torques.tare_refusal if self.rig is None else self.rig.tare_refusal
             self.health.refusals["tare"] = tare_refusal
             report = partial(self._report, clock)
             self.commands = Commands(
@@ -132,7 +132,7 @@ class Daemon:
         )
         if self.rig.commissioning is not None:
             self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
-        self.health.refusals |= {"start": self.rig.runner.start_refusal, "release": self.rig.runner.release_refusal}
+        self.health.refusals |= {"start": self.rig.start_refusal, "release": self.rig.runner.release_refusal}
         if config.experiment is not None:
             daemon_end = self.ending if config.stop_when_done else None
             self._experiment = ConfiguredExperiment(

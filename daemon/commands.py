@@ -97,7 +97,7 @@ class Commands:
         """Return the experiments that `start` may name, and the one that it runs if it names none."""
         rig = required_rig(self.rig)
         try:
-            found = await rig.experiments.list()
+            found = await rig.experiments.list(rig.reading_refusal)
         except UserError as error:
             raise CommandRefusedError(str(error)) from error
         own = str(self.experiment.path) if self.experiment is not None else ""
@@ -119,7 +119,6 @@ class Commands:
         rig = required_rig(self.rig)
         try:
             if request.get("ask"):
-                _refuse_if(rig.runner.start_refusal())
                 question = await rig.start_question(Path(path))
                 return dict(question.facts)
             _refuse_if(await rig.start(Path(path), request.get("digest")))

@@ -2,21 +2,25 @@
 
 Every user of this machine may send `start` with the name of a file, and the daemon may be allowed to read more than
 they are. So a request names only files in the configured folders, and the reply names no content.
+
+A thread that parses a file takes the interpreter from the event loop, some ms at a time. So the files are small, and
+none is read for a request while something moves or is about to: `Rig.reading_refusal` says so.
 """
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import structlog
 
-from shearloop.daemon.commissioning import Commissioning
+from shearloop.daemon.commissioning import Commissioning, MotionCap
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_check import check_steps, experiment_mistakes
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
@@ -27,13 +31,17 @@ from shearloop.errors import UserError
 from shearloop.files import read_file
 from shearloop.mistakes import shown
 from shearloop.words import counted
-from shearloop.yaml_files import MOST_BYTES, Document
+from shearloop.yaml_files import Document
 
 # A file on a network drive may never answer.
 READ_WITHIN_S = 5.0
+# Those of the first folder have less than 2 kB.
+MOST_BYTES = 1 << 15
 # Of a path, and of a mistake, in a message.
 _LONGEST_NAME = 300
 _LONGEST_MISTAKE = 500
+# Requests that may wait for the turn of their file: others of the command socket have room beside them.
+_MOST_WAITING = 4
 # Files of a folder that are looked at for the list.
 MOST_LISTED = 500
 Found = TypeVar("Found")
@@ -61,7 +69,7 @@ def check_experiment(
 
 def read_document(path: Path) -> Document:
     """Return the content of an experiment's file; raises UserError."""
-    return Document.read(path, UserError, ExperimentFile.what)
+    return Document.read(path, UserError, ExperimentFile.what, most_bytes=MOST_BYTES)
 
 
 def without_mistakes(document: Document, mistakes: Sequence[Mistake]) -> ExperimentFile:
@@ -86,9 +94,26 @@ class ReadExperiment:
     data: bytes
 
 
+class _Stamp(NamedTuple):
+    """What the name in the list depends on: the file's content, by its times, size and number, and the robot's cap."""
+
+    changed_ns: int
+    renamed_ns: int
+    size: int
+    number: int
+    cap: MotionCap | None
+
+
+class _Listed(NamedTuple):
+    """A file of the folders, and the name of its experiment; None where `start` does not accept it."""
+
+    stamp: _Stamp
+    name: str | None
+
+
 @dataclass(slots=True)
 class ExperimentFiles:
-    """The experiments that a request may name: regular files of at most 128 kB in `folders`, or below them.
+    """The experiments that a request may name: regular files of at most 32 kB in `folders`, or below them.
 
     Each can run on the rig of `config`, where it is given: with its torque `sources`, but the robot's, and its `robot`.
     """
@@ -97,7 +122,14 @@ class ExperimentFiles:
     config: DaemonConfig | None = None
     sources: Mapping[str, TorqueSource] = field(default_factory=dict)
     robot: Commissioning | None = None
-    _reading: threading.Thread | None = field(default=None, init=False)
+    # Held by the one thread that reads, also after its request has given up.
+    _turn: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
+    _waiting: int = field(default=0, init=False)
+    _abandoned: bool = field(default=False, init=False)
+    # Each file is parsed again only once it has changed.
+    _listed: dict[Path, _Listed] = field(default_factory=dict, init=False)
+    # The latest complete list.
+    _latest: Mapping[str, str] | None = field(default=None, init=False)
 
     @property
     def gripper(self) -> GripperModel | None:
@@ -106,44 +138,97 @@ class ExperimentFiles:
 
     async def read(self, path: Path) -> ReadExperiment:
         """Return the experiment of a file; raises UserError without the file's content, at the latest after 5 s."""
-        return await self._in_thread(lambda: self._read(path), str(path))
+        async with _in_time(str(path)):
+            return await self._in_thread(lambda: self._read(path))
 
-    async def list(self) -> dict[str, str]:
-        """Return the names of the experiments of `folders` that `read` accepts, by path; raises UserError."""
-        return await self._in_thread(self._list, "the folders of experiments")
+    async def list(self, reading_refusal: Callable[[], str | None] = lambda: None) -> Mapping[str, str]:
+        """Return the names of the experiments of `folders` that `read` accepts, by path; raises UserError.
 
-    async def _in_thread(self, work: Callable[[], Found], what: str) -> Found:
-        """Return what a thread finds, one at a time: no file keeps the event loop, or others' threads, from working."""
-        if self._reading is not None and self._reading.is_alive():
-            raise UserError("the file of another start is being read; wait for its end")
+        While `reading_refusal` has a reason, no file is read and the latest list is returned.
+        """
+        async with _in_time("the folders of experiments"):
+            reason = await self._refresh(reading_refusal)
+        if self._latest is None:
+            raise UserError(f"{reason}, and no folder of experiments is read meanwhile; ask again afterwards")
+        return self._latest
+
+    async def _refresh(self, reading_refusal: Callable[[], str | None]) -> str | None:
+        """Read the files that have changed and renew the list; return None, or why no file is read now."""
+        if (reason := reading_refusal()) is not None:
+            return reason
+        stamps = await self._in_thread(self._stamps)
+        # Of files that are gone, nothing is kept.
+        self._listed = {path: one for path, one in self._listed.items() if path in stamps}
+        for path, stamp in stamps.items():
+            known = self._listed.get(path)
+            if known is not None and known.stamp == stamp:
+                continue
+            # Before each file: a start that has come meanwhile has the next turn, and then something moves.
+            if (reason := reading_refusal()) is not None:
+                return reason
+            name = await self._in_thread(partial(self._name_of, path))
+            self._listed[path] = _Listed(stamp, name)
+        listed = ((str(path), self._listed[path].name) for path in stamps if path in self._listed)
+        self._latest = {path: name for path, name in listed if name is not None}
+        return None
+
+    async def _in_thread(self, work: Callable[[], Found]) -> Found:
+        """Return what a thread finds, one at a time: no drive keeps the event loop, or others' threads, from working.
+
+        Raises UserError where others wait already, or wait in vain.
+        """
+        if self._abandoned or self._waiting >= _MOST_WAITING:
+            raise UserError("the file of another request is being read; wait for its end")
+        self._waiting += 1
+        try:
+            await self._turn.acquire()
+        finally:
+            self._waiting -= 1
         loop = asyncio.get_running_loop()
         result: asyncio.Future[Found] = loop.create_future()
         # A daemon thread: a drive that does not answer must not keep the process alive.
-        reading = self._reading = threading.Thread(
-            target=_run, args=(work, loop, result), name="experiment", daemon=True
+        reading = threading.Thread(
+            target=_run, args=(work, loop, result, self._on_read), name="experiment", daemon=True
         )
-        reading.start()
         try:
-            await asyncio.wait({result}, timeout=READ_WITHIN_S)
-            if not result.done():
-                cure = "try again on a less busy computer; from a network drive, copy it to a local one"
-                raise UserError(f"{what}: the experiment was not read within {READ_WITHIN_S:g} s; {cure}")
+            reading.start()
+        except RuntimeError:
+            self._on_read()
+            raise
+        try:
+            await asyncio.wait({result})
         finally:
-            # A later result has no receiver.
+            # Its request gives up. A later result has no receiver.
+            self._abandoned = not result.done()
             result.cancel()
         # Its work is done.
         reading.join()
         return result.result()
 
-    def _list(self) -> dict[str, str]:
-        found: dict[str, str] = {}
+    def _on_read(self) -> None:
+        """Give the turn to the next request: the thread has ended, whether or not its own request still waits."""
+        self._abandoned = False
+        self._turn.release()
+
+    def _stamps(self) -> dict[Path, _Stamp]:
+        """Return the files of the folders, with their stamps."""
+        cap = self.robot.cap if self.robot is not None else None
+        found: dict[Path, _Stamp] = {}
         for path in self._paths():
-            # Configurations share the folder with experiments. The list has only the files that `start` accepts.
-            with suppress(UserError, OSError):
-                document = Document.parse(path, read_file(path, MOST_BYTES), UserError, ExperimentFile.what)
-                if isinstance(document.content, dict) and "steps" in document.content:
-                    found[str(path)] = without_mistakes(document, self._mistakes(document)).name
+            with suppress(OSError):
+                status = path.stat()
+                times_ns = status.st_mtime_ns, status.st_ctime_ns
+                found[path] = _Stamp(*times_ns, status.st_size, status.st_ino, cap)
         return found
+
+    def _name_of(self, path: Path) -> str | None:
+        """Return the name of the experiment in a file; None where `start` does not accept it."""
+        # Configurations share the folder with experiments.
+        with suppress(UserError, OSError):
+            document = Document.parse(path, read_file(path, MOST_BYTES), UserError, ExperimentFile.what)
+            if isinstance(document.content, dict) and "steps" in document.content:
+                return without_mistakes(document, self._mistakes(document)).name
+        return None
 
     def _paths(self) -> Iterator[Path]:
         """Yield the YAML files of the folders."""
@@ -201,20 +286,34 @@ class ExperimentFiles:
         return ReadExperiment(path, file, data)
 
 
-def _run(read: Callable[[], Found], loop: asyncio.AbstractEventLoop, result: "asyncio.Future[Found]") -> None:
-    """Read in a thread, and give the result or the error to the event loop, if it still waits."""
+@asynccontextmanager
+async def _in_time(what: str) -> AsyncIterator[None]:
+    """Raise UserError in time for who waits for a thread."""
     try:
-        found, error = read(), None
-    except Exception as raised:  # noqa: BLE001 - it is raised in the event loop
-        found, error = None, raised
+        async with asyncio.timeout(READ_WITHIN_S):
+            yield
+    except TimeoutError as error:
+        cure = "try again on a less busy computer; from a network drive, copy it to a local one"
+        raise UserError(f"{what}: the experiment was not read within {READ_WITHIN_S:g} s; {cure}") from error
+
+
+def _run(
+    read: Callable[[], Found],
+    loop: asyncio.AbstractEventLoop,
+    result: "asyncio.Future[Found]",
+    on_ended: Callable[[], None],
+) -> None:
+    """Read in a thread, and give the result or the error to the event loop, if it still waits."""
+    deliver: Callable[[], None]
+    try:
+        deliver = partial(result.set_result, read())
+    except Exception as error:  # noqa: BLE001 - it is raised in the event loop
+        deliver = partial(result.set_exception, error)
 
     def hand_over() -> None:
-        if result.done():
-            return
-        if error is not None:
-            result.set_exception(error)
-        elif found is not None:
-            result.set_result(found)
+        on_ended()
+        if not result.done():
+            deliver()
 
     # The loop may have ended meanwhile.
     with suppress(RuntimeError):

@@ -182,8 +182,31 @@ class Rig:
     # None where the emulated devices end with the daemon.
     memory: RigMemory | None = None
     commissioning: Commissioning | None = None
+    # The file of the experiment that is about to begin.
+    starting: str = field(default="", init=False)
     # Of this process: in a container, each has the same number.
     token: str = field(default_factory=lambda: secrets.token_hex(8))
+
+    def start_refusal(self) -> str | None:
+        """Return why no experiment at all can begin, or None."""
+        return self._start_under_way() or self.runner.start_refusal()
+
+    def tare_refusal(self, *, confirmed: bool = False) -> str | None:
+        """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded.
+
+        The first step of an experiment that is about to begin may grip a tool, whose torque would become the zero.
+        """
+        return self._start_under_way() or self.control_loop.tare_refusal(confirmed=confirmed)
+
+    def reading_refusal(self) -> str | None:
+        """Return why no file of the folders is read for the list now, or None.
+
+        It would hold up the loop, which stops a motion that it cannot watch in time.
+        """
+        return self._start_under_way() or self.runner.motion()
+
+    def _start_under_way(self) -> str | None:
+        return f"{self.starting} is being started; wait until it has begun, or stop it" if self.starting else None
 
     async def start(self, path: Path, digest: str | None = None) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file.
@@ -192,8 +215,15 @@ class Rig:
         another one would be asked now.
         """
         # While something moves, no file is read.
-        if (reason := self.runner.start_refusal()) is not None:
+        if (reason := self.start_refusal()) is not None:
             return reason
+        self.starting = path.name
+        try:
+            return await self._start(path, digest)
+        finally:
+            self.starting = ""
+
+    async def _start(self, path: Path, digest: str | None) -> str | None:
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
         if digest is not None and digest != (question := self._question_of(experiment)).digest:
@@ -216,6 +246,8 @@ class Rig:
 
     async def start_question(self, path: Path) -> Question:
         """Return the question before a start, with the first motion, and the plan; raises UserError as `start` does."""
+        if (reason := self.start_refusal()) is not None:
+            raise UserError(reason)
         experiment = await self.experiments.read(path)
         if (reason := self.control_loop.file_refusal(experiment.file)) is not None:
             raise UserError(reason)

@@ -65,6 +65,11 @@ class ActionExecutor:
         """Whether robot and gripper are being unlocked, or the gripper is opened for the operator."""
         return self._unlocking is not None and not self._unlocking.done()
 
+    @property
+    def finishing(self) -> bool:
+        """Whether the last release or halt of a stop is under way."""
+        return self._final_task is not None and not self._final_task.done()
+
     def begin(self, action: Action) -> None:
         """Carry out an action, and report its end to the control loop."""
         self._start(action.do, partial(self._run, action), self.control_loop.on_action_ended)

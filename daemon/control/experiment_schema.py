@@ -16,6 +16,8 @@ from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS
 from shearloop.mistakes import shown
 
 MOST_ANGLES = 1000
+# Bounds on what an experiment costs: its plan is made in the loop that moves the robot.
+MOST_STEPS, MOST_ANGLES_IN_ALL = 500, 4000
 # Larger numbers have no differences.
 _LARGEST_WRITTEN = 1e9
 
@@ -246,6 +248,20 @@ class ExperimentFile(ConfigModel):
         description="kind of slice that `recording export --format slices` makes of each held angle; none by default",
     )
     steps: tuple[Step, ...] = Field(min_length=1, description="the steps in order")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> "ExperimentFile":
+        if len(self.steps) > MOST_STEPS:
+            raise ValueError(
+                f"it has {len(self.steps)} steps, and an experiment has at most {MOST_STEPS}: make two of it"
+            )
+        angles = sum(len(step.angles_rad) for step in self.steps if isinstance(step, TwistStep))
+        if angles > MOST_ANGLES_IN_ALL:
+            raise ValueError(
+                f"its `twist` steps have {angles} angles in all, and an experiment has at most {MOST_ANGLES_IN_ALL}: "
+                "repeat fewer of them with `repeats`, or make two of it"
+            )
+        return self
 
     @property
     def tightest_nm(self) -> float:

@@ -151,11 +151,24 @@ class ControlLoopRunner:
             return ENDING
         if self.actions.unlocking:
             return UNLOCKING
-        if (refusal := self._control_loop.start_refusal()) is not None:
-            return refusal
+        return self._control_loop.start_refusal() or self._taring()
+
+    def _taring(self) -> str | None:
+        """Return why no experiment can begin with the zeros of now, or None."""
         taring = [name for name, sensor in self.actions.sensors.items() if sensor.taring]
         if taring:
             return f"a zero is being taken ({', '.join(taring)}), with nothing gripped; start again when it is done"
+        return None
+
+    def motion(self) -> str | None:
+        """Return what moves or may move now, in words, or None."""
+        if (experiment := self._control_loop.running) is not None:
+            return f"the experiment {experiment.file.name!r} is running"
+        if self.actions.unlocking or self.actions.finishing:
+            return "the gripper or the robot is being moved"
+        state = self._robot.state
+        if self._timeline.pending or (state is not None and state.motion != "idle"):
+            return "the arm is moving"
         return None
 
     async def start(self, file: ExperimentFile, stops_before: int | None = None) -> str | None:
@@ -179,6 +192,9 @@ class ControlLoopRunner:
             return refusal
         if self.actions.unlocking:
             return UNLOCKING
+        # Its first step could grip a tool, whose torque becomes the zero.
+        if (refusal := self._taring()) is not None:
+            return refusal
         now_ns = self._clock.now_ns()
         refusal = self._control_loop.start(file, now_ns)
         if refusal is None:

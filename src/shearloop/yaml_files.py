@@ -98,12 +98,20 @@ class Document:
     _given: Mapping[tuple[int | str, ...], str] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Self:
+    def read(
+        cls,
+        path: Path,
+        raises: type[Exception],
+        what: str = "configuration",
+        cure: str = "",
+        *,
+        most_bytes: int = MOST_BYTES,
+    ) -> Self:
         """Read a file that is neither missing nor empty; `cure` ends the message of a missing one."""
         if "\0" in str(path) or len(path.name) > _LONGEST_NAME or len(str(path)) > _LONGEST_PATH:
             raise raises(f"{shown(str(path))}: no {what} has such a name")
         try:
-            data = read_file(path, MOST_BYTES)
+            data = read_file(path, most_bytes)
         except OSError as error:
             raise raises(f"{path}: the {what} cannot be read: {error.strerror}{_meant(path)}{cure}") from error
         return cls.parse(path, data, raises, what)

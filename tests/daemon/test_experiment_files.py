@@ -1,6 +1,7 @@
 """Experiments that a request names: bounded in place, kind, size and time, and read beside the event loop."""
 
 import asyncio
+import json
 import os
 import threading
 from collections.abc import Callable
@@ -15,9 +16,10 @@ from shearloop.cli import command, main
 from shearloop.daemon import experiment_files
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.control.experiment_schema import MOST_ANGLES_IN_ALL, MOST_STEPS
 from shearloop.daemon.errors import InvalidExperimentError
-from shearloop.daemon.experiment_files import ExperimentFiles
-from shearloop.daemon.messaging.command_server import CommandRefusedError
+from shearloop.daemon.experiment_files import ExperimentFiles, read_experiment
+from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.errors import UserError
@@ -141,7 +143,7 @@ def fifo(folder: Path) -> Path:
         (lambda folder: folder / "none.yaml", "No such file"),
         (lambda folder: folder, "Is a directory"),
         (fifo, "it is a device or a pipe"),
-        (lambda folder: write(folder / "large.yaml", "#" * 200_000), "it is larger than 128 kB"),
+        (lambda folder: write(folder / "large.yaml", "#" * 200_000), "it is larger than 32 kB"),
         (lambda folder: folder / ("x" * 300), "File name too long"),
         (lambda folder: folder / "a\0b", "null"),
     ],
@@ -165,13 +167,13 @@ async def test_a_reply_has_no_content_of_a_file(text, folder, log):
 
 
 async def test_the_event_loop_goes_on_while_a_large_file_is_read(folder):
-    steps = [{"do": "wait", "wait_s": number % 7 + 0.5} for number in range(1500)]
+    steps = [{"do": "wait", "wait_s": number % 7 + 0.5} for number in range(MOST_STEPS)]
     files, beats = ExperimentFiles((folder,)), 0
     reading = asyncio.create_task(files.read(write(folder / "large.yaml", {**VALID, "steps": steps})))
     while not reading.done():
         await asyncio.sleep(0)
         beats += 1
-    assert len(reading.result().file.steps) == 1500
+    assert len(reading.result().file.steps) == MOST_STEPS
     assert beats > 10
 
 
@@ -180,11 +182,13 @@ class SlowDrive:
 
     def __init__(self) -> None:
         self.asked, self.answers = threading.Event(), threading.Event()
+        self.read: list[Path] = []
         self._read = experiment_files.read_file
 
     def read_file(self, path: Path, most_bytes: int) -> bytes:
         self.asked.set()
         self.answers.wait()
+        self.read.append(path)
         return self._read(path, most_bytes)
 
 
@@ -209,7 +213,7 @@ async def test_a_drive_that_does_not_answer_ends_the_start_and_keeps_one_thread(
     with pytest.raises(UserError, match=r"was not read within 0\.05 s"):
         await files.read(path)
     for _ in range(16):
-        with pytest.raises(UserError, match="the file of another start is being read"):
+        with pytest.raises(UserError, match="the file of another request is being read"):
             await files.read(path)
     slow_drive.answers.set()
     async with deadline("the first reading did not end"):
@@ -227,6 +231,9 @@ class Runner:
         self.started: list[tuple[str, int]] = []
 
     def start_refusal(self) -> str | None:
+        return self.refusal
+
+    def motion(self) -> str | None:
         return self.refusal
 
     async def start(self, file: Any, stops_before: int) -> None:
@@ -255,6 +262,99 @@ async def test_no_file_is_read_while_none_can_start(folder, monkeypatch):
     monkeypatch.setattr(experiment_files, "read_file", lambda *_: pytest.fail("it is read"))
     path = write(folder / "one.yaml", VALID)
     assert await rig(folder, Runner("the experiment 'two' is still running")).start(path) is not None
+
+
+async def test_no_file_is_read_for_a_question_or_the_list_while_something_moves(folder, monkeypatch):
+    """A thread that parses holds up the loop, and a loop that is late stops the experiment that runs."""
+    path, runner = write(folder / "one.yaml", VALID), Runner()
+    idle, subject = rig(folder, Runner()), rig(folder, runner)
+    known = await answers_of(subject)["experiments"]({})
+    assert [one["name"] for one in known["experiments"]] == ["one"]
+    write(folder / "two.yaml", {**VALID, "name": "two"})
+    runner.refusal = idle.runner.refusal = "the experiment 'three' is running"
+    monkeypatch.setattr(experiment_files, "read_file", lambda *_: pytest.fail("it is read"))
+    monkeypatch.setattr(ExperimentFiles, "_stamps", lambda _: pytest.fail("the folders are read"))
+    with pytest.raises(CommandRefusedError, match="'three' is running"):
+        await answers_of(subject)["start"]({"experiment": str(path), "ask": True})
+    # A page that opens meanwhile has the list that was read before.
+    assert await answers_of(subject)["experiments"]({}) == known
+    with pytest.raises(CommandRefusedError, match="'three' is running, and no folder of experiments is read meanwhile"):
+        await answers_of(idle)["experiments"]({})
+
+
+async def test_no_file_is_read_for_a_question_or_the_list_while_another_starts(folder, slow_drive):
+    """It begins to move as soon as its own file is read and the arm is enabled."""
+    path, subject = write(folder / "one.yaml", VALID), rig(folder, Runner())
+    starting = asyncio.create_task(subject.start(path))
+    await asyncio.to_thread(slow_drive.asked.wait)
+    expected = "one.yaml is being started; wait until it has begun, or stop it"
+    for request in ({"experiment": str(path)}, {"experiment": str(path), "ask": True}):
+        with pytest.raises(CommandRefusedError, match=expected):
+            await answers_of(subject)["start"](request)
+    with pytest.raises(CommandRefusedError, match=expected.partition(";")[0]):
+        await answers_of(subject)["experiments"]({})
+    assert subject.tare_refusal(confirmed=True) == expected
+    slow_drive.answers.set()
+    assert await starting is None
+    assert subject.start_refusal() is None
+
+
+async def test_a_start_does_not_wait_for_a_long_list(folder, slow_drive):
+    paths = [write(folder / f"{number}.yaml", VALID) for number in range(20)]
+    subject = rig(folder, Runner())
+    listing = asyncio.create_task(subject.experiments.list(subject.reading_refusal))
+    await asyncio.to_thread(slow_drive.asked.wait)
+    starting = asyncio.create_task(subject.start(paths[-1]))
+    await asyncio.sleep(0)
+    slow_drive.answers.set()
+    assert await starting is None
+    with pytest.raises(UserError, match="is being started"):
+        await listing
+    assert slow_drive.read == [paths[0], paths[-1]]
+
+
+async def test_a_file_is_read_for_the_list_only_after_a_change(folder, slow_drive):
+    slow_drive.answers.set()
+    files, path = ExperimentFiles((folder,)), write(folder / "one.yaml", VALID)
+    wrong = write(folder / "wrong.yaml", "name: [")
+    for _ in range(3):
+        assert await files.list() == {str(path): "one"}
+    assert slow_drive.read == [path, wrong]
+    write(path, {**VALID, "name": "another"})
+    assert await files.list() == {str(path): "another"}
+    path.unlink()
+    assert await files.list() == {}
+    assert slow_drive.read == [path, wrong, path]
+
+
+async def test_as_many_requests_wait_for_a_file_as_leave_room_for_others(folder, slow_drive):
+    files, path = ExperimentFiles((folder,)), write(folder / "one.yaml", VALID)
+    reading = [asyncio.create_task(files.read(path)) for _ in range(MAX_CONCURRENT)]
+    await asyncio.to_thread(slow_drive.asked.wait)
+    slow_drive.answers.set()
+    replies = await asyncio.gather(*reading, return_exceptions=True)
+    refused = [one for one in replies if isinstance(one, UserError)]
+    assert all("the file of another request is being read" in str(one) for one in refused)
+    assert 1 < len(replies) - len(refused) <= MAX_CONCURRENT // 2
+
+
+@pytest.mark.parametrize(
+    ("steps", "said"),
+    [
+        ([{"do": "wait", "wait_s": 1}] * (MOST_STEPS + 1), f"at most {MOST_STEPS}"),
+        ([{"do": "twist", "angles_rad": "0:1:1000"}] * 5, f"5000 angles in all, .* at most {MOST_ANGLES_IN_ALL}"),
+        ([{"do": "twist", "angles_rad": [0.1] * (MOST_ANGLES_IN_ALL + 1)}], f"at most {MOST_ANGLES_IN_ALL}"),
+    ],
+)
+def test_an_experiment_whose_plan_would_take_long_is_refused(steps, said, folder):
+    path = folder / "long.yaml"
+    path.write_text(json.dumps({"name": "long", "steps": steps}, separators=(", ", ": ")))
+    with pytest.raises(UserError, match=said):
+        read_experiment(path)
+
+
+def answers_of(subject: Rig) -> Any:
+    return Commands(subject, None, None, None, asyncio.Event(), None).handlers()
 
 
 async def test_what_a_person_confirmed_is_what_starts(folder):

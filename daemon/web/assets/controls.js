@@ -58,9 +58,14 @@ export class Controls {
   update(link) {
     this.reasons = refusals(link);
     this.refresh();
-    const received = link.state() === "live" && link.get("loop.state") !== undefined;
-    if (received && !this.received) this.offer();
+    const loop = link.get("loop.state")?.content;
+    const received = link.state() === "live" && loop !== undefined;
+    const busy = received && ACTIVE.has(loop.phase);
+    // While an experiment runs, the daemon may have no list yet.
+    const ended = this.busy && !busy;
+    if (received && (!this.received || (ended && !this.listed))) this.offer();
     this.received = received;
+    this.busy = busy;
   }
 
   // Fill the picker with the experiments that the daemon offers.
@@ -72,6 +77,7 @@ export class Controls {
     } catch {
       reply = {};
     }
+    this.listed = reply.ok === true;
     const before = picker.value;
     const offered = reply.experiments ?? [];
     picker.replaceChildren(...offered.map(({ path, name }) => new Option(name, path)));

@@ -5,6 +5,7 @@ import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,6 +19,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile, first_mot
 from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.plan import plan_of, speeds_of
 from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.daemon.experiment_files import ReadExperiment
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.rig import Rig as RigOfDaemon
@@ -121,8 +123,12 @@ async def test_a_release_of_another_moment_than_its_question_opens_nothing(betwe
 
 
 def commands_of(cell: Cell) -> Any:
-    rig = RigOfDaemon(cell.control_loop, cell.runner, {}, None, None)
-    return Commands(rig, None, None, None, asyncio.Event(), rig.control_loop.tare_refusal).handlers()
+    return commands_with(RigOfDaemon(cell.control_loop, cell.runner, {}, None, None))
+
+
+def commands_with(rig: RigOfDaemon, sensors: dict[str, Any] | None = None) -> Any:
+    health = SimpleNamespace(tasks=dict)
+    return Commands(rig, SimpleNamespace(tareable=sensors), None, health, asyncio.Event(), rig.tare_refusal).handlers()
 
 
 @pytest.mark.parametrize("hand", [{"holding": True}, {"uncertain": True}, {"moving": True}])
@@ -263,6 +269,62 @@ async def test_no_start_while_a_zero_is_taken():
         await cell.start(WAIT)
         cell.sensors["right"].taring = True
         assert cell.runner.start_refusal() == "the experiment 'test' is still running; stop it first"
+
+
+class Tared:
+    """A sensor whose zero takes long."""
+
+    taring = False
+
+    def tare(self, **_: bool) -> None:
+        self.taring = True
+
+
+class OneFile:
+    """The experiments of a rig, of which one is read once the test lets it."""
+
+    gripper = robot = None
+
+    def __init__(self) -> None:
+        self.asked, self.answers = asyncio.Event(), asyncio.Event()
+
+    async def read(self, path: Path) -> ReadExperiment:
+        self.asked.set()
+        await self.answers.wait()
+        return ReadExperiment(path, experiment({"do": "grip", "width_mm": 10.0}, WAIT), b"grip")
+
+
+async def test_no_zero_is_taken_while_an_experiment_starts():
+    """The file of the start is read and the arm is enabled for seconds; its first step could grip a tool."""
+    async with with_gripper() as cell:
+        cell.holding = False
+        await cell.cycles(5)
+        files, cell.sensors["load_cell"] = OneFile(), Tared()
+        commands = commands_with(RigOfDaemon(cell.control_loop, cell.runner, {}, files, None), cell.sensors)
+        starting = asyncio.create_task(commands["start"]({"experiment": "/rig/grip.yaml"}))
+        await files.asked.wait()
+        for confirmed in (False, True):
+            with pytest.raises(CommandRefusedError, match=r"grip\.yaml is being started; wait until it has begun"):
+                await commands["tare"]({"confirmed": confirmed})
+        files.answers.set()
+        while not starting.done():
+            await cell.cycles(1)
+        assert starting.result() == {"experiment": "/rig/grip.yaml", "run": 1}
+        assert not cell.sensors["load_cell"].taring
+
+
+async def test_no_experiment_begins_while_a_zero_is_taken_that_came_during_its_start():
+    async with with_gripper() as cell:
+        cell.holding = False
+        cell.sensors["load_cell"] = Tared()
+        await cell.cycles(5)
+        starting = asyncio.create_task(cell.runner.start(experiment({"do": "grip", "width_mm": 10.0}, WAIT)))
+        # The arm is being enabled.
+        await asyncio.sleep(0)
+        cell.sensors["load_cell"].tare()
+        await cell.cycles(10)
+        assert "a zero is being taken (load_cell)" in (starting.result() or "")
+        assert (cell.control_loop.running, cell.gripper.asked) == (None, [])
 
 
 class OnLever(Rig):

@@ -57,14 +57,21 @@ class FakeDaemon(Killable):
         self.forget()
 
     def say(
-        self, *, refusal: str = "", digest: str = "a", drops: bool = False, **changed: Mapping[str, Any] | None
+        self,
+        *,
+        refusal: str = "",
+        digest: str = "a",
+        drops: bool = False,
+        lists: bool = True,
+        **changed: Mapping[str, Any] | None,
     ) -> None:
         """Say all messages from now on, with changes to some; None takes one out. Refuse commands where told so.
 
-        `digest` is of the questions; `drops`: an unlock drops a tool, and asks.
+        `digest` is of the questions; `drops`: an unlock drops a tool, and asks; `lists`: it has a list of experiments.
         """
         new = self._folder / "changed.new"
-        new.write_text(json.dumps({"messages": changed, "refusal": refusal, "digest": digest, "drops": drops}))
+        told = {"refusal": refusal, "digest": digest, "drops": drops, "lists": lists}
+        new.write_text(json.dumps({"messages": changed, **told}))
         new.rename(self._folder / "changed")
 
     @property

@@ -128,6 +128,8 @@ async def serve(folder: Path) -> None:
         return handle
 
     async def experiments(_request: Mapping[str, Any]) -> dict[str, Any]:
+        if not json.loads((folder / "changed").read_text())["lists"]:
+            raise CommandRefusedError("the experiment 'hold' is running")
         found = [{"path": path, "name": name} for path, name in EXPERIMENTS.items()]
         return {"experiments": found, "configured": next(iter(EXPERIMENTS))}
 

@@ -133,6 +133,15 @@ def test_the_keyboard_reaches_everything_and_stop_first(browsed):
     assert browsed.daemon.asked == ["stop", "tare"]
 
 
+def test_a_page_that_opens_during_a_run_has_the_list_afterwards(browsed):
+    browsed.daemon.say(loop={"phase": "running"}, lists=False)
+    page = browsed.open(token=True)
+    page.wait_for_selector("[data-command=pause]:enabled")
+    assert page.locator("#experiment:visible").count() == 0
+    browsed.daemon.say(loop={"phase": "done"})
+    page.wait_for_selector("#experiment:visible")
+
+
 def test_the_picked_experiment_shows_its_plan_and_is_the_one_that_starts(browsed):
     page = browsed.open(token=True)
     browsed.daemon.say(loop={"phase": "idle"})

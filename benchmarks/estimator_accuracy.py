@@ -34,8 +34,8 @@ from shearloop.tools.recordings.matlab_import import import_mat
 
 # Columns of the tables: figures of loaded frames, then two of all frames.
 LOADED = {
-    "loaded": "n", "RMSE, N·m": "rmse_nm", "saying 0": "zero_rmse_nm", "gain": "gain", "coverage": "coverage_95",
-    "score, N·m": "winkler_nm", "valid": "valid_fraction",
+    "loaded": "n", "RMSE, N·m": "rmse_nm", "saying 0": "baseline_zero_rmse_nm", "gain": "gain",
+    "coverage": "coverage_95", "score, N·m": "winkler_nm", "valid": "valid_fraction",
 }  # fmt: skip
 ALL = {"all: RMSE, N·m or mm": "rmse_nm", "r": "r"}
 

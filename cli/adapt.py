@@ -8,6 +8,7 @@ from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, load_c
 from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
 from shearloop.tools.outputs import check_overwrite
+from shearloop.words import counted
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -16,16 +17,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "recordings", Path, "REC", "recordings (.mcap) of a grip with a twist or more", nargs="+")
     add_option(parser, "--out", Path, "NEW", "calibration to write", required=True)
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
-    text = "share of each recording whose twists count, e.g. 0:0.2; earlier frames show the idle fingertip"
+    text = "fraction of each recording whose twists count, e.g. 0:0.2; earlier frames show the idle fingertip"
     add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
     text = "delay of the load cell's timestamps, which is subtracted"
     add_option(parser, "--load-cell-delay-s", DELAY_S, "S", text, default=0.0)
     add_option(parser, "--tool-mm", TOOL_MM, "MM", "diameter of the tool, if the recording does not name it")
     add_json(parser)
     parser.epilog = (
-        "The gain of each fingertip changes between grips. Twists of known torque correct it; the correction is the "
-        "smaller, the less twists agree, and the first twist after a grip counts less than the later ones. Use the "
-        "result for this grip, and CAL for the next one."
+        "The gain of each fingertip changes between grips. Twists of known torque correct it. Twists that disagree "
+        "correct less, and the first twist after a grip counts less than the later ones. Use the result for this grip, "
+        "and CAL for the next one."
     )
 
 
@@ -56,8 +57,17 @@ def run(args: argparse.Namespace) -> int:
     gains = {name: {"gain": gain, "error": error} for name, gain, error in zip(names, factors, errors, strict=True)}
     sentences = [f"{name}: torque times {one['gain']:.2f} ± {one['error']:.2f}." for name, one in gains.items()]
     sentences.append(f"Offset: {correction.offset_nm:+.4f} N·m.")
-    twists = correction.twists
-    sentences.append(f"{twists} twist{'s' * (twists > 1)} of known torque decided. Written to {args.out}.")
-    figures = {"path": str(args.out), "gains": gains, "twists": twists, "gain_spread": correction.spread.between}
-    figures["offset_nm"] = correction.offset_nm
+    if correction.is_unchanged:
+        sentences.append("The deviation may be chance; the gain is unchanged.")
+    else:
+        sentences.append(f"{counted(correction.twists, 'twist')} of known torque decided.")
+    sentences.append(f"Written to {args.out}.")
+    figures = {
+        "path": str(args.out),
+        "gains": gains,
+        "gain_is_unchanged": correction.is_unchanged,
+        "twists": correction.twists,
+        "gain_spread": correction.spread.between,
+        "offset_nm": correction.offset_nm,
+    }
     return print_result(figures, sentences, as_json=args.json)

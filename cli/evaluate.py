@@ -31,7 +31,6 @@ _FIGURES = (".png", ".svg", ".pdf")
 _MEANINGS = {
     "n": "frames with a known torque",
     "rmse_nm": "root mean square error, N·m",
-    "zero_rmse_nm": "the same of an estimate that is always 0",
     "baseline_zero_rmse_nm": "without a sensor: always 0",
     "baseline_profile_rmse_nm": (
         "without a sensor: the calibration's mean twist at the same phase of the motion; for slices the mean at the "
@@ -39,17 +38,17 @@ _MEANINGS = {
     ),
     "baseline_ratio": "rmse_nm over the smaller of both; from 1 on the sensor adds nothing",
     "bias_nm": "mean error, N·m",
-    "coverage_95": "share of the known values within their 95 % intervals",
+    "coverage_95": "fraction of the known values within their 95 % intervals",
     "interval_nm": "median width of these intervals, N·m",
     "winkler_nm": "mean width plus 40 times the distance of a known value outside; less is better",
-    "valid_fraction": "share of the frames with an estimate",
+    "valid_fraction": "fraction of the frames with an estimate",
     "gain": "mean estimate along the known torque over the mean of its size",
     "r": "correlation of estimated and known torque",
     "latency_ms_p50": "time of an estimate, ms, median",
     "latency_ms_p99": "time of an estimate, ms, 99th percentile",
     "frames": "frames in all",
     "diameter_rmse_mm": "root mean square error of the diameter, mm",
-    "diameter_coverage_95": "share of the known diameters within their 95 % intervals",
+    "diameter_coverage_95": "fraction of the known diameters within their 95 % intervals",
     "diameter_interval_mm": "median width of these intervals, mm",
 }
 
@@ -67,9 +66,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--adapt-twists", number(1, 100, int), "N", text)
     add_recipe(parser)
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
-    text = "share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
+    text = "fraction of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
     add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
-    text = "least known torque of a frame that counts as loaded (default: %(default)s N·m)"
+    text = "minimum known torque of a frame that counts as loaded (default: %(default)s N·m)"
     add_option(parser, "--loaded-nm", number(0.0, 100.0), "NM", text, default=LOADED_NM)
     add_option(parser, "--estimates", Path, "FILE.csv", "table to write with known torque and estimate of every frame")
     add_cluster(parser)

@@ -126,7 +126,7 @@ def add_recipe(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--sides", _sides, "SIDE[,SIDE]", "sides to use, e.g. right (default: all)")
     text = "delay of the load cell's timestamps, which is subtracted; 0 accepts them unchecked"
     add_option(parser, "--load-cell-delay-s", DELAY_S, "S", text)
-    text = "no torque will exceed the slices: intervals do not extend beyond them"
+    text = "no torque will exceed the calibrated range: intervals do not extend beyond it"
     parser.add_argument("--assume-full-range", action="store_true", help=text)
     text = "diameter of the tool in recordings that do not name it; on another tool there is no torque"
     add_option(parser, "--tool-mm", TOOL_MM, "MM", text)

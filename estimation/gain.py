@@ -378,6 +378,11 @@ class GainCorrection:
     spread: GainSpread
     twists: int
 
+    @property
+    def is_unchanged(self) -> bool:
+        """Whether the factors stay at 1, because the twists' deviation may be chance."""
+        return bool(np.abs(np.log(self.factors)).max() < _LEAST_CHANGE)
+
 
 @dataclass(frozen=True, slots=True)
 class ToolLaw:

@@ -171,7 +171,7 @@ def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     """Return the figures of all frames, by the names that `shearloop evaluate` prints.
 
     Only valid frames with a known truth are judged; with fewer than two of them, errors are None. interval_nm is the
-    median width of the intervals. winkler_nm is their mean score. zero_rmse_nm is the error of an estimate of 0. Known
+    median width of the intervals. winkler_nm is their mean score. baseline_zero_rmse_nm is the error of always 0. Known
     diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a torque, coverage_95 is of
     the diameter.
     """
@@ -195,7 +195,7 @@ def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_N
     """Return the torque's figures of `loaded` frames, with a torque of loaded_nm or more in size, and of the others.
 
     n frames have a known truth, and valid_fraction of them an estimate. Only these are judged. gain is the mean
-    estimate over the mean truth, both along the truth. For loaded frames baseline_zero_rmse_nm and
+    estimate over the mean truth, both along the truth. baseline_zero_rmse_nm and, for loaded frames,
     baseline_profile_rmse_nm are errors without a sensor, and baseline_ratio is the estimate's over the smaller one.
     """
     frames = _known_frames(tracks, "torque")
@@ -252,15 +252,14 @@ def _joined(reasons: Sequence[str]) -> str:
 
 
 def _baselines(frames: FloatArray) -> Figures:
-    """Return the errors on the same frames (5, n) without a sensor, and the estimate's over the smaller of them."""
+    """Return the stopwatch's error on the same frames (5, n), and the estimate's over that or that of always 0."""
     truth, value, _, _, profile = frames[:, np.isfinite(frames[1])]
     if len(truth) < 2:
-        return dict.fromkeys(("baseline_zero_rmse_nm", "baseline_profile_rmse_nm", "baseline_ratio"))
+        return dict.fromkeys(("baseline_profile_rmse_nm", "baseline_ratio"))
     known = bool(np.isfinite(profile).all())
     zero_nm, profile_nm, own_nm = (float(np.sqrt(((one - truth) ** 2).mean())) for one in (0.0, profile, value))
     least_nm = min(zero_nm, profile_nm) if known else zero_nm
     return {
-        "baseline_zero_rmse_nm": zero_nm,
         "baseline_profile_rmse_nm": profile_nm if known else None,
         "baseline_ratio": own_nm / least_nm if least_nm else None,
     }
@@ -292,7 +291,7 @@ def _compare(frames: FloatArray, unit: str) -> Figures:
     n = frames.shape[1]
     counts: Figures = {"n": n, "valid_fraction": len(truth) / n if n else None}
     if len(truth) < 2:
-        errors = (f"{name}_{unit}" for name in ("rmse", "zero_rmse", "bias", "interval", "winkler"))
+        errors = (f"{name}_{unit}" for name in ("rmse", "baseline_zero_rmse", "bias", "interval", "winkler"))
         return counts | dict.fromkeys(("r", "gain", "coverage_95", *errors))
     error, size = value - truth, float(np.abs(truth).sum())
     changing = value.std() > 0 and truth.std() > 0
@@ -300,7 +299,7 @@ def _compare(frames: FloatArray, unit: str) -> Figures:
         "r": float(np.corrcoef(value, truth)[0, 1]) if changing else None,
         "gain": float((value * np.sign(truth)).sum()) / size if size else None,
         f"rmse_{unit}": float(np.sqrt((error**2).mean())),
-        f"zero_rmse_{unit}": float(np.sqrt((truth**2).mean())),
+        f"baseline_zero_rmse_{unit}": float(np.sqrt((truth**2).mean())),
         f"bias_{unit}": float(error.mean()),
         "coverage_95": float(((low <= truth) & (truth <= high)).mean()),
         f"interval_{unit}": float(np.median(high - low)),
@@ -381,7 +380,7 @@ def _draw_intervals(axes: "Axes", t_s: FloatArray, value: FloatArray, low: Float
 def loaded_text(track: EstimateTrack) -> str:
     """Return the errors of a track's loaded frames as the end of a title, empty without any."""
     loaded = figures_by_load([track])["loaded"]
-    error, zero = loaded["rmse_nm"], loaded["zero_rmse_nm"]
+    error, zero = loaded["rmse_nm"], loaded["baseline_zero_rmse_nm"]
     if error is None or zero is None:
         return ""
     return f"; {loaded['n']} loaded frames: RMSE {error:.2g} N·m (always saying 0: {zero:.2g})"

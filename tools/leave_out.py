@@ -16,7 +16,14 @@ from shearloop.bank.mesh import load_mesh
 from shearloop.estimation import Calibration, FrameSeries, LoadTiming, Physics, adapt, fit
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
+from shearloop.tools.evaluate import (
+    EstimateTrack,
+    Figures,
+    estimate_series,
+    figures_by_load,
+    figures_of,
+    no_better_than_clock,
+)
 from shearloop.tools.frame_series import Series
 from shearloop.tools.left_out_blocks import Block, Kind, after_twists, find_blocks, kept, number_of_grips, tools_of
 from shearloop.tools.parallel import Executor
@@ -26,6 +33,7 @@ from shearloop.words import counted
 _ENOUGH_GRIPS = 3
 # A tool that is left out needs three others, which determine the gain over the diameter.
 _ENOUGH_TOOLS = 4
+MEAN_TWIST = "a stopwatch with the mean twist"
 NO_ESTIMATE = "No loaded frame has an estimate: see why with `shearloop evaluate CAL REC`."
 # Below this coverage of the 95 % intervals, the advice is more data.
 _LEAST_COVERAGE = 0.9
@@ -93,7 +101,8 @@ class Recipe:
 class LeftOut:
     """The names of the blocks, the tracks of each, a sentence of advice, and the name of the guess without a sensor.
 
-    Where the gain was adapted to twists, `before` are the tracks of the same frames without it.
+    Where the gain was adapted to twists, `before` are the tracks of the same frames without it, and `without_rest` says
+    why blocks have nothing left to be judged.
     """
 
     kind: str
@@ -102,11 +111,19 @@ class LeftOut:
     advice: str
     clock: str
     before: tuple[EstimateTrack, ...] = ()
+    without_rest: Sequence[str] = ()
 
     @property
     def all_tracks(self) -> list[EstimateTrack]:
         """The tracks of all blocks."""
         return [one for tracks in self.tracks for one in tracks]
+
+    @property
+    def not_judged(self) -> list[str]:
+        """Why blocks have no part in the figures, each in one sentence without its point."""
+        blocks = zip(self.names, self.tracks, strict=True)
+        refused = [f"{name} is not judged: no torque was estimated on it" for name, own in blocks if _lacks_torque(own)]
+        return [*self.without_rest, *refused]
 
     def figures(self, loaded_nm: float = LOADED_NM) -> dict[str, object]:
         """Return the figures by the names of `shearloop evaluate`, and the figures of each block's loaded frames."""
@@ -115,7 +132,12 @@ class LeftOut:
             for name, tracks in zip(self.names, self.tracks, strict=True)
         ]
         tracks = self.all_tracks
-        named: dict[str, object] = {"left_out": self.kind, "blocks": blocks, "advice": self.advice}
+        named: dict[str, object] = {
+            "left_out": self.kind,
+            "blocks": blocks,
+            "not_judged": self.not_judged,
+            "advice": self.advice,
+        }
         if self.before:
             named["before_adapting"] = figures_by_load(self.before, loaded_nm)["loaded"]
         return {**figures_by_load(tracks, loaded_nm), **figures_of(tracks), **named}
@@ -126,6 +148,7 @@ class Plan:
     """What is fitted and judged: a recipe, recordings, and the blocks to leave out in turn.
 
     `advice` returns a sentence on the tracks of the blocks. `clock` names the guess without a sensor.
+    `without_rest` says why blocks have nothing left to be judged.
     """
 
     kind: str
@@ -133,14 +156,15 @@ class Plan:
     recordings: Sequence[FrameSeries]
     blocks: Sequence[Block]
     advice: Callable[[Sequence[Sequence[EstimateTrack]]], str]
-    clock: str = "a stopwatch with the mean twist"
+    clock: str = MEAN_TWIST
+    without_rest: Sequence[str] = ()
 
     def judge(self, pool: Executor) -> LeftOut:
         """Fit and judge each block; raises CalibrationError where the rest determines no calibration."""
         judged = list(pool.map(judge_block, (self.recipe, self.recordings), self.blocks))
         tracks, names = tuple(one.tracks for one in judged), tuple(one.name for one in self.blocks)
         before = tuple(track for one in judged for track in one.before)
-        return LeftOut(self.kind, names, tracks, self.advice(tracks), self.clock, before)
+        return LeftOut(self.kind, names, tracks, self.advice(tracks), self.clock, before, self.without_rest)
 
 
 def judge_block(shared: tuple[Judge, Sequence[FrameSeries]], block: Block) -> Judged:
@@ -160,9 +184,11 @@ def plan_left_out(
     sides = [side for side in recordings[0].sides if all(side in one.sides for one in recordings)]
     chosen = tuple(one.select_sides(tuple(sides)) for one in recordings) if sides else tuple(recordings)
     blocks = find_blocks(kind, chosen, names)
-    if adapt_twists:
-        blocks = after_twists(blocks, chosen, adapt_twists)
-    return Plan(kind, recipe, chosen, blocks, partial(advice_on, kind, chosen, adapted=bool(adapt_twists)))
+    advice = partial(advice_on, kind, chosen, adapted=bool(adapt_twists))
+    if not adapt_twists:
+        return Plan(kind, recipe, chosen, blocks, advice)
+    later = after_twists(blocks, chosen, adapt_twists)
+    return Plan(kind, recipe, chosen, later.blocks, advice, without_rest=later.not_judged)
 
 
 Fitted = TypeVar("Fitted")
@@ -199,8 +225,8 @@ def advice_on(
     loaded = figures_by_load(judged)["loaded"]
     if loaded["baseline_ratio"] is None:
         return NO_ESTIMATE
-    if kind == "tools" and (n_tools := len(tools_of(recordings))) < _ENOUGH_TOOLS:
-        return f"{counted(n_tools, 'tool')} only: record four, because three others tell the gain of one left out."
+    if few_tools := _few_tools(kind, recordings):
+        return few_tools
     if kind == "tools" and not adapted:
         return "Another tool has a gain of its own: correct it with `shearloop adapt` on two twists of known torque."
     if against := no_better_than_clock(judged):
@@ -233,15 +259,42 @@ def sentences_of(result: LeftOut, loaded_nm: float = LOADED_NM) -> list[str]:
         f"Without a sensor: {_milli(loaded['baseline_zero_rmse_nm'])} mN·m for always 0, "
         f"{_milli(loaded['baseline_profile_rmse_nm'])} mN·m for {result.clock}. Ratio to the better: "
         f"{'unknown' if ratio is None else f'{ratio:.2f}'}.",
-        *_not_judged(result),
+        *(f"{why[0].upper()}{why[1:]}." for why in result.not_judged),
         *_before_adapting(result, loaded_nm),
         result.advice,
     ]
 
 
-def _not_judged(result: LeftOut) -> list[str]:
-    names = [name for name, tracks in zip(result.names, result.tracks, strict=True) if _lacks_torque(tracks)]
-    return [f"No torque was estimated on {' and '.join(names)}: these figures are of the others."] if names else []
+def figures_on_fitted(tracks: Sequence[EstimateTrack]) -> Figures:
+    """Return what frames of the fit show of a calibration: the width of intervals, and the errors without a sensor.
+
+    Its own error on them shows nothing.
+    """
+    loaded = figures_by_load(tracks)["loaded"]
+    return {name: loaded[name] for name in ("n", "interval_nm", "baseline_zero_rmse_nm", "baseline_profile_rmse_nm")}
+
+
+def sentences_on_fitted(figures: Figures, clock: str) -> list[str]:
+    """Return `figures_on_fitted` in words; `clock` names the guess without a sensor."""
+    if figures["interval_nm"] is None:
+        return ["Too few loaded frames of the fit have an estimate."]
+    return [
+        f"Loaded frames of the fit have intervals of {_milli(figures['interval_nm'])} mN·m (median). Without a sensor: "
+        f"{_milli(figures['baseline_zero_rmse_nm'])} mN·m for always 0, "
+        f"{_milli(figures['baseline_profile_rmse_nm'])} mN·m for {clock}, which knows these frames."
+    ]
+
+
+def advice_unjudged(kind: str, recordings: Sequence[FrameSeries]) -> str:
+    """Return one sentence: what to do first where no block of a kind can be left out."""
+    return _few_tools(kind, recordings) or "Judge it on another recording: `shearloop evaluate CAL REC`."
+
+
+def _few_tools(kind: str, recordings: Sequence[FrameSeries]) -> str:
+    n_tools = len(tools_of(recordings))
+    if kind != "tools" or n_tools >= _ENOUGH_TOOLS:
+        return ""
+    return f"{counted(n_tools, 'tool')} only: record four, because three others tell the gain of one left out."
 
 
 def _lacks_torque(tracks: Sequence[EstimateTrack]) -> bool:

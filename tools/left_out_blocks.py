@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
@@ -169,20 +169,36 @@ def kept(recordings: Sequence[Series], rows: Sequence[BoolArray]) -> list[Series
     return found
 
 
-def after_twists(blocks: Sequence[Block], recordings: Sequence[FrameSeries], n_twists: int) -> list[Block]:
+class AfterTwists(NamedTuple):
+    """Blocks that are judged after the first twists of their grip, and why others have nothing left to be judged."""
+
+    blocks: list[Block]
+    not_judged: list[str]
+
+
+def after_twists(blocks: Sequence[Block], recordings: Sequence[FrameSeries], n_twists: int) -> AfterTwists:
     """Return blocks that are judged after the gain is adapted to the first twists of the grip where they begin.
 
     These twists are neither fitted nor judged. Raises UserError where nothing remains to be judged.
     """
     grips = [find_grips(one) for one in recordings]
     found: list[Block] = []
+    not_judged: list[str] = []
     for block in blocks:
         for span in block.judged:
             series = recordings[span.recording]
             grip = [one for one in grips[span.recording] if one.idle.start <= span.first][-1]
             edges = _twist_edges(series, grip)
-            end = edges[n_twists] if len(edges) > n_twists + 1 else span.stop
-            if max(span.first, end) >= span.stop:
+            n_of_grip = len(edges) - 1
+            if n_of_grip <= n_twists:
+                which = block.name if len(block.judged) == 1 else f"a recording of {block.name}"
+                not_judged.append(
+                    f"{which} is not judged: its grip has {counted(n_of_grip, 'twist')} (one ends where the load falls "
+                    f"below a tenth), and the gain is adapted to {counted(n_twists, 'twist')}"
+                )
+                continue
+            end = edges[n_twists]
+            if end >= span.stop:
                 continue
             fitted = [rows.copy() for rows in block.fitted]
             # The idle frames before the grip hold no twist.
@@ -191,4 +207,4 @@ def after_twists(blocks: Sequence[Block], recordings: Sequence[FrameSeries], n_t
             found.append(replace(block, fitted=tuple(fitted), judged=(judged,), adapted=adapted))
     if not found:
         raise UserError(f"no grip has more than {counted(n_twists, 'twist')}: none remains to be judged; record ten")
-    return found
+    return AfterTwists(found, not_judged)

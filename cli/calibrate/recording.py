@@ -3,6 +3,7 @@
 import argparse
 import shlex
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from shearloop.estimation import Calibration, Physics
     from shearloop.estimation.interval_regressor import IntervalRegressor
     from shearloop.tools.calibrate import CalibrationResult
+    from shearloop.tools.evaluate import EstimateTrack
     from shearloop.tools.leave_out import Plan
 
 # The refits without each block may take about this long, estimated from the time of one fit.
@@ -30,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_recipe(parser)
     add_option(parser, "--out", Path, "CAL", "calibration to write", required=True)
     add_option(parser, "--bank", Path, "FILE", "a bank, which the estimators paper and bank need")
-    text = "share of each recording to use, e.g. 0:0.5"
+    text = "fraction of each recording to use, e.g. 0:0.5"
     add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
     add_json(parser)
     parser.epilog = (
@@ -60,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
 def _calibrate_recordings(args: argparse.Namespace, physics: "Physics") -> tuple[dict[str, object], list[str]]:
     """Write a calibration on recordings; return its figures, and what the user should know of it."""
     from shearloop.tools.calibrate import calibrate
-    from shearloop.tools.leave_out import Recipe, plan_left_out
+    from shearloop.tools.evaluate import estimate_series
+    from shearloop.tools.leave_out import MEAN_TWIST, Recipe, advice_unjudged, plan_left_out
     from shearloop.tools.left_out_blocks import usual_kind
 
     result = calibrate(
@@ -74,14 +77,23 @@ def _calibrate_recordings(args: argparse.Namespace, physics: "Physics") -> tuple
     kind = usual_kind(result.parts)
     recipe = Recipe(args.estimator, args.bank, args.mesh, result.timing.uncertainty_s)
     names = [path.name for path in args.recordings]
-    judged, said = _judge_left_out(args, kind, result.fit_s, lambda: plan_left_out(kind, recipe, result.parts, names))
+    trial = _Trial(
+        kind,
+        lambda: plan_left_out(kind, recipe, result.parts, names),
+        lambda: [estimate_series(result.calibration, one, physics.bank) for one in result.parts],
+        MEAN_TWIST,
+        advice_unjudged(kind, result.parts),
+    )
+    judged, said = _judge_left_out(args, trial, result.fit_s)
     return {**figures, **judged}, sentences + said
 
 
 def _calibrate_slices(args: argparse.Namespace, physics: "Physics") -> tuple[dict[str, object], list[str]]:
     """Write a calibration on folders of slices; return its figures, and what the user should know of it."""
     from shearloop.studies.slices.calibrate import calibrate_slices
-    from shearloop.studies.slices.leave_out import LEVELS, SliceRecipe, plan_levels
+    from shearloop.studies.slices.evaluate import estimate_slices
+    from shearloop.studies.slices.leave_out import LEVELS, MEAN_OF_PLACE, SliceRecipe, plan_levels
+    from shearloop.tools.leave_out import advice_unjudged
 
     result = calibrate_slices(
         args.recordings, args.estimator, physics,
@@ -92,31 +104,65 @@ def _calibrate_slices(args: argparse.Namespace, physics: "Physics") -> tuple[dic
     if result.calibration.torque is None:
         return {**figures, "left_out": None}, sentences
     recipe = SliceRecipe(args.estimator, args.bank, args.mesh, args.assume_full_range)
-    judged, said = _judge_left_out(args, LEVELS, result.fit_s, lambda: plan_levels(LEVELS, recipe, result.parts))
+    trial = _Trial(
+        LEVELS,
+        lambda: plan_levels(LEVELS, recipe, result.parts),
+        lambda: [estimate_slices(result.calibration, one, physics.bank) for one in result.parts],
+        MEAN_OF_PLACE,
+        advice_unjudged(LEVELS, ()),
+    )
+    judged, said = _judge_left_out(args, trial, result.fit_s)
     return {**figures, **judged}, sentences + said
 
 
-def _judge_left_out(
-    args: argparse.Namespace, kind: str, fit_s: float, plan_of: "Callable[[], Plan]"
-) -> tuple[dict[str, object], list[str]]:
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """How a calibration is judged: the kind of blocks left out, their plan, and the tracks of the fit's own frames.
+
+    `clock` names the guess without a sensor; `advice` is for a calibration of which no block can be left out.
+    """
+
+    kind: str
+    plan: "Callable[[], Plan]"
+    tracks: "Callable[[], list[EstimateTrack]]"
+    clock: str
+    advice: str
+
+    def on_fitted(self) -> tuple[dict[str, object], list[str]]:
+        """Return what frames of the fit show, as figures and in words."""
+        from shearloop.tools.leave_out import figures_on_fitted, sentences_on_fitted
+
+        figures = figures_on_fitted(self.tracks())
+        return {"on_fitted": figures}, sentences_on_fitted(figures, self.clock)
+
+
+def _judge_left_out(args: argparse.Namespace, trial: _Trial, fit_s: float) -> tuple[dict[str, object], list[str]]:
     """Return the figures of the blocks left out, and the advice for the user.
 
-    Where the refits would take longer than some seconds, that is the command; without two blocks, it is why.
+    Where the refits would take longer than some seconds, or the rest gives no calibration, it says so; then come the
+    figures on frames of the fit, and the command or the advice.
     """
     from shearloop.bank.errors import CalibrationError
     from shearloop.tools.leave_out import sentences_of as sentences_of_left_out
     from shearloop.tools.parallel import SerialExecutor
 
     try:
-        plan = plan_of()
-        if len(plan.blocks) * fit_s > LEFT_OUT_WITHIN_S:
-            command = shlex.join(_evaluate_command(args, kind))
-            return {"left_out": None, "left_out_command": command}, [f"Judge it by {kind} left out: {command}"]
+        plan = trial.plan()
+        takes_s = len(plan.blocks) * fit_s
+        if takes_s > LEFT_OUT_WITHIN_S:
+            command = shlex.join(_evaluate_command(args, trial.kind))
+            figures, sentences = trial.on_fitted()
+            why = f"Not judged yet: {len(plan.blocks)} fits take about {takes_s:.0f} s."
+            advice = f"Judge it by {trial.kind} left out: {command}"
+            return {"left_out": None, "left_out_command": command, **figures}, [why, *sentences, advice]
         found = plan.judge(SerialExecutor())
     except (UserError, CalibrationError) as error:
-        return {"left_out": None, "left_out_refused": str(error)}, [f"Not judged by {kind} left out: {error}."]
+        figures, sentences = trial.on_fitted()
+        why = f"Not judged by {trial.kind} left out: {error}."
+        refused = {"left_out": None, "left_out_refused": str(error), "advice": trial.advice}
+        return {**refused, **figures}, [why, *sentences, trial.advice]
     except KeyboardInterrupt:
-        print(f"{args.out} is written and whole; its trial with {kind} left out has not ended", file=sys.stderr)
+        print(f"{args.out} is written and whole; its trial with {trial.kind} left out has not ended", file=sys.stderr)
         raise
     return {"left_out": found.figures()}, sentences_of_left_out(found)
 
@@ -160,8 +206,8 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
     if result.widening is not None:
         sentences.append(
             "Could not verify the load cell's timestamps: the load changed too few times. They may be "
-            f"{timing.uncertainty_s:.2g} s off, so the intervals are wider, for loads {result.widening:.2g} times. "
-            "Record more changes of load, such as ten twists, or confirm the load cell's clock with "
+            f"{timing.uncertainty_s:.2g} s off, so the intervals of loaded frames are {result.widening:.2g} times "
+            "wider. Record more changes of load, such as ten twists, or confirm the load cell's clock with "
             "--load-cell-delay-s 0."
         )
     if result.tool_mm is not None:

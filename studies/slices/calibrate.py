@@ -81,8 +81,8 @@ def calibrate_slices(
 ) -> SliceResult:
     """Fit an estimator to these shares (0 to 1) of folders of slices, oldest first.
 
-    With `assume_full_range` no torque will exceed the slices. Raises UserError for a folder that is given twice, and
-    CalibrationError for slices that determine no calibration.
+    With `assume_full_range` no torque will exceed the calibrated range. Raises UserError for a folder that is given
+    twice, and CalibrationError for slices that determine no calibration.
     """
     _, parts = read_parts(folders, time_range)
     begun = time.perf_counter()

@@ -24,6 +24,7 @@ from shearloop.tools.left_out_blocks import Block, Span, kept
 from shearloop.words import counted
 
 LEVELS = "levels"
+MEAN_OF_PLACE = "the mean of the place in the sequence"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ def plan_levels(kind: str, recipe: SliceRecipe, recordings: Sequence[SliceSeries
     if kind != LEVELS:
         raise UserError(f"slices show no {kind}; use --leave-out {LEVELS}")
     blocks = find_levels(recordings)
-    return Plan(LEVELS, recipe, tuple(recordings), blocks, _advice, "the mean of the place in the sequence")
+    return Plan(LEVELS, recipe, tuple(recordings), blocks, _advice, MEAN_OF_PLACE)
 
 
 def find_levels(recordings: Sequence[SliceSeries]) -> list[Block]:

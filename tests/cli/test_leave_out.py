@@ -31,10 +31,59 @@ def test_calibrate_judges_or_names_the_command(limit_s, slices_folder, tmp_path,
     if limit_s:
         assert result["left_out"]["left_out"] == "levels"
     else:
+        assert result["on_fitted"]["baseline_profile_rmse_nm"] is not None
         assert result["left_out"] is None
         command = result["left_out_command"].split()
         assert command[:4] == ["shearloop", "evaluate", "--leave-out", "levels"]
         assert command[-4:] == recipe
+
+
+def of_the_stream(name, shared, tmp_path):
+    out = tmp_path / f"{name}.mcap"
+    import_mat([shared / "recordings/streams" / name], out)
+    return [out]
+
+
+def of_three_tools(shared, tmp_path):
+    found = []
+    for name in ("10mm_1", "20mm_1", "40mm_1"):
+        found.append(tmp_path / f"{name}.mcap")
+        import_mat(sorted((shared / "recordings/streams/cylinders").glob(f"{name}_*.mat")), found[-1])
+    return [*found, "--load-cell-delay-s", "0"]
+
+
+@pytest.mark.parametrize(
+    ("recipe", "why", "advice"),
+    [
+        (
+            lambda shared, _: [shared / "recordings/torque_slices", "--time-range", "0:0.592"],
+            "Not judged by levels left out: without slices of 74.7 mN·m",
+            "Judge it on another recording: `shearloop evaluate CAL REC`.",
+        ),
+        (
+            lambda shared, tmp_path: of_the_stream("20241202_153632", shared, tmp_path),
+            "Not judged by twists left out: there is one twist",
+            "Judge it on another recording: `shearloop evaluate CAL REC`.",
+        ),
+        (of_three_tools, "Not judged by tools left out: without the tool of 40 mm", "3 tools only: record four"),
+    ],
+    ids=["slices", "one twist", "three tools"],
+)
+def test_calibrate_ends_with_figures_and_advice_where_nothing_can_be_left_out(
+    recipe, why, advice, shared, tmp_path, ran, result_of, monkeypatch
+):
+    monkeypatch.setattr("shearloop.cli.calibrate.recording.LEFT_OUT_WITHIN_S", 1e6)
+    arguments = ["calibrate", *recipe(shared, tmp_path), "--out", tmp_path / "a.cal"]
+    *_, refused, width, advised, _written = ran(*arguments).out.splitlines()
+    assert refused.startswith(why)
+    assert "intervals of " in width
+    assert "mN·m for always 0" in width
+    assert "unknown" not in width
+    assert advised.startswith(advice)
+    figures = result_of(*arguments)
+    assert figures["left_out"] is None
+    assert figures["advice"] == advised
+    assert all(figures["on_fitted"].values())
 
 
 def test_an_interrupted_trial_says_that_the_calibration_is_written(shared, tmp_path, capsys, monkeypatch):

@@ -77,13 +77,13 @@ def test_figures_are_those_of_a_slow_loop(rows, loaded_nm):
             assert figures["valid_fraction"] == pytest.approx(n / len(chosen))
         assert figures.get("n", len(chosen)) == len(chosen)
         if n < 2:
-            assert figures["rmse_nm"] is figures["winkler_nm"] is figures["zero_rmse_nm"] is None
+            assert figures["rmse_nm"] is figures["winkler_nm"] is figures["baseline_zero_rmse_nm"] is None
             continue
         if name == "all" and min(np.ptp(judged, axis=0)[:2]) > 0:
             assert figures["r"] == pytest.approx(np.corrcoef(*np.array(judged)[:, :2].T)[0, 1])
         ends = [(truth, value - below, value + above) for truth, value, below, above in judged]
         assert figures["rmse_nm"] == pytest.approx(math.sqrt(sum((one[1] - one[0]) ** 2 for one in judged) / n))
-        assert figures["zero_rmse_nm"] == pytest.approx(math.sqrt(sum(one[0] ** 2 for one in judged) / n))
+        assert figures["baseline_zero_rmse_nm"] == pytest.approx(math.sqrt(sum(one[0] ** 2 for one in judged) / n))
         assert figures["bias_nm"] == pytest.approx(sum(one[1] - one[0] for one in judged) / n, abs=1e-12)
         assert figures["coverage_95"] == pytest.approx(sum(low <= truth <= high for truth, low, high in ends) / n)
         assert figures["interval_nm"] == pytest.approx(np.median([high - low for _, low, high in ends]), abs=1e-12)

@@ -87,7 +87,7 @@ def test_figures_are_those_of_a_slow_loop():
     assert figures["loaded"]["rmse_nm"] == pytest.approx(np.sqrt(np.mean(np.square(errors))))
     assert [one["name"] for one in figures["blocks"]] == ["a", "b"]
     evaluated = {*figures_of(result.all_tracks), *figures_by_load(result.all_tracks)}
-    assert {*figures} == evaluated | {"left_out", "blocks", "advice"}
+    assert {*figures} == evaluated | {"left_out", "blocks", "not_judged", "advice"}
     assert result.advice == "Two grips only: record three, because the gain changes from grip to grip."
     assert result.advice == sentences_of(result)[-1]
 
@@ -126,7 +126,8 @@ def test_the_first_twist_adapts_and_is_neither_fitted_nor_judged(kind, n_blocks)
     if kind == "grips":
         recordings[0] = replace(recordings[0], torque_nm=1.4 * recordings[0].torque_nm)
     names = ["a", "b"][: len(recordings)]
-    blocks = after_twists(find_blocks(kind, recordings, names), recordings, 1)
+    blocks, not_judged = after_twists(find_blocks(kind, recordings, names), recordings, 1)
+    assert not_judged == []
     assert len(blocks) == n_blocks
     for block in blocks:
         adapted = block.adapted
@@ -166,7 +167,8 @@ def test_a_tool_without_a_torque_is_named():
     diameters = tuple(Estimate(True, (), None, None, None, 12.0, 10.0, 14.0) for _ in refused.estimates)
     without = replace(refused, estimates=diameters, why_no_torque="the tool has 10 mm")
     result = LeftOut("tools", ("the tool of 20 mm", "the tool of 10 mm"), ((judged,), (without,)), "advice", "a clock")
-    assert sentences_of(result)[-2] == "No torque was estimated on the tool of 10 mm: these figures are of the others."
+    assert sentences_of(result)[-2] == "The tool of 10 mm is not judged: no torque was estimated on it."
+    assert result.figures()["not_judged"] == ["the tool of 10 mm is not judged: no torque was estimated on it"]
     assert without.between(3, 10).without_torque == 7
     assert judged.without_torque == 0
 
@@ -195,7 +197,30 @@ def test_no_twist_reaches_from_one_grip_into_the_next():
     assert (spans[6].first, spans[9].stop) == (grips[1].gripped.start, grips[1].gripped.stop)
     # The gain is adapted to the twists of the grip that is judged.
     adapted = after_twists(find_blocks("grips", [series], ["a"]), [series], 2)
-    assert [one.adapted for one in adapted] == [Span(0, 0, spans[1].stop), Span(0, grips[1].idle.start, spans[7].stop)]
+    assert [one.adapted for one in adapted.blocks] == [
+        Span(0, 0, spans[1].stop),
+        Span(0, grips[1].idle.start, spans[7].stop),
+    ]
+
+
+def test_a_block_without_a_later_twist_is_named():
+    recordings = [of_tool(10.0, 1), of_tool(12.0, 2), of_tool(14.0, 3)]
+    # The load between the twists stays, so that they count as one.
+    held = recordings[0]
+    gripped = np.abs(held.torque_nm) > 0.1 * np.abs(held.torque_nm).max()
+    between = slice(*np.flatnonzero(gripped)[[0, -1]])
+    torque_nm = held.torque_nm.copy()
+    torque_nm[between] = np.maximum(torque_nm[between], 0.3 * torque_nm.max())
+    recordings[0] = replace(held, torque_nm=torque_nm)
+    names = ["a", "b", "c"]
+    why = (
+        "is not judged: its grip has 1 twist (one ends where the load falls below a tenth), and the gain is adapted to"
+    )
+    of_twists = after_twists(find_blocks("twists", recordings, names), recordings, 2)
+    assert of_twists.not_judged == [f"twist 1 of a {why} 2 twists"]
+    result = plan_left_out("tools", RECIPE, recordings, names, adapt_twists=2).judge(SerialExecutor())
+    assert result.figures()["not_judged"] == [f"the tool of 10 mm {why} 2 twists"]
+    assert f"The tool of 10 mm {why} 2 twists." in sentences_of(result)
 
 
 def test_nothing_remains_after_as_many_twists_as_there_are():

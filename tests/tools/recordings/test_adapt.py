@@ -51,6 +51,20 @@ def test_two_twists_of_a_grip_correct_the_calibration_of_another(calibration, cy
     assert after["winkler_nm"] < before["winkler_nm"]
 
 
+def test_a_deviation_within_chance_decides_nothing(calibration, cylinder, tmp_path, ran, result_of):
+    """Twists of a recording by a calibration on its own earlier ones: the gain is right already."""
+    recording, own = cylinder("30mm_1"), tmp_path / "own.cal"
+    ran("calibrate", recording, "--time-range", "0:0.5", "--load-cell-delay-s", "0", "--out", own)
+    later = [recording, "--time-range", "0.5:0.7", "--out", tmp_path / "new.cal"]
+    out = ran("adapt", own, *later).out
+    assert "right: torque times 1.00 " in out
+    assert "The deviation may be chance; the gain is unchanged." in out
+    assert "decided" not in out
+    assert result_of("adapt", own, *later)["gain_is_unchanged"] is True
+    twists = [cylinder("30mm_2"), "--time-range", "0:0.38", "--out", tmp_path / "other.cal"]
+    assert "2 twists of known torque decided." in ran("adapt", calibration, *twists).out
+
+
 def test_twists_count_once_under_any_name_and_range(calibration, cylinder, tmp_path, ran, mistake):
     first, recording, new = cylinder("30mm_1"), cylinder("30mm_2"), tmp_path / "new.cal"
     again, renamed = ["--out", tmp_path / "again.cal"], tmp_path / "renamed.mcap"
@@ -114,6 +128,6 @@ def test_other_diameters_and_two_twists_estimate_the_torque_on_a_tool(
     ran("adapt", out, tested, "--time-range", "0:0.28", "--out", new)
     after = result_of("evaluate", new, tested, "--time-range", "0.28:1")
     # A plateau is nearly the loaded frames' root mean square.
-    assert after["rmse_nm"] < 0.2 * after["loaded"]["zero_rmse_nm"]
+    assert after["rmse_nm"] < 0.2 * after["loaded"]["baseline_zero_rmse_nm"]
     assert after["coverage_95"] >= 0.9
     assert after["frames"] * after["valid_fraction"] > 40

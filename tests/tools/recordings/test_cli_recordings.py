@@ -26,7 +26,7 @@ from shearloop.tools.evaluate import EstimateTrack, InvalidReason, draw_stream, 
 
 pytestmark = pytest.mark.usefixtures("unjudged")
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
-KEYS |= {"latency_ms_p50", "latency_ms_p99", "winkler_nm", "zero_rmse_nm", "loaded", "unloaded"}
+KEYS |= {"latency_ms_p50", "latency_ms_p99", "winkler_nm", "baseline_zero_rmse_nm", "loaded", "unloaded"}
 
 
 @pytest.mark.usefixtures("fonts")
@@ -314,7 +314,7 @@ def test_a_time_that_could_not_be_checked_is_called_probable(unsure_s, delay_s, 
     _, late, *sentences, _ = sentences_of(result)
     assert late == f"The load is {'probably ' if unsure_s else ''}stamped {when} the frames move."
     assert ("widening" in result.figures()) == bool(unsure_s) == bool(sentences)
-    assert all("so the intervals are wider, for loads 1.9 times. Record more" in one for one in sentences)
+    assert all("so the intervals of loaded frames are 1.9 times wider. Record more" in one for one in sentences)
     *_, common, few = sentences_of(replace(result, tools=[Measured(15.0, 0.0), Measured(30.0, 0.0)]))
     assert common == "The tools of 15 and 30 mm have the torque in common."
     assert few == "Diameters are not estimated: that takes recordings of three."

@@ -335,7 +335,7 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
     assert (
         "Could not verify the load cell's timestamps: the load changed too few times. They may be 0.75 s off" in printed
     )
-    assert re.search(r"intervals are wider, for loads \d\.\d times\. Record more changes of load", printed)
+    assert re.search(r"intervals of loaded frames are \d\.\d times wider\. Record more changes of load", printed)
     assert "Could not verify" not in ran(*calibrate, "--load-cell-delay-s", "0").out
     printed = result_of("calibrate", twists_file, "--sides", "left", "--out", tmp_path / "a.cal")
     assert printed["timing_uncertainty_s"] == 0

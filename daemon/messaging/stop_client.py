@@ -1,16 +1,19 @@
 """The client of the stop socket; it imports little, so that `shearloop command stop` is quick on a busy computer."""
 
+import ipaddress
 import os
 import socket
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgpack
 
 from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.errors import UserError
+
+_IpAddress: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 _LARGEST_REPLY_BYTES = 1 << 18
 # struct ucred: process, user, group.
@@ -30,16 +33,28 @@ def owners(address: str) -> set[int]:
         with suppress(OSError):
             found.add(os.stat(address.removeprefix("ipc://")).st_uid)
         return found
-    port = address.rpartition(":")[2]
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    listeners = [(ip, uid) for ip, listens_at, uid in _listeners() if str(listens_at) == port]
+    # A connection goes to the listener at this address, and only without one to a listener at all addresses. Any user
+    # may listen at another address of this computer, such as 127.0.0.2.
+    asked_ip = "127.0.0.1" if host == "localhost" else host.strip("[]")
+    at_address = {uid for ip, uid in listeners if str(ip) == asked_ip}
+    return found | (at_address or {uid for ip, uid in listeners if ip.is_unspecified})
+
+
+def _listeners() -> Iterator[tuple[_IpAddress, int, int]]:
+    """Yield address, port and user of each listening TCP socket of this computer."""
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
         with suppress(OSError), open(table, encoding="ascii") as rows:
             for row in rows:
-                # The address is IP:PORT in hexadecimal digits.
                 columns = row.split()
-                listens = len(columns) > _UID and columns[_STATE] == _LISTENS
-                if listens and port.isdecimal() and columns[_LOCAL].rpartition(":")[2] == f"{int(port):04X}":
-                    found.add(int(columns[_UID]))
-    return found
+                if len(columns) > _UID and columns[_STATE] == _LISTENS:
+                    # Both are hexadecimal digits; the address has words of 32 bits in the computer's byte order.
+                    digits, _, port = columns[_LOCAL].partition(":")
+                    words = [int(digits[begin : begin + 8], 16) for begin in range(0, len(digits), 8)]
+                    ip = ipaddress.ip_address(struct.pack(f"={len(words)}I", *words))
+                    mapped = ip.ipv4_mapped if isinstance(ip, ipaddress.IPv6Address) else None
+                    yield mapped or ip, int(port, 16), int(columns[_UID])
 
 
 def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any] | None:
@@ -65,8 +80,9 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
             _, uid, _ = _CREDENTIALS.unpack(credentials)
             if uid not in owners(address):
                 raise StopSocketTakenError(
-                    f"the stop socket of {address} is held by the user {uid}, who does not run the daemon: nothing was "
-                    "stopped by it; `sudo ss -xlp` names the process, end it and restart the daemon"
+                    f"the stop socket of {address} is held by the user {uid}, who does not run the daemon at this "
+                    "address: that it has stopped anything is not believed; `sudo ss -xlp` names the process, end it "
+                    "and restart the daemon"
                 )
     try:
         # It has no arrays; `messages.decode` would import numpy.

@@ -239,3 +239,39 @@ def test_the_owner_of_the_command_address_is_believed(tmp_path):
         os.chown(path, NOBODY, NOBODY)
         assert owners(f"ipc://{path}") == {0, NOBODY}
     assert owners(f"ipc://{tmp_path}/none") == {0, os.getuid()}
+
+
+def listener_of(user: int, host: str, port: int) -> socket.socket:
+    """Listen as another user."""
+    os.seteuid(user)
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listener = socket.socket(family)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen()
+    finally:
+        os.seteuid(0)
+    return listener
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can pose as another user")
+@pytest.mark.parametrize(
+    ("theirs", "asked", "believed"),
+    [
+        ("127.0.0.1", "127.0.0.1", True),
+        ("127.0.0.1", "localhost", True),
+        ("0.0.0.0", "127.0.0.1", True),  # noqa: S104 - a daemon with keys
+        ("::", "127.0.0.1", True),
+        ("::1", "[::1]", True),
+        ("::ffff:127.0.0.1", "127.0.0.1", True),
+        ("127.0.0.2", "127.0.0.1", False),
+        ("127.0.0.2", "localhost", False),
+        ("::1", "localhost", False),
+        ("::1", "127.0.0.1", False),
+    ],
+)
+def test_who_listens_at_another_address_of_the_same_port_is_not_believed(theirs, asked, believed):
+    port = free_port()
+    with listener_of(NOBODY, theirs, port):
+        assert (NOBODY in owners(f"tcp://{asked}:{port}")) is believed

@@ -484,8 +484,9 @@ class ControlLoop:
         if (running := self.running) is not None:
             return f"the experiment {running.file.name!r} is still running; stop it first"
         if self.safety.stopped:
-            reasons = " ".join(fault.sentence for fault in self.safety.stop_faults)
-            return f"a stop has not been acknowledged; `shearloop command unlock` does so: {reasons}"
+            first, *others = self.safety.stop_faults
+            also = f" Also: {'; '.join(fault.cause for fault in others)}." if others else ""
+            return f"{first.sentence}{also}"
         return None
 
     def start(self, file: ExperimentFile, t_ns: int) -> str | None:

@@ -57,7 +57,8 @@ class FaultCode(Enum):
     ESTIMATE_STALE = Rule(
         _HOLD,
         "no new torque has arrived: {detail}.",
-        "Check the sensor's cable and its task in `shearloop listen health`.",
+        "Check the sensor's cable and its task in `shearloop listen health`. If the wrist stopped, then "
+        "`shearloop command unlock`.",
         hold_at_most_s=5.0,
         timer="torque source",
     )
@@ -77,7 +78,8 @@ class FaultCode(Enum):
     ESTIMATE_JUMPED = Rule(
         _HOLD,
         "the torque jumped without a motion of the wrist: {detail}.",
-        "Check whether the tool slipped or the screw broke loose.",
+        "Check whether the tool slipped or the screw broke loose. If the wrist stopped, then "
+        "`shearloop command unlock`.",
         hold_at_most_s=5.0,
     )
     NOT_FOLLOWING = Rule(
@@ -101,7 +103,8 @@ class FaultCode(Enum):
     TORQUES_DISAGREE = Rule(
         _HOLD,
         "two torque measurements disagree: {detail}.",
-        "Tare both with nothing gripped; if they still disagree, calibrate again.",
+        "Tare both with nothing gripped; if they still disagree, calibrate again. If the wrist stopped, then "
+        "`shearloop command unlock`.",
         hold_at_most_s=3.0,
     )
     PROTECTIVE_STOP = Rule(
@@ -140,7 +143,8 @@ class FaultCode(Enum):
     STATE_STALE = Rule(
         _HOLD,
         "a device's state is out of date: {detail}.",
-        "It resumes with the next state; check the cable, and whether this computer is overloaded.",
+        "It resumes with the next state; check the cable, and whether this computer is overloaded. If the wrist "
+        "stopped, then `shearloop command unlock`.",
         hold_at_most_s=2.0,
     )
     DEVICE_AWAITED = Rule(
@@ -186,7 +190,8 @@ class FaultCode(Enum):
     LOOP_LATE = Rule(
         _HOLD,
         "the daemon is too slow for its devices: {detail}.",
-        "End other programs on this computer, or see the service's real-time options.",
+        "End other programs on this computer, or see the service's real-time options. If the wrist stopped, then "
+        "`shearloop command unlock`.",
         hold_at_most_s=5.0,
         is_past=True,
         explains=True,
@@ -220,7 +225,7 @@ class FaultCode(Enum):
         _KEEP, "the experiment cannot continue: {detail}.", "Clear the cause, then `shearloop command unlock`."
     )
     OPERATOR_STOP = Rule(
-        _KEEP, "the operator stopped it: {detail}.", "`shearloop command unlock` allows the next start."
+        _KEEP, "the operator stopped it: {detail}.", "Send `shearloop command unlock` before the next start."
     )
     TOOL_GRIPPED = Rule(
         Response.NOTE,
@@ -233,9 +238,7 @@ class FaultCode(Enum):
         "Angle, force and zeros of an earlier grip are not used. Check what it holds; "
         "`shearloop command release --yes` opens the gripper, and the object drops.",
     )
-    DAEMON_ENDED = Rule(
-        _KEEP, "the daemon ended: {detail}.", "Look at the rig, then `shearloop command unlock` allows the next start."
-    )
+    DAEMON_ENDED = Rule(_KEEP, "the daemon ended: {detail}.", "Look at the rig, then send `shearloop command unlock`.")
 
     @property
     def text(self) -> str:

@@ -149,7 +149,7 @@ async def test_stop_cancels_a_waiting_experiment_and_keeps_the_daemon(robotless)
         assert reply["stopped"] == "the start of loosen.yaml"
         assert (await ask(daemon, "stop", spare_daemon=True))["stopped"] == ""
         refused = await ask(daemon, "start")
-        assert "a stop has not been acknowledged" in refused["reason"]
+        assert "Send `shearloop command unlock` before the next start." in refused["reason"]
 
 
 async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, monkeypatch):

@@ -229,7 +229,8 @@ def test_a_reason_to_wait_with_the_start_does_not_ask_for_a_start(code):
 
 @pytest.mark.parametrize("code", FaultCode)
 def test_the_cure_of_a_stop_names_the_command_that_allows_the_next_start(code):
-    stops = code.value.response >= Response.STOP_AND_KEEP_GRIP
+    # A hold that lasts too long becomes a stop.
+    stops = code.value.response >= Response.STOP_AND_KEEP_GRIP or code.value.hold_at_most_s is not None
     # These two only delay a start.
     if stops and code not in {FaultCode.DEVICE_AWAITED, FaultCode.ROBOT_STARTING}:
         assert "`shearloop command unlock`" in code.value.cure

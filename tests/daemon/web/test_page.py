@@ -181,7 +181,7 @@ def test_lines_break_at_invalid_values_and_continue_past_other_sources(browsed):
 
 
 def test_a_persons_own_stop_is_no_error(browsed):
-    cause = "the operator stopped it: `shearloop command`. `shearloop command unlock` allows the next start."
+    cause = "the operator stopped it: `shearloop command`. Send `shearloop command unlock` before the next start."
     stopped = {"phase": "stopped", "response": "stop and keep grip", "cause": cause, "reasons": cause}
     browsed.daemon.say(loop={**stopped, "faults": "operator stop"})
     browsed.open()

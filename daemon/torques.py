@@ -81,7 +81,7 @@ class SensorListener(Protocol):
         """Take the return or the loss of a device, with a sentence."""
 
     def on_torque(self, torque: TorqueSample) -> None:
-        """Take a torque of any source."""
+        """Accept a torque sample from any source."""
 
     def on_zero(self, source: str, *, known: bool = True) -> None:
         """Take that a source's zero is known from now on, or is not."""
@@ -102,7 +102,7 @@ class LatestTorques:
             self._torques_nm.clear()
 
     def on_torque(self, torque: TorqueSample) -> None:
-        """Take a torque of any source."""
+        """Accept a torque sample from any source."""
         if torque.torque_nm is None:
             self._torques_nm.pop(torque.source, None)
         else:

@@ -166,7 +166,7 @@ class ControlLoop:
         return self.experiment if self.experiment is not None and self.experiment.running else None
 
     def on_torque(self, torque: TorqueSample) -> None:
-        """Take a torque of any source."""
+        """Accept a torque sample from any source."""
         creep = self._creep.get(torque.source)
         if creep is not None and torque.torque_nm is not None:
             torque = replace(torque, torque_nm=creep.torque_nm(torque.torque_nm, torque.t_mid_ns))
@@ -354,8 +354,8 @@ class ControlLoop:
     def release_question(self) -> str:
         """Return what a release does now, for the operator who confirms it."""
         gripper = self.inputs.gripper
-        width = f"its fingers are {gripper.width_mm:.1f} mm apart" if gripper is not None else "its width is unknown"
-        what = self.held or f"{width}, and it does not say that it holds something"
+        apart = f"its fingers are {gripper.width_mm:.0f} mm apart" if gripper is not None else "its width is unknown"
+        what = self.held or f"the gripper reports no object, and {apart}"
         renewed = "; it is activated first: the fingers open and close once" if self._activates() else ""
         return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
 

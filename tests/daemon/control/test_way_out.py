@@ -73,7 +73,7 @@ async def test_a_release_whose_question_has_changed_opens_nothing():
         await cell.cycles(5)
         release = commands_of(cell)["release"]
         asked = await release({"ask": True})
-        assert "it does not say that it holds something" in asked["question"]
+        assert "the gripper reports no object, and its fingers are 140 mm apart" in asked["question"]
         cell.holding = True
         await cell.cycles(5)
         with pytest.raises(CommandRefusedError, match=r"changed since the question.* hold something") as refused:

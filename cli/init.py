@@ -29,9 +29,13 @@ def run(args: argparse.Namespace) -> int:
     if present := [args.folder / path for path in files if (args.folder / path).exists()]:
         raise UserError(f"{present[0]} exists: nothing was written; choose another folder")
     write_files(args.folder, files)
-    rig = args.folder / "rig.yaml"
-    print(f"{rig}: edit it, then run `shearloop check {shlex.quote(str(rig))}`")
-    print(f"{args.folder / 'ur.yaml'}: set the robot's address, its payload and every limit")
+    rig, settings = args.folder / "rig.yaml", args.folder / "ur.yaml"
+    described, bank = args.folder / "banks" / "paper.yaml", args.folder / "paper.bank"
+    build = shlex.join(["shearloop", "bank", "build", "--config", str(described), "--out", str(bank)])
+    print(f"{rig}: name your boards, and take out what you do not have")
+    print(f"{settings}: set the robot's address, its payload and every limit")
+    print(f"Then build the bank that rig.yaml names, which takes some seconds: `{build}`")
+    print(f"Then check all files: `{shlex.join(['shearloop', 'check', str(rig)])}`")
     return 0
 
 

@@ -19,7 +19,7 @@ DAEMON_COMMANDS = {
     "pause": "hold the arm until `resume`; moving fingers finish their move",
     "resume": "continue after `pause`",
     "stop": "stop the experiment and the arm; without an experiment, stop the daemon",
-    "release": "open the gripper, also after a stop: a tool in it drops; needs --yes",
+    "release": "open the gripper, and a tool drops; or count a clamped one's angle anew; after a stop too; needs --yes",
     "unlock": "allow motion again after a stop, when no person is within reach; --yes where it opens the gripper",
 }
 
@@ -47,7 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", choices=DAEMON_COMMANDS, metavar="COMMAND", help="one of the commands below")
     parser.add_argument("--source", metavar="NAME", help="for tare: name of the sensor (default: all)")
     add_option(parser, "--experiment", Path, "FILE", "for start (default: that of the configuration)")
-    yes = "for release and unlock: the tool may drop; for tare: nothing is held"
+    yes = "for release and unlock: the tool may drop, or is another one; for tare: nothing is held"
     parser.add_argument("--yes", action="store_true", help=yes)
     add_connection(parser, addresses.COMMAND_ADDRESS, "the daemon's command address")
     default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for {', '.join(addresses.SLOW)} {addresses.UNLOCK_TIMEOUT_S:g} s"

@@ -94,7 +94,9 @@ class Remembered:
         """Give the stored state to a new control loop; a restored stop keeps the grip, even if it had opened it."""
         for fault in self.faults:
             loop.safety.stop(fault)
-        if self.grips:
+        if not loop.has_gripper:
+            loop.restore_clamped(self.origin_rad)
+        elif self.grips:
             loop.restore_grip(self.grip, on_judged)
 
 
@@ -132,6 +134,9 @@ class RigMemory:
         elsewhere = (*files.other_states, *files.lapsed_states)
         if len(files.states) == 1 and not any(path.exists() for path in elsewhere):
             self._written = remembered
+        if not self.loop.has_gripper:
+            # Zeros are kept for a grip alone.
+            return
         # Until the gripper answers, its grip counts as the one before.
         cell, zero = self.load_cell, remembered.load_zero
         if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:

@@ -95,7 +95,7 @@ class ActionExecutor:
         await self._by_operator("unlock", "unlocking", partial(self._unlock, confirmed=confirmed))
 
     async def open_by_operator(self) -> None:
-        """Open the gripper while no experiment runs; raises DriverError and ActionError."""
+        """Open the gripper, if there is one, while no experiment runs; raises DriverError and ActionError."""
         await self._by_operator("release", "the release", self._open)
 
     async def _by_operator(self, command: str, name: str, act: Callable[[], Coroutine[Any, Any, None]]) -> None:
@@ -111,7 +111,7 @@ class ActionExecutor:
 
     async def _open(self) -> None:
         if self.gripper is None:
-            raise ActionError("no gripper is configured; add a `gripper` section to the configuration")
+            return
         self.fingers_move = True
         await self.gripper.open_by_operator()
         self.fingers_move = False

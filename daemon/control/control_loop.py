@@ -291,19 +291,28 @@ class ControlLoop:
             self._gripped.grip = NO_GRIP
 
     @property
+    def has_gripper(self) -> bool:
+        """Whether a gripper of ours holds the tool; without one it is clamped by other means."""
+        return "gripper" in self._watched.required
+
+    @property
     def grip(self) -> Grip:
-        """What is known of the present grip."""
+        """What is known of the present grip; of a clamped tool the angle alone."""
         return self._gripped.grip
 
     def restore_grip(self, grip: Grip, on_judged: OnJudged) -> None:
         """Take the grip that a process before this one has closed, until the gripper shows whether it still has it."""
         self._gripped.grip, self._gripped.is_earlier, self._on_judged = grip, True, on_judged
 
+    def restore_clamped(self, origin_rad: float | None) -> None:
+        """Take where a process before this one began to count the angle of the clamped tool."""
+        self._gripped.grip = Grip(origin_rad)
+
     @property
     def held(self) -> str | None:
         """The object between the fingers, with its width and the force of the grip, or None."""
         gripper, force_n = self.inputs.gripper, self._gripped.grip.force_n
-        if "gripper" not in self._watched.required or gripper is None or not gripper.holding:
+        if not self.has_gripper or gripper is None or not gripper.holding:
             return None
         known = force_n is not None and gripper.others_requests == self._others_requests
         force = f"with at most {force_n:g} N" if known else "with an unknown force"
@@ -332,7 +341,7 @@ class ControlLoop:
 
     def may_hold(self) -> bool:
         """Return whether the gripper holds something, or does not know; a grip of an earlier process counts."""
-        if "gripper" not in self._watched.required:
+        if not self.has_gripper:
             return False
         gripper = self.inputs.gripper
         if gripper is None:
@@ -343,8 +352,8 @@ class ControlLoop:
         """Return why the operator cannot open the gripper now, or None; the arm is not asked."""
         if (running := self.running) is not None:
             return f"the experiment {running.file.name!r} is running; stop it first"
-        if "gripper" not in self._watched.required:
-            return "no gripper is configured; add a `gripper` section to the configuration"
+        if not self.has_gripper:
+            return None
         gripper = self.inputs.gripper
         if gripper is None or "gripper" in self.inputs.lost:
             reason = self.inputs.lost.get("gripper", "it has not answered yet")
@@ -353,6 +362,10 @@ class ControlLoop:
 
     def release_question(self) -> str:
         """Return what a release does now, for the operator who confirms it."""
+        if not self.has_gripper:
+            present = f"at present {turned}" if (turned := self._clamped_turn()) else "no angle counts at present"
+            anew = "the angle of the clamped tool counts anew from the next start"
+            return f"nothing opens, because no gripper is configured; {anew}; {present}"
         gripper = self.inputs.gripper
         apart = f"its fingers are {gripper.width_mm:.0f} mm apart" if gripper is not None else "its width is unknown"
         what = self.held or f"the gripper reports no object, and {apart}"
@@ -387,8 +400,19 @@ class ControlLoop:
             return ""
         return f" Before step {first[0]} the gripper is activated: its fingers open and close once, and a tool drops."
 
+    def _clamped_turn(self) -> str:
+        """Return how far a clamped tool is turned, as a sentence; empty where no angle counts."""
+        arm, origin_rad = self.inputs.arm, self._gripped.grip.origin_rad
+        if arm is None or origin_rad is None:
+            return ""
+        return f"it is turned by {arm.wrist_rad - origin_rad:+.3f} rad"
+
     def held_note(self, file: ExperimentFile) -> str:
-        """Return what the gripper holds as the first step moves, for the operator's question; or an empty string."""
+        """Return what is held as an experiment begins to turn it, for the operator's question; or an empty string."""
+        if not self.has_gripper:
+            turned = self._clamped_turn()
+            anew = "if another tool is clamped, `shearloop command release --yes` lets its angle count anew"
+            return f" At present the clamped tool's angle counts on: {turned}; {anew}." if turned else ""
         held, unknown, first = self.held, self._unknown_grip, first_gripper_step(file)
         # A `grip` closes tighter on what is held, and its angle stays as unknown as it is.
         turns = first_motion_before_grip(file) is not None
@@ -471,7 +495,7 @@ class ControlLoop:
     def _loaded(self) -> str:
         """Return which sensor measures a load that does not come from its drift, or an empty string."""
         # Fingers that are known to be empty do not load a fingertip: its torque is drift.
-        empty = "gripper" in self._watched.required and self.inputs.gripper is not None
+        empty = self.has_gripper and self.inputs.gripper is not None
         judged = {
             name: latest.torque_nm
             for name, latest in self.inputs.torques.items()
@@ -569,7 +593,7 @@ class ControlLoop:
             another=before.another,
             unmeasured_since_ns=t_ns,
             # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
-            expected="gripper" not in self._watched.required or (gripper is not None and gripper.holding),
+            expected=not self.has_gripper or (gripper is not None and gripper.holding),
             release_error=before.release_error,
         )
 
@@ -653,7 +677,7 @@ class ControlLoop:
     def _why_uncertain(self) -> str | None:
         """Return why the gripper cannot say whether it holds a tool, or None."""
         hand = self.inputs.gripper
-        if "gripper" not in self._watched.required or hand is None or not (hand.uncertain or hand.moving):
+        if not self.has_gripper or hand is None or not (hand.uncertain or hand.moving):
             return None
         doubt = "are moving" if hand.moving else "stand where a stop, an activation or a lack of power has left them"
         return f"the gripper does not know whether it holds a tool: its fingers, {hand.width_mm:.1f} mm apart, {doubt}"

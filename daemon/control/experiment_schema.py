@@ -68,7 +68,9 @@ class ExperimentLimits(ConfigModel):
     """Limits of all steps; a step's limits can only be tighter."""
 
     torque_nm: ranges.TorqueLimit = Field(default=CAPPED_NM, description="a larger torque stops the motion")
-    angle_rad: ranges.Turn = Field(default=3.2, description="from the angle at which the tool was gripped")
+    angle_rad: ranges.Turn = Field(
+        default=3.2, description="from the angle at the grip, or at the first start with a clamped tool"
+    )
 
 
 class _Step(ConfigModel):

@@ -78,7 +78,11 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
                 beyond += f" and its noise {source.noise_nm:g} N·m"
             found.append(Fault(FaultCode.TORQUE_LIMIT, beyond, t_ns=torque.t_mid_ns))
     if watched.grasp is Grasp.HELD and abs(watched.twisted_rad) > limit_rad:
-        turned = f"turned by {watched.twisted_rad:+.3f} rad since the grip, the limit is {limit_rad:g} rad"
+        clamped = "gripper" not in watched.required
+        since = "its angle began to count" if clamped else "the grip"
+        turned = f"turned by {watched.twisted_rad:+.3f} rad since {since}, the limit is {limit_rad:g} rad"
+        if clamped:
+            turned += "; where another tool has been clamped, `shearloop command release --yes` lets it count anew"
         found.append(Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None))
     found += _device_faults(inputs, watched, t_ns)
     for name, reason in inputs.died.items():

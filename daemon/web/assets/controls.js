@@ -185,6 +185,6 @@ function refusals(link) {
     pause: idle || (phase === "paused" ? "it is paused" : ""),
     resume: idle || (phase === "running" ? "nothing is paused" : ""),
     unlock: busy || (locked ? "" : "nothing is locked"),
-    release: busy || (link.get("gripper.state") ? health?.release_refusal ?? "" : "no gripper answers"),
+    release: busy || (health?.release_refusal ?? ""),
   };
 }

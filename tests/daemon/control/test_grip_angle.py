@@ -5,10 +5,15 @@ from typing import Any
 
 import pytest
 
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import Grip
-from tests.daemon.control.loop_rig import GRIP, Rig, new_loop, phase, started, stop
+from shearloop.daemon.rig_memory import RigMemory
+from shearloop.daemon.robot_files import RobotFiles
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell
+from tests.daemon.control.cell import TWIST, driven
+from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
 
 TWIST_AGAIN = {"do": "twist", "angles_rad": [0.25], "return_to_start": False, "speed_rad_per_s": 0.2, "hold_s": 0.1}
 TWISTED = {"limits": {"angle_rad": 0.3, "torque_nm": 0.5}, "torque_source": "load_cell"}
@@ -108,3 +113,86 @@ def test_the_question_before_a_tighter_grip_says_that_the_angle_is_not_known():
     assert "its angle counts from the start" in rig.control_loop.held_note(tighter)
     assert rig.control_loop.held_note(after_release) == ""
     assert twisted().control_loop.held_note(tighter) == "", "its angle goes on"
+
+
+FILES = RobotFiles("192.168.1.10", ("192.168.1.10",))
+
+
+def clamped_rig() -> Rig:
+    """Return a rig without a gripper, with a tool clamped to the wrist."""
+    rig = Rig(ControlLoop(CONFIG, {"right": EIT, "load_cell": LOAD}, ("right",)))
+    rig.force_n, rig.silent = 60.0, {"hand"}
+    return rig
+
+
+def turn_to_limit(rig: Rig) -> float:
+    """Run the twist by 0.25 of 0.3 rad once more, and return how far the wrist has turned in it."""
+    begun_rad = rig.wrist_rad
+    started(rig, TWIST_AGAIN, **TWISTED)
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    return rig.wrist_rad - begun_rad
+
+
+def test_the_angle_of_a_clamped_tool_goes_on_from_start_to_start_until_another_one_is_clamped():
+    rig = clamped_rig()
+    assert turn_to_limit(rig) == pytest.approx(0.25, abs=0.01)
+    assert turn_to_limit(rig) == pytest.approx(0.0, abs=0.01)
+    file = ExperimentFile.model_validate({"name": "test", "steps": [TWIST_AGAIN]})
+    assert "it is turned by +0.249 rad; if another tool is clamped, `shearloop command" in rig.control_loop.held_note(
+        file
+    )
+    rig.wrist_rad += 0.1
+    started(rig, TWIST_AGAIN, **TWISTED)
+    rig.run(1)
+    assert "`shearloop command release --yes` lets it count anew" in rig.control_loop.experiment.stop_reason
+    rig.control_loop.acknowledge()
+    assert rig.control_loop.release_refusal() is None
+    assert "nothing opens, because no gripper is configured; the angle of" in rig.control_loop.release_question()
+    rig.control_loop.on_release_ended()
+    assert rig.control_loop.held_note(file) == ""
+    assert turn_to_limit(rig) == pytest.approx(0.25, abs=0.01)
+
+
+async def test_the_angle_of_a_clamped_tool_outlives_the_process():
+    before = clamped_rig()
+    memory = RigMemory(FILES, before.control_loop)
+    turn_to_limit(before)
+    await memory.save_present()
+    after = clamped_rig()
+    after.wrist_rad = before.wrist_rad
+    RigMemory(FILES, after.control_loop)
+    assert turn_to_limit(after) == pytest.approx(0.0, abs=0.01)
+    after.control_loop.on_release_ended()
+    memory = RigMemory(FILES, after.control_loop)
+    assert after.control_loop.grip == before.control_loop.grip, "what is on the disk counts"
+    after.control_loop.on_release_ended()
+    await memory.save_present()
+    again = clamped_rig()
+    RigMemory(FILES, again.control_loop)
+    assert not again.control_loop.grip.known
+
+
+async def test_a_daemon_that_has_lost_its_gripper_keeps_the_angle_and_none_of_the_zeros():
+    """The tool may still be in the gripper that the configuration does not name."""
+    before = twisted()
+    cell = LoadCell(None, LoadCalibration(tare_counts=8321.5, scale_n_per_count=0.001))
+    memory = RigMemory(FILES, before.control_loop, cell)
+    before.control_loop.on_zero("load_cell")
+    await memory.save_present()
+    after, cell = clamped_rig(), LoadCell(None, LoadCalibration(tare_counts=8000.0, scale_n_per_count=0.001))
+    after.wrist_rad = before.wrist_rad
+    RigMemory(FILES, after.control_loop, cell)
+    assert cell.calibration.tare_counts == 8000.0
+    assert after.control_loop.grip == Grip(before.control_loop.grip.origin_rad)
+
+
+async def test_the_operator_says_that_another_tool_is_clamped():
+    async with driven(TWIST, cycles=60) as cell:
+        cell.runner.actions.gripper = None
+        assert await cell.runner.release() is not None, "an experiment runs"
+        cell.runner.stop()
+        await cell.cycles(50)
+        assert cell.control_loop.grip.known
+        assert await cell.runner.release() is None
+        assert not cell.control_loop.grip.known

@@ -228,8 +228,10 @@ def test_fingers_that_move_at_the_restart_are_judged_once_they_stand(restarted):
     exchange(rig, "another request")
     rig.force_n = 0.0
     rig.hand = replace(rig.hand, moving=True)
-    rig.run(0.1)
+    rig.run(0.6)
     assert restarted.zeros == KEPT
+    next_file = ExperimentFile.model_validate({"name": "next", "steps": [WAIT]})
+    assert "the fingers move, and an earlier daemon had gripped" in (rig.control_loop.start(next_file, rig.t_ns) or "")
     rig.force_n = 60.0
     rig.hand = replace(rig.hand, moving=False)
     rig.run(0.1)

@@ -3,11 +3,13 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from itertools import pairwise
 from typing import NamedTuple
 
 from shearloop.daemon.commissioning import Commissioning, MotionCap
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_schema import (
+    SIGNS,
     AdaptStep,
     ApproachStep,
     Direction,
@@ -37,49 +39,97 @@ _ROUNDING = 1e-9
 
 
 class Turn(NamedTuple):
-    """What a step turns: the direction of its first turn, and of the turn that it leaves; None for none, or unknown.
+    """What a step turns: the direction of its first turn, and of its last one; None for none, or unknown.
 
-    `low_rad` and `high_rad` bound the angle since the grip after the step; infinite where it is unknown.
+    `loads` is the direction of the torque or the angle that it leaves, None where that is as before. `low_rad` and
+    `high_rad` bound the angle since the grip after the step; infinite where it is unknown.
     """
 
     begins: Direction | None
     leaves: Direction | None
+    loads: Direction | None
     low_rad: float
     high_rad: float
 
 
+class _Bounds(NamedTuple):
+    """The least and the largest value that an angle or a torque of the tool may have; counterclockwise is positive."""
+
+    low: float
+    high: float
+
+    def way_to(self, value: float) -> Direction | None:
+        """Return the direction of the turn to another value; None where nothing turns, or the direction is unknown."""
+        if self.low < value < self.high:
+            return None
+        return direction_of((value - self.low) + (value - self.high))
+
+    def turned(self, direction: Direction | None) -> "_Bounds":
+        """Return the bounds after a turn of unknown extent: a turn raises or lowers angle and torque alike."""
+        match direction:
+            case "clockwise":
+                return _Bounds(-math.inf, self.high)
+            case "counterclockwise":
+                return _Bounds(self.low, math.inf)
+        return _UNKNOWN
+
+
+_UNTURNED, _UNKNOWN = _Bounds(0.0, 0.0), _Bounds(-math.inf, math.inf)
+
+
 def turns(file: ExperimentFile) -> Iterator[Turn]:
     """Yield what each step turns."""
-    low_rad = high_rad = 0.0
+    angle_rad = torque_nm = _UNTURNED
+    # Whether a tool may be held: a `grip` then closes tighter on it, and its angle goes on.
+    held = False
     for step in file.steps:
         begins: Direction | None = None
         leaves: Direction | None = None
+        loads: Direction | None = None
         match step:
+            case GripStep() if held:
+                pass
             case GripStep() | ReleaseStep():
-                low_rad = high_rad = 0.0
+                angle_rad = torque_nm = _UNTURNED
             case TightenStep(direction=direction):
-                begins = leaves = direction
-                low_rad -= step.until_angle_rad if direction == "clockwise" else 0.0
-                high_rad += step.until_angle_rad if direction == "counterclockwise" else 0.0
-            case HoldTorqueStep(signed_torque_nm=torque_nm):
-                begins = leaves = direction_of(torque_nm)
-                # The tool lies on the side of its torque, however far.
-                low_rad, high_rad = (-math.inf if torque_nm <= 0 else 0.0), (math.inf if torque_nm >= 0 else 0.0)
+                begins = leaves = loads = direction
+                sign = SIGNS[direction]
+                turned_rad = sign * step.until_angle_rad
+                angle_rad = _Bounds(angle_rad.low + min(0.0, turned_rad), angle_rad.high + max(0.0, turned_rad))
+                # As it is meant to end.
+                torque_nm = _Bounds(sign * step.until_torque_nm, sign * step.until_torque_nm)
+            case HoldTorqueStep(signed_torque_nm=asked_nm):
+                begins = leaves = torque_nm.way_to(asked_nm)
+                loads = direction_of(asked_nm)
+                if torque_nm != (asked_nm, asked_nm):
+                    angle_rad = angle_rad.turned(begins)
+                torque_nm = _Bounds(asked_nm, asked_nm)
             case TwistStep(absolute=False, angles_rad=angles_rad):
-                begins = _turn_to(angles_rad[0], low_rad, high_rad)
+                begins = angle_rad.way_to(angles_rad[0])
                 if not step.return_to_start:
-                    leaves = _turn_to(angles_rad[-1], low_rad, high_rad)
-                    low_rad = high_rad = angles_rad[-1]
-            case TwistStep() | TurnToStep():
-                low_rad, high_rad = -math.inf, math.inf
-        yield Turn(begins, leaves, low_rad, high_rad)
+                    leaves = _last_way(angles_rad) or begins
+                    loads = direction_of(angles_rad[-1])
+                    if angle_rad != (angles_rad[-1], angles_rad[-1]):
+                        torque_nm = torque_nm.turned(begins if len(angles_rad) == 1 else None)
+                    angle_rad = _Bounds(angles_rad[-1], angles_rad[-1])
+            case TwistStep(return_to_start=True):
+                pass
+            case TwistStep(angles_rad=angles_rad):
+                leaves = _last_way(angles_rad)
+                angle_rad = torque_nm = _UNKNOWN
+            case TurnToStep():
+                angle_rad = torque_nm = _UNKNOWN
+        if isinstance(step, GripStep | TwistingStep):
+            held = True
+        elif isinstance(step, ReleaseStep):
+            held = False
+        yield Turn(begins, leaves, loads, *angle_rad)
 
 
-def _turn_to(angle_rad: float, low_rad: float, high_rad: float) -> Direction | None:
-    """Return the direction from any angle between two ends to another angle; None where it is unknown."""
-    if low_rad <= angle_rad <= high_rad and low_rad < high_rad:
-        return None
-    return direction_of(angle_rad - (low_rad if angle_rad < low_rad else high_rad))
+def _last_way(angles_rad: Sequence[float]) -> Direction | None:
+    """Return the direction of the last turn from angle to angle; None where all are one."""
+    ways = [direction_of(later - earlier) for earlier, later in pairwise(angles_rad)]
+    return next((way for way in reversed(ways) if way is not None), None)
 
 
 class Reversal(NamedTuple):
@@ -100,15 +150,23 @@ class Reversal(NamedTuple):
 
 
 def reversals(file: ExperimentFile) -> Iterator[Reversal]:
-    """Yield each step that turns the tool against the turn that the steps before have left in this grip."""
-    left: tuple[int, Direction] | None = None
+    """Yield each step that turns the tool back in its grip: against the last turn, or to the other side.
+
+    With torques of 0.1, 0 and -0.1 N·m the second and the third step do.
+    """
+    # The last turn, and the last one that loaded the tool further.
+    turned: tuple[int, Direction] | None = None
+    loaded: tuple[int, Direction] | None = None
     for number, (step, turn) in enumerate(zip(file.steps, turns(file), strict=True), 1):
-        if isinstance(step, GripperStep):
-            left = None
-        if turn.begins is not None and left is not None and turn.begins != left[1]:
-            yield Reversal(number, turn.begins, *left)
+        if isinstance(step, ReleaseStep):
+            turned = loaded = None
+        if turn.begins is not None and turned is not None and turn.begins != turned[1]:
+            yield Reversal(number, turn.begins, *turned)
+        elif turn.begins is not None and loaded is not None and turn.begins == turn.loads != loaded[1]:
+            yield Reversal(number, turn.begins, *loaded)
         if turn.leaves is not None:
-            left = number, turn.leaves
+            turned = number, turn.leaves
+            loaded = turned if turn.leaves == turn.loads else loaded
 
 
 def too_noisy(source: str, noise_nm: float, limit_nm: float) -> str:
@@ -183,16 +241,22 @@ def _forgets_tool(step: Step, torque_source: str) -> bool:
 
 
 def _undoing(file: ExperimentFile) -> Iterator[Mistake]:
-    """Yield each torque that undoes a `tighten`, where only its sign says so."""
-    for back in reversals(file):
-        step, before = file.steps[back.number - 1], file.steps[back.before - 1]
-        if isinstance(before, TightenStep) and isinstance(step, HoldTorqueStep) and step.direction is None:
-            yield (
-                ("steps", back.number - 1),
-                f"hold_torque turns {back.direction} by the sign of its torque_nm, and undoes step {back.before}, "
-                f"tighten {back.direction_before}; write `direction: {back.direction_before}`, or "
-                f"`direction: {back.direction}` if it is meant",
-            )
+    """Yield each torque against the last `tighten` of its grip, where only its sign says so."""
+    tightened: tuple[int, Direction] | None = None
+    for number, step in enumerate(file.steps, 1):
+        match step:
+            case ReleaseStep():
+                tightened = None
+            case TightenStep(direction=direction):
+                tightened = number, direction
+            case HoldTorqueStep(direction=None, torque_nm=torque_nm) if tightened is not None:
+                before, direction, back = *tightened, direction_of(torque_nm)
+                if back not in (None, direction):
+                    yield (
+                        ("steps", number - 1),
+                        f"hold_torque turns {back} by the sign of its torque_nm, and undoes step {before}, "
+                        f"tighten {direction}; write `direction: {direction}`, or `direction: {back}` if it is meant",
+                    )
 
 
 def check_devices(

@@ -259,7 +259,7 @@ def test_a_steps_limits_change_only_what_they_name(own, torque_nm, angle_rad):
 
 
 GRIP, TIGHTEN = {"do": "grip"}, {"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": 2.0}
-HOLD, TWIST = {"do": "hold_torque", "torque_nm": 0.08}, {"do": "twist"}
+HOLD, TWIST, RELEASE = {"do": "hold_torque", "torque_nm": 0.08}, {"do": "twist"}, {"do": "release"}
 CLOCKWISE, COUNTERCLOCKWISE = {"direction": "clockwise"}, {"direction": "counterclockwise"}
 
 
@@ -286,7 +286,37 @@ def test_a_turn_of_unknown_or_twofold_direction_is_refused(step):
     ("steps", "found"),
     [
         ([GRIP, {**TIGHTEN, **CLOCKWISE}, HOLD], [(3, "counterclockwise", 2, "clockwise")]),
-        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**HOLD, **CLOCKWISE}], []),
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**HOLD, "torque_nm": 0.1, **CLOCKWISE}], []),
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**HOLD, "torque_nm": 0.12, **CLOCKWISE}], []),
+        # A smaller torque turns the tool back, and none does.
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**HOLD, **CLOCKWISE}], [(3, "counterclockwise", 2, "clockwise")]),
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**HOLD, "torque_nm": 0.0}], [(3, "counterclockwise", 2, "clockwise")]),
+        ([GRIP, HOLD, {**HOLD, "torque_nm": 0.0}, {**HOLD, "torque_nm": -0.08}],
+         [(3, "clockwise", 2, "counterclockwise"), (4, "clockwise", 2, "counterclockwise")]),
+        ([GRIP, HOLD, {**HOLD, "torque_nm": 0.05}, {**HOLD, "torque_nm": 0.02}],
+         [(3, "clockwise", 2, "counterclockwise")]),
+        ([GRIP, HOLD, {**HOLD, "torque_nm": 0.02}, {**HOLD, "torque_nm": 0.05}],
+         [(3, "clockwise", 2, "counterclockwise"), (4, "counterclockwise", 3, "clockwise")]),
+        # Only a release ends a grip: another `grip` closes tighter on the tool.
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, GRIP, {**TIGHTEN, **COUNTERCLOCKWISE}],
+         [(4, "counterclockwise", 2, "clockwise")]),
+        ([GRIP, {**TWIST, "angles_rad": [0.2], "return_to_start": False}, GRIP, {**TWIST, "angles_rad": [0.1]}],
+         [(4, "clockwise", 2, "counterclockwise")]),
+        ([{**TIGHTEN, **CLOCKWISE}, GRIP, HOLD], [(3, "counterclockwise", 1, "clockwise")]),
+        ([{"do": "turn_to", "angle_rad": 1.0}, GRIP, {**TWIST, "angles_rad": [0.1]}, HOLD], []),
+        # The tool may stand anywhere up to the angle of its grip.
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**TWIST, "angles_rad": [0.0], "return_to_start": False}],
+         [(3, "counterclockwise", 2, "clockwise")]),
+        ([GRIP, HOLD, {**TWIST, "angles_rad": [0.0]}], [(3, "clockwise", 2, "counterclockwise")]),
+        # What turned a screw has no place of its own in the grip.
+        ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**HOLD, **COUNTERCLOCKWISE}, {**TWIST, "angles_rad": [-0.5]}],
+         [(3, "counterclockwise", 2, "clockwise")]),
+        # The last turn counts, and a torque that is not known may be larger or smaller.
+        ([GRIP, {**TWIST, "angles_rad": [0.2, 0.1], "return_to_start": False}, {**TWIST, "angles_rad": [0.15]}],
+         [(3, "counterclockwise", 2, "clockwise")]),
+        ([GRIP, {**TWIST, "angles_rad": [0.2], "return_to_start": False}, HOLD], []),
+        ([GRIP, {**TWIST, "angles_rad": [0.2], "return_to_start": False}, {**HOLD, "torque_nm": -0.08}],
+         [(3, "clockwise", 2, "counterclockwise")]),
         ([GRIP, {**TIGHTEN, **CLOCKWISE}, {"do": "release"}, GRIP, HOLD], []),
         ([GRIP, {**TIGHTEN, **CLOCKWISE}, {**TIGHTEN, **COUNTERCLOCKWISE}], [(3, "counterclockwise", 2, "clockwise")]),
         ([GRIP, HOLD, {**HOLD, "torque_nm": -0.08}, HOLD], [(3, "clockwise", 2, "counterclockwise"),
@@ -321,3 +351,11 @@ def test_a_torque_that_undoes_a_tightening_by_its_sign_alone_is_refused(tighten,
     mistakes = [text for place, text in check_steps(file) if place == ("steps", 3)]
     assert len(mistakes) == refused
     assert not refused or f"write `direction: {tighten['direction']}`" in mistakes[0]
+
+
+@pytest.mark.parametrize(("between", "refused"), [({**HOLD, "torque_nm": 0.0}, True), (GRIP, True), (RELEASE, False)])
+def test_what_comes_between_a_tightening_and_its_undoing_forgives_nothing_but_a_release(between, refused):
+    steps = [GRIP, {**TIGHTEN, **CLOCKWISE}, between, {"do": "identify"}, HOLD]
+    file = ExperimentFile.model_validate({"name": "one", "steps": steps})
+    undoing = [text for _, text in check_steps(file) if "undoes step 2, tighten clockwise" in text]
+    assert len(undoing) == refused

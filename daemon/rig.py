@@ -102,6 +102,14 @@ def open_settings(config: DaemonConfig) -> UrSettings | None:
     return with_emulated_deadlines(settings) if is_patient(config) else settings
 
 
+def keeps_memory(config: DaemonConfig) -> bool:
+    """Return whether stops and grips outlive the process, as the devices do.
+
+    Devices that a process emulates end with it, and with them every grip and stop.
+    """
+    return not (config.autostart or (config.emulated and bool(config.emulators)))
+
+
 def with_emulated_deadlines(settings: UrSettings) -> UrSettings:
     """Return the settings of an emulated robot, with deadlines that fit a busy computer."""
     return replace(
@@ -307,9 +315,7 @@ def build_rig(
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning)
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
-    # Devices that this process emulates end with it, and with them every grip and stop.
-    ends_with_us = config.autostart or (config.emulated and bool(config.emulators))
-    memory = None if ends_with_us else RigMemory(files, loop, sensors.load_cell, robot)
+    memory = RigMemory(files, loop, sensors.load_cell, robot) if keeps_memory(config) else None
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
     if memory is not None:
         tasks["memory"] = memory

@@ -68,6 +68,22 @@ class Remembered:
         return self.grip != NO_GRIP or self.load_zero is not None or self.wrench_zero is not None
 
     @property
+    def held(self) -> str:
+        """What is known of a tool that may be held, without a capital letter and a full stop; empty without a grip."""
+        if not self.grips:
+            return ""
+        known = [
+            text.format(value)
+            for text, value in (
+                ("gripped with at most {:g} N", self.force_n),
+                ("{:.1f} mm wide", self.width_mm),
+                ("its angle counts from {:.3f} rad of wrist 3", self.origin_rad),
+            )
+            if value is not None
+        ]
+        return ", ".join(["a tool may be in the fingers", *known])
+
+    @property
     def faults(self) -> tuple[Fault, ...]:
         """The faults of the stop that waits for the operator, one for each code; an experiment that ran is one."""
         entries = list(self.stop)

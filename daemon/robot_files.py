@@ -166,10 +166,17 @@ def lock_robot(files: RobotFiles, commands: str = "", gripper: tuple[str, int] |
         for path in files.locks:
             _lock(path, f"robot at {files.host}", commands, opened)
         if gripper is not None:
-            host, port = gripper
-            for address in sorted(addresses_of((host,))[host]) or [one_spelling(host)]:
-                path = _file(f"{address}-{port}", ".lock", of="gripper")
-                _lock(path, f"gripper at {host}:{port}", commands, opened)
+            opened.enter_context(lock_gripper(*gripper, commands))
+        yield
+
+
+@contextlib.contextmanager
+def lock_gripper(host: str, port: int, commands: str = "") -> Iterator[None]:
+    """Keep other programs of this user away from a gripper's socket; raises UserError as `lock_robot` does."""
+    with contextlib.ExitStack() as opened:
+        for address in sorted(addresses_of((host,))[host]) or [one_spelling(host)]:
+            path = _file(f"{address}-{port}", ".lock", of="gripper")
+            _lock(path, f"gripper at {host}:{port}", commands, opened)
         yield
 
 

@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from shearloop.errors import UserError
 from shearloop.words import counted
 
 if TYPE_CHECKING:
+    from shearloop.daemon.rig_memory import Remembered
     from shearloop.drivers.robotiq.gripper import RobotiqGripper
 
 
@@ -21,8 +23,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `calibrate gripper`."""
     parser.epilog = (
         "The fingers open and close: keep clear of them. Asks for one object after the other, to be held between the "
-        "fingertips, and closes on each after you press Enter. Stop the daemon first: it uses the gripper. Name the "
-        "file as `gripper.calibration` in the configuration."
+        "fingertips, and closes on each after you press Enter. Stop the daemon first: it has the gripper. "
+        "Name the file as `gripper.calibration` in the configuration."
     )
     way = parser.add_mutually_exclusive_group(required=True)
     way.add_argument("--host", metavar="ADDRESS", help="the robot's controller, for the URCap's socket")
@@ -40,6 +42,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Grip each object and write the calibration."""
+    from shearloop.daemon.rig_memory import Remembered, read_memories
+    from shearloop.daemon.robot_files import RobotFiles, lock_gripper
     from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
@@ -49,14 +53,19 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("give at least two different --diameter-mm")
     check_calibration_file(args.out)
     client: RobotiqClient
-    if args.host is not None:
-        client = SocketClient(args.host, args.socket_port)
-    else:
-        path = str(args.port) if args.port is not None else None
-        client = ModbusClient(serial_number=args.serial_number, path=path)
-    gripper = RobotiqGripper(client, WidthCalibration.nominal(args.model))
-    operator = Operator(stdout_is_for_json=args.json)
-    gauges = asyncio.run(_grip(gripper, args.diameter_mm, operator))
+    left = Remembered()
+    with ExitStack() as opened:
+        if args.host is not None:
+            # The URCap's socket serves a daemon at the same time; a serial port has one program.
+            opened.enter_context(lock_gripper(args.host, args.socket_port))
+            left = read_memories(RobotFiles.of(args.host))
+            client = SocketClient(args.host, args.socket_port)
+        else:
+            path = str(args.port) if args.port is not None else None
+            client = ModbusClient(serial_number=args.serial_number, path=path)
+        gripper = RobotiqGripper(client, WidthCalibration.nominal(args.model))
+        operator = Operator(stdout_is_for_json=args.json)
+        gauges = asyncio.run(_grip(gripper, args.diameter_mm, operator, left))
     calibration = WidthCalibration.of_gauges(gauges, args.model)
     save_calibration(args.out, calibration)
     report = {
@@ -74,10 +83,15 @@ def run(args: argparse.Namespace) -> int:
     return print_result(report, sentences, as_json=args.json)
 
 
-async def _grip(gripper: "RobotiqGripper", diameters_mm: list[float], operator: Operator) -> list[tuple[float, float]]:
+async def _grip(
+    gripper: "RobotiqGripper", diameters_mm: list[float], operator: Operator, left: "Remembered"
+) -> list[tuple[float, float]]:
     with operator:
         try:
             await gripper.connect()
+            for sentence in (*(fault.cause for fault in left.faults), left.held):
+                if sentence:
+                    await operator.ask(f"From the last program: {sentence}. Look at the rig, then press Enter.")
             warning = "The fingers will open and close. Keep clear, take out what they hold, then press Enter."
             await operator.ask(warning)
             await gripper.activate(operator_confirmed=True)

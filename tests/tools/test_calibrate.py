@@ -11,6 +11,8 @@ import pytest
 
 from shearloop.cli.calibrate import load
 from shearloop.cli.terminal import Operator
+from shearloop.daemon.rig_memory import Remembered, read_memory, write_memory
+from shearloop.daemon.robot_files import lock_gripper, memory_path
 from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import SerialPort
 from shearloop.drivers.errors import DeviceLostError
@@ -164,6 +166,28 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
     # Two positions, each rounded to a count: the true gripper goes from 3 to 230 counts over 140 mm.
     assert found.width_mm(3) == pytest.approx(140, abs=5)
     assert found.width_mm(230) == pytest.approx(0, abs=1)
+
+
+def test_a_gripper_of_a_daemon_is_refused_and_what_it_may_hold_is_said_before_it_opens(tmp_path):
+    write_memory(memory_path("127.0.0.1"), Remembered(force_n=60.0, running="loosen"))
+    with Process("emulate", "gripper-socket", "--port", "0") as gripper:
+        host, _, port = gripper.hear("127.0.0.1:").partition(":")
+        given = ("--host", host, "--socket-port", port, "--diameter-mm", "10", "--diameter-mm", "40")
+        calibration = ("calibrate", "gripper", *given, "--out", str(tmp_path / "gripper.yaml"))
+        with lock_gripper("localhost", int(port)), Process(*calibration) as calibrate:
+            status, _, refused = calibrate.end()
+        assert status != 0
+        assert f"the gripper at {host}:{port} is driven by another program of this computer" in refused
+        with Process(*calibration) as calibrate:
+            assert "'loosen' was under way. Look at the rig" in calibrate.hear(
+                "From the last program: the daemon ended"
+            )
+            calibrate.tell("")
+            calibrate.hear("From the last program: a tool may be in the fingers, gripped with at most 60 N. Look at")
+            calibrate.tell("")
+            calibrate.hear("The fingers will open")
+            calibrate.end()
+    assert read_memory(memory_path("127.0.0.1")).running == "loosen", "the arm waits for its own acknowledgement"
 
 
 def test_a_gripper_of_another_model_is_measured_where_its_counts_begin_and_bow(tmp_path):

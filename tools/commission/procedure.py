@@ -17,6 +17,7 @@ from shearloop.tools.commission import boards, gripper, identity, motion, rtde, 
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.limits import EMULATED
 from shearloop.tools.commission.operator import Operator
+from shearloop.tools.commission.remembered import LeftRobot
 from shearloop.tools.commission.report import Measured, earlier_report, report_for, save_report
 from shearloop.tools.commission.rig import ConnectedRig, Rig
 from shearloop.tools.commission.tactile import calibrated_sessions
@@ -58,13 +59,15 @@ def commission(
     _open_files(config)
     with ExitStack() as opened:
         # A daemon would drive the robot at the same time.
-        opened.enter_context(lock_robot(RobotFiles.of(settings.host), gripper=config.gripper_address))
+        files = RobotFiles.of(settings.host)
+        opened.enter_context(lock_robot(files, gripper=config.gripper_address))
+        left = LeftRobot.acknowledged(config, files, operator)
         devices = rig or ConnectedRig(config, settings)
         controller = devices.controller()
         report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)
         report = _without_changed(report, config, operator)
         context = Context(config, settings, devices, controller, operator, report, counts, opened)
-        return _run(context, out, only)
+        return _run(context, left, out, only)
 
 
 def _open_files(config: DaemonConfig) -> None:
@@ -86,7 +89,7 @@ def _without_changed(report: Report, config: DaemonConfig, operator: Operator) -
     return report
 
 
-def _run(context: Context, out: Path, only: Sequence[str]) -> tuple[Report, Path]:
+def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> tuple[Report, Path]:
     operator = context.operator
     if context.config.emulated:
         times = ", and its limits on times are those of a busy computer" if context.limits is EMULATED else ""
@@ -99,6 +102,7 @@ def _run(context: Context, out: Path, only: Sequence[str]) -> tuple[Report, Path
         if failed := [one.stage for one in context.report.stages if not one.passed and one.stage < stage]:
             raise UserError(f"stage {failed[0]} failed: mend it and run it again before stage {stage}")
         operator.say(f"Stage {stage}")
+        context.operator = left.before(stage)
         measured = measure(context)
         result = StageResult(
             stage=stage,

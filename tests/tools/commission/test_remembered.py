@@ -1,0 +1,90 @@
+"""A commissioning of a robot that another program has left with a stop, a crash or a grip."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.rig_memory import Remembered, read_memory, write_memory
+from shearloop.daemon.robot_files import RobotFiles, memory_path
+from shearloop.errors import UserError
+from shearloop.tools.commission.operator import DeclinedError, Operator
+from shearloop.tools.commission.remembered import LeftRobot
+from tests.tools.commission.test_procedure import Lab
+
+pytestmark = pytest.mark.usefixtures("ur_rtde")
+
+HOST = "127.0.0.9"
+GRIP = Remembered(origin_rad=0.3, force_n=60.0, width_mm=30.0)
+LEFT = replace(GRIP, running="loosen", stop=((FaultCode.GRIP_LOST.name, "the object is gone"),))
+
+
+@pytest.fixture
+def lab(tmp_path) -> Iterator[Lab]:
+    lab = Lab(tmp_path)
+    yield lab
+    lab.close()
+
+
+def motions(lab: Lab) -> list[str]:
+    return [question for question in lab.operator.asked if question.startswith("MOTION")]
+
+
+def test_stop_crash_and_grip_are_shown_and_acknowledged_before_anything_is_asked_of_the_robot(lab, monkeypatch):
+    write_memory(memory_path(HOST), LEFT)
+    with monkeypatch.context() as patched:
+        patched.setattr(lab.rig, "controller", lambda: pytest.fail("the robot was asked before"))
+        lab.operator.declined = "Look at the rig"
+        with pytest.raises(DeclinedError, match="Look at the rig"):
+            lab.run("0")
+    assert read_memory(memory_path(HOST)) == LEFT
+    shown = " ".join(lab.operator.said)
+    for part in ("the object is gone", "'loosen' was under way", "60 N, 30.0 mm wide, its angle counts from 0.300 rad"):
+        assert part in shown
+    lab.operator.declined = ""
+    lab.run("0")
+    assert read_memory(memory_path(HOST)) == GRIP
+
+
+def test_without_anything_to_remember_nothing_is_asked(lab):
+    write_memory(memory_path(HOST), Remembered())
+    lab.run("0")
+    assert lab.operator.asked[0] == "Your name:"
+
+
+def test_each_motion_says_that_a_tool_may_be_held(lab):
+    write_memory(memory_path(HOST), GRIP)
+    lab.run("3")
+    assert len(motions(lab)) > 0
+    assert all("a tool may be in the fingers, gripped with at most 60 N" in motion for motion in motions(lab))
+    assert read_memory(memory_path(HOST)) == GRIP
+
+
+def test_the_fingers_open_once_a_tool_that_may_be_held_is_secured_and_the_grip_is_over(lab):
+    write_memory(memory_path(HOST), GRIP)
+    lab.operator.declined = "Stage 2 gripper opens the fingers, and it drops"
+    with pytest.raises(DeclinedError, match="A tool may be in the fingers"):
+        lab.run("2")
+    assert motions(lab) == []
+    assert read_memory(memory_path(HOST)) == GRIP
+    lab.operator.declined = ""
+    lab.run("2")
+    assert read_memory(memory_path(HOST)) == Remembered()
+    assert not any("may be in the fingers" in motion for motion in motions(lab))
+
+
+def test_an_acknowledgement_that_cannot_be_kept_is_none(lab):
+    memory_path(HOST).mkdir(parents=True)
+    with pytest.raises(UserError, match="what was acknowledged cannot be kept in"):
+        lab.run("0")
+
+
+def test_devices_that_end_with_the_rehearsal_have_no_past(lab):
+    write_memory(memory_path(HOST), LEFT)
+    config = load_daemon_config(lab.path).model_copy(update={"autostart": True})
+    operator = Operator(pytest.fail, lambda _: None)
+    left = LeftRobot.acknowledged(config, RobotFiles.of(HOST), operator)
+    assert left.before("2 gripper") is operator
+    assert read_memory(memory_path(HOST)) == LEFT

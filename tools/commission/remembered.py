@@ -1,0 +1,87 @@
+"""What the last program left of a robot: a commissioning shows it, and begins once the operator has acknowledged it."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Self
+
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.rig import keeps_memory
+from shearloop.daemon.rig_memory import Remembered, read_memories, write_memories
+from shearloop.daemon.robot_files import RobotFiles
+from shearloop.errors import UserError
+from shearloop.tools.commission import boards, gripper, tool
+from shearloop.tools.commission.operator import Operator, Played
+
+# Stages that open the fingers.
+_OPENING: Final = (gripper.STAGE, boards.STAGE, tool.STAGE)
+_PLAYED: Final = Played("nothing is left to clear")
+
+
+@dataclass(frozen=True, slots=True)
+class HoldingOperator(Operator):
+    """Asks about motions while a tool may be in the fingers: each question says so."""
+
+    held: str = ""
+
+    def allow(self, motion: str) -> None:
+        """Show a motion with what is held, and return once the word was typed; raises DeclinedError."""
+        Operator.allow(self, f"{motion}; {self.held}")
+
+
+@dataclass(slots=True)
+class LeftRobot:
+    """The state of a robot that another program has left, after its acknowledgement, and who is asked from there on."""
+
+    files: RobotFiles
+    operator: Operator
+    # Whether the configuration has a gripper, which stages open.
+    opens: bool
+    state: Remembered
+
+    @classmethod
+    def acknowledged(cls, config: DaemonConfig, files: RobotFiles, operator: Operator) -> Self:
+        """Show what is remembered, and return once it is acknowledged; nothing may move before.
+
+        A grip is still remembered afterwards. Raises DeclinedError, and UserError where the state cannot be written.
+        """
+        left = cls(files, operator, config.gripper is not None, Remembered())
+        if not keeps_memory(config):
+            return left
+        state = read_memories(files)
+        held = state.held
+        shown = [*(fault.cause for fault in state.faults), *([held] if held else [])]
+        if not shown:
+            return left
+        operator.say(f"The robot at {files.host} was left like this:")
+        for sentence in shown:
+            operator.say(f"- {sentence}.")
+        operator.act(
+            "Look at the rig, and clear what stopped it. The commissioning makes the robot ready to move again", _PLAYED
+        )
+        left._keep(replace(state, stop=(), running=""))
+        return left
+
+    def before(self, stage: str) -> Operator:
+        """Return who is asked in a stage. One that opens the fingers begins once a tool that may be in them is secured.
+
+        Raises DeclinedError, and UserError where the state cannot be written.
+        """
+        held = self.state.held
+        if held and self.opens and stage in _OPENING:
+            self.operator.act(f"{held[0].upper()}{held[1:]}. Stage {stage} opens the fingers, and it drops: secure it")
+            self._keep(Remembered())
+            held = ""
+        if not held:
+            return self.operator
+        return HoldingOperator(self.operator.answer, self.operator.say, self.operator.play, held)
+
+    def _keep(self, state: Remembered) -> None:
+        try:
+            write_memories(self.files, state)
+        except OSError as error:
+            at: Path = self.files.states[0]
+            raise UserError(
+                f"what was acknowledged cannot be kept in {at} ({error.strerror}): make room, or make the folder "
+                "writable"
+            ) from error
+        self.state = state

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     described, bank = args.folder / "banks" / "paper.yaml", args.folder / "paper.bank"
     build = shlex.join(["shearloop", "bank", "build", "--config", str(described), "--out", str(bank)])
     print(f"{rig}: name your boards, and take out what you do not have")
-    print(f"{settings}: set the robot's address, its payload and every limit")
+    print(f"{settings}: enter the robot's address, the workspace and the tool; a real robot does not run before")
     print(f"Then build the bank that rig.yaml names, which takes some seconds: `{build}`")
     print(f"Then check all files: `{shlex.join(['shearloop', 'check', str(rig)])}`")
     return 0

@@ -107,7 +107,7 @@ class _DeviceReplacer:
         """Write the robot's settings of a file with a loopback address, and return them."""
         import yaml
 
-        from shearloop.daemon.rig import robot_settings
+        from shearloop.daemon.rig import robot_settings, sentences_on_open_keys
         from shearloop.yaml_files import read_yaml
 
         settings = robot_settings(source)
@@ -117,6 +117,7 @@ class _DeviceReplacer:
         self._sentences.append(
             f"the robot at {settings.host} is played at {self._host}; its limits are those of {source}"
         )
+        self._sentences += sentences_on_open_keys(source, settings)
         return replace(settings, host=self._host)
 
     def _rig(self, robot: "UrSettings") -> None:
@@ -235,12 +236,12 @@ def _robot_arguments(robot: "UrSettings") -> list[str]:
     joints_rad = joints_within(
         [low + margin_rad for low in limits.joints.lower_rad],
         [high - margin_rad for high in limits.joints.upper_rad],
-        limits.workspace.lower_m,
-        limits.workspace.upper_m,
+        limits.box.lower_m,
+        limits.box.upper_m,
         offset,
     )
     if joints_rad is None:
-        box = asdict(limits.workspace)
+        box = asdict(limits.box)
         raise UserError(
             f"the emulated arm reaches no point in the middle of the workspace with its tool downwards: {box}; "
             "check `limits.workspace` and `limits.joints` of the robot's settings"

@@ -87,6 +87,30 @@ def robot_settings(path: Path) -> UrSettings:
 
 
 def open_settings(config: DaemonConfig) -> UrSettings | None:
+    """Return the settings to drive the configured robot with, None without one; raises as `configured_settings` does.
+
+    Raises UserError with a line for each part that a real robot needs and the settings leave open.
+    """
+    settings = configured_settings(config)
+    if lines := why_not_driven(config, settings):
+        raise UserError("\n".join(lines))
+    return settings
+
+
+def why_not_driven(config: DaemonConfig, settings: UrSettings | None) -> list[str]:
+    """Return a sentence on each part that the settings of a configured robot leave open; none for an emulated one."""
+    if config.robot is None or settings is None or config.emulated:
+        return []
+    return sentences_on_open_keys(config.robot, settings)
+
+
+def sentences_on_open_keys(path: Path, settings: UrSettings) -> list[str]:
+    """Return a sentence on each part that the settings of a robot leave open; `path` is their file."""
+    stakes = "a real robot does not run before, a rehearsal (`--emulate`) does"
+    return [f"{path}: {part} is not filled in: {cure}; {stakes}" for part, cure in settings.left_open().items()]
+
+
+def configured_settings(config: DaemonConfig) -> UrSettings | None:
     """Return the settings of the configured robot, None without one; raises DriverError as `robot_settings` does.
 
     Raises UserError for a robot elsewhere in a rig that is said to be emulated.

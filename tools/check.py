@@ -32,6 +32,10 @@ CheckEmulators = Callable[[tuple["EmulatorConfig", ...], Path], object]
 _MEMORY_DEVICES = 1
 
 
+# The part with what the robot's settings leave open.
+OPEN_KEYS = "robot's settings"
+
+
 @dataclass(frozen=True, slots=True)
 class Parts:
     """A sentence on each part of a configuration, or its mistakes, so that one hides no other."""
@@ -171,7 +175,7 @@ def _torque(calibration: "Calibration") -> str:
 def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
     """Check load cell, gripper and robot; return the robot's settings with their cap, if there are any."""
     from shearloop.daemon.commissioning import commissioning_of
-    from shearloop.daemon.rig import gripper_calibration, open_settings
+    from shearloop.daemon.rig import configured_settings, gripper_calibration, why_not_driven
     from shearloop.daemon.sensors import load_cell_calibration
 
     if (cell := config.load_cell) is not None:
@@ -185,7 +189,9 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
             own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
             parts.texts["gripper"] = f"{hand.model}, {own}"
     with parts.of("robot"):
-        if (settings := open_settings(config)) is not None:
+        if (settings := configured_settings(config)) is not None:
+            if lines := why_not_driven(config, settings):
+                parts.mistakes[OPEN_KEYS] = "\n".join(lines)
             parts.texts["robot"] = f"{settings.host}, limits of {config.robot}"
             with parts.of("commissioned"):
                 commissioning = commissioning_of(config, settings)

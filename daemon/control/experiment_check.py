@@ -300,7 +300,7 @@ def _outside_robot(step: Step, limits: UrLimits | None) -> str:
     angles_rad: tuple[float, ...] = ()
     match step:
         case ApproachStep(pose_m_rad=pose) if pose is not None:
-            outside = limits.workspace.why_outside(pose[:3])
+            outside = limits.box.why_outside(pose[:3])
             return f"ends at {outside}" if outside else ""
         case TurnToStep(angle_rad=angle_rad):
             angles_rad = (angle_rad,)

@@ -136,7 +136,7 @@ class MotionExecutor:
                 return f"The arm is still stopping ({self.end_reason})."
             case WristSpeed(), _Move():
                 return "A straight move is under way: stop it."
-            case MoveLinear(pose), _ if outside := self._settings.limits.workspace.why_outside(pose[:3]):
+            case MoveLinear(pose), _ if outside := self._settings.limits.box.why_outside(pose[:3]):
                 return f"The straight move would end at {outside}; nothing moves."
             case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:
                 return "A straight move needs a speed and an acceleration above 0."
@@ -494,7 +494,7 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
     if not all(map(math.isfinite, measured)):
         return "The controller reports values that are no numbers."
     limits = settings.limits
-    joints, box = limits.joints, limits.workspace
+    joints, box = limits.joints, limits.box
     for number, (q, low, high) in enumerate(zip(sample.q_rad, joints.lower_rad, joints.upper_rad, strict=True), 1):
         if not low <= q <= high:
             return f"Joint {number} is at {q:.3f} rad, beyond its hard limits of {low:g} and {high:g} rad."
@@ -540,6 +540,11 @@ def tool_difference(sample: RtdeOutputs, tool: InstalledTool) -> str:
         ("tcp_offset", tcp, sample.tcp_offset, tcp is None or is_close(sample.tcp_offset, tcp, TOOL_M_RAD)),
     )  # fmt: skip
     for name, configured, found, same in checks:
+        if not same and not _is_reported(found):
+            return (
+                f"The controller does not report {name}, and the robot's settings have {_rounded(configured)}: install "
+                "PolyScope 3.12 (CB3) or 5.5.1 (e-Series), or newer."
+            )
         if not same:
             return (
                 f"The controller has {name} {_rounded(found)}, the robot's settings have {_rounded(configured)}: "
@@ -548,9 +553,14 @@ def tool_difference(sample: RtdeOutputs, tool: InstalledTool) -> str:
     return ""
 
 
+def _is_reported(value: float | tuple[float, ...]) -> bool:
+    values = value if isinstance(value, tuple) else (value,)
+    return not any(map(math.isnan, values))
+
+
 def _rounded(value: float | tuple[float, ...] | None) -> str:
     values = value if isinstance(value, tuple) else (value,)
-    return ", ".join("unknown" if one is None or math.isnan(one) else f"{one:.4g}" for one in values)
+    return ", ".join("unknown" if one is None else f"{one:.4g}" for one in values)
 
 
 def _beyond(name: str, value: float, bound: Bound, unit: str) -> str:

@@ -4,7 +4,7 @@ All limits are magnitudes. A measured value beyond a `hard` limit stops the moti
 limit, so that no command reaches the hard one.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal
 
@@ -169,6 +169,12 @@ class TorqueBound(Bound):
     """A larger measured value stops the motion. The script on a CB3 does not subtract a tare."""
 
 
+def _check_range(lower: tuple[float, ...], upper: tuple[float, ...], margin: float) -> None:
+    for number, (low, high) in enumerate(zip(lower, upper, strict=True), start=1):
+        if low + 2 * margin >= high:
+            raise ValueError(f"entry {number}: no room between {low:g} and {high:g} with a margin of {margin:g}")
+
+
 @dataclass(frozen=True, slots=True)
 class JointRange(_Checked):
     """The hard ends of each joint's range in rad, and the margin that commands keep from them."""
@@ -213,14 +219,18 @@ class Workspace(_Checked):
         return ""
 
 
+# An emulated arm stands in this box where the settings leave the workspace open; a real robot does not run then.
+_EMULATED_WORKSPACE = Workspace(lower_m=(-0.8, -0.8, 0.0), upper_m=(0.8, 0.8, 0.9), margin_m=0.02)
+
+
 @dataclass(frozen=True, slots=True)
 class UrLimits(_Checked):
     """The limits on commands and on measured states."""
 
     joints: JointRange
     """Range of each joint."""
-    workspace: Workspace
-    """Box for the tool centre point."""
+    workspace: Workspace | None = field(default=None, kw_only=True)
+    """Box for the tool centre point; a real robot does not run without it."""
     wrist_speed_rad_per_s: WristSpeedBound
     """Speed of the last joint."""
     wrist_acceleration_rad_per_s2: WristAccelerationBound
@@ -234,10 +244,15 @@ class UrLimits(_Checked):
     torque_nm: TorqueBound
     """Torque on the tool centre point."""
 
+    @property
+    def box(self) -> Workspace:
+        """The workspace, or that of an emulated arm where it is left open."""
+        return _EMULATED_WORKSPACE if self.workspace is None else self.workspace
+
 
 @dataclass(frozen=True, slots=True)
 class InstalledTool(_Checked):
-    """Payload and tool centre point that the pendant must have for motion; a key that is absent is not compared."""
+    """Payload and tool centre point that the pendant must have for motion; a real robot does not run without them."""
 
     payload_kg: ranges.Payload | None = None
     """Mass of the load."""
@@ -245,6 +260,12 @@ class InstalledTool(_Checked):
     """Centre of gravity of the load, from the flange."""
     tcp_offset: ranges.ToolOffset | None = None
     """Tool centre point from the flange: position in m, rotation vector in rad."""
+
+    @property
+    def open_keys(self) -> list[str]:
+        """The keys that are absent."""
+        values = {"payload_kg": self.payload_kg, "payload_cog_m": self.payload_cog_m, "tcp_offset": self.tcp_offset}
+        return [key for key, value in values.items() if value is None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,6 +325,15 @@ class UrSettings(_Checked):
                     "commissioning measures how much, five standard deviations and the bias"
                 )
 
+    def left_open(self) -> dict[str, str]:
+        """Return the parts that a real robot needs and that are not filled in, each with what to do."""
+        found = {}
+        if self.limits.workspace is None:
+            found["limits.workspace"] = "measure the free space of your cell, and enter lower_m, upper_m and margin_m"
+        if absent := self.tool.open_keys:
+            found[f"tool ({', '.join(absent)})"] = "enter what the pendant has for gripper and fingertips"
+        return found
+
     @property
     def facts(self) -> GenerationFacts:
         """The particular settings of a controller's generation."""
@@ -342,12 +372,6 @@ class UrSettings(_Checked):
             "lower command_timeout_s, silence_timeout_s or the inner limit of wrist_speed_rad_per_s, or raise rate_hz "
             "or the hard limit of wrist_acceleration_rad_per_s2"
         )
-
-
-def _check_range(lower: tuple[float, ...], upper: tuple[float, ...], margin: float) -> None:
-    for number, (low, high) in enumerate(zip(lower, upper, strict=True), start=1):
-        if low + 2 * margin >= high:
-            raise ValueError(f"entry {number}: no room between {low:g} and {high:g} with a margin of {margin:g}")
 
 
 def read_settings(path: Path) -> UrSettings:

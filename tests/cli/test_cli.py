@@ -35,6 +35,7 @@ from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.torques import WRENCH
 from shearloop.tools.task_row import task_row
+from tests.fixtures.robots import write_filled_in
 from tests.paper_curve import paper_curve
 from tests.sample_messages import sample
 
@@ -138,7 +139,7 @@ def test_a_real_robot_in_an_emulated_rig_is_refused(command, config, tmp_path, m
 
 @pytest.mark.usefixtures("ur_rtde")
 async def test_fingertip_names_do_not_collide_with_task_names(config, tmp_path):
-    shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
+    write_filled_in(tmp_path)
     (tmp_path / "wait.yaml").write_text("{name: one, torque_source: right, steps: [{do: wait, wait_s: 1}]}")
     whole = config(
         robot="ur.yaml",

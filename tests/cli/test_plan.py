@@ -17,6 +17,7 @@ from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.drivers.ur.settings import UrLimits, read_settings
 from tests.daemon.control.loop_rig import TICK_S, Rig, new_loop, phase, started
 from tests.fixtures.daemons import collector, running_daemon, shearloop
+from tests.fixtures.robots import write_filled_in
 
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "config" / "ur.yaml"
@@ -33,7 +34,7 @@ def written(folder: Path, *steps: dict[str, object], **keys: object) -> Path:
 def rig(folder: Path, model: str = "2F-140", **keys: object) -> Path:
     content = {
         "load_cell": {"device": {"path": "load"}},
-        "robot": str(ROBOT),
+        "robot": str(write_filled_in(folder)),
         "gripper": {"model": model, "socket": {"host": "192.168.1.10"}},
         **keys,
     }

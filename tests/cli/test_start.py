@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,10 +16,14 @@ from jsonschema import Draft202012Validator
 from shearloop.cli import demo
 from shearloop.cli.config_schema import MODELS
 from shearloop.cli.emulator_processes import running
+from shearloop.cli.rehearsal import rehearsal
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.rig import open_settings
+from shearloop.drivers.hosts import is_loopback_host
 from shearloop.estimation.skin.calibration import load_calibration
+from tests.fixtures.robots import write_filled_in
 
 CONFIG = Path(__file__).parents[2] / "config"
 # A calibration is written by a command, not by people.
@@ -79,6 +84,52 @@ def test_init_writes_files_that_load_and_changes_none(tmp_path, ran, mistake):
     assert (folder / "rig.yaml").read_text() == "mine"
     assert not (folder / "ur.yaml").exists()
     assert "cannot be written: Not a directory; choose another path" in mistake("init", folder / "rig.yaml")
+
+
+@pytest.fixture
+def untouched(tmp_path, ran, tiny_bank) -> Path:
+    """The configuration of a fresh folder of `init`, with its bank."""
+    ran("init", tmp_path / "rig")
+    shutil.copy(tiny_bank, tmp_path / "rig" / "paper.bank")
+    return tmp_path / "rig" / "rig.yaml"
+
+
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize("command", [("check",), ("run",), ("commission", "--out", "report.yaml")])
+def test_a_real_robot_does_not_run_before_its_workspace_and_its_tool_are_filled_in(command, untouched, mistake):
+    name, *options = command
+    robot = untouched.with_name("ur.yaml")
+    workspace, tool = mistake(name, untouched, *options).removeprefix(f"shearloop {name}: ").splitlines()
+    assert workspace.startswith(f"{robot}: limits.workspace is not filled in: measure the free space of your cell")
+    assert tool.startswith(f"{robot}: tool (payload_kg, payload_cog_m, tcp_offset) is not filled in: enter ")
+    assert workspace.endswith(stakes := "; a real robot does not run before, a rehearsal (`--emulate`) does")
+    assert tool.endswith(stakes)
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_what_is_not_filled_in_hides_no_mistake_of_an_experiment(untouched, ran):
+    fast = {"do": "turn_to", "angle_rad": 1, "speed_rad_per_s": 3}
+    path = untouched.with_name("fast.yaml")
+    path.write_text(yaml.safe_dump({"name": "fast", "torque_source": "load_cell", "steps": [fast]}))
+    said = ran("check", path, "--config", untouched, status=2)
+    assert "speed_rad_per_s 3 rad/s: write 0.2 or less" in said.err
+    assert "limits.workspace is not filled in" in said.err
+    assert "turn_to" in said.out
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_robot_that_is_filled_in_is_in_order(untouched, ran):
+    write_filled_in(untouched.parent)
+    assert "is in order" in ran("check", untouched).out
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_an_untouched_folder_is_rehearsed_and_the_first_lines_say_what_is_not_filled_in(untouched):
+    with rehearsal(load_daemon_config(untouched), untouched) as rehearsed:
+        settings = open_settings(rehearsed.config)
+        said = [one for one in rehearsed.sentences if "is not filled in" in one]
+    assert is_loopback_host(settings.host)
+    assert [one.partition(": ")[2].split()[0] for one in said] == ["limits.workspace", "tool"]
 
 
 def test_init_leaves_nothing_behind_on_a_full_disc(tmp_path, mistake, monkeypatch):

@@ -8,7 +8,6 @@ import pytest
 import yaml
 
 from shearloop.cli import main
-from shearloop.cli.init import packaged_files
 from shearloop.daemon.commissioning import (
     CAPPED_M_PER_S,
     CAPPED_NM,
@@ -33,6 +32,7 @@ from shearloop.errors import UserError
 from shearloop.tools.commission.report import save_report
 from shearloop.tools.doctor import check_cap
 from tests.fixtures.daemons import ask, collector, robot_at, running_daemon
+from tests.fixtures.robots import filled_in
 
 NOW = datetime(2026, 11, 1, tzinfo=UTC)
 VERSION, SERIAL = "5.17.3.0", "20235500001"
@@ -48,7 +48,7 @@ SUPPLIED = Supplied(
 
 
 def write_rig(folder: Path, *, wrist: float = 0.8, **content: object) -> Path:
-    robot = yaml.safe_load(packaged_files()[Path("ur.yaml")])
+    robot = filled_in()
     robot["limits"]["wrist_speed_rad_per_s"] = {"inner": wrist, "hard": 1.5 * wrist}
     robot["limits"]["linear_speed_m_per_s"] = {"inner": 0.2, "hard": 0.3}
     (folder / "ur.yaml").write_text(yaml.safe_dump(robot))

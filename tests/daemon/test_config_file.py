@@ -20,6 +20,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
 from shearloop.yaml_files import load_model, read_yaml
+from tests.fixtures.robots import filled_in
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -325,7 +326,7 @@ def test_a_shipped_file_with_any_value_changed_loads_or_is_refused_in_sentences(
 
 
 def test_each_list_of_the_robots_file_may_lack_an_entry(tmp_path):
-    content = yaml.safe_load((CONFIG / "ur.yaml").read_text())
+    content = filled_in()
     path = tmp_path / "ur.yaml"
     lists = [place for place in places(content) if place and place[-1] in ("lower_rad", "upper_rad", "lower_m")]
     assert len(lists) == 3

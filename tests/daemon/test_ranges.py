@@ -14,8 +14,8 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
+from tests.fixtures.robots import filled_in
 
-ROBOT = Path(__file__).parents[2] / "config" / "ur.yaml"
 # The designs of banks and fingertips move nothing; their meshes have no largest size that we know.
 MOVING = sorted(MODELS.keys() - {"bank", "fingertip"})
 
@@ -49,8 +49,7 @@ def test_every_number_has_a_lower_and_an_upper_bound(kind):
 
 def robot(folder: Path, place: str, value: object) -> Path:
     """Return the delivered robot's settings with one other value."""
-    content = yaml.safe_load(ROBOT.read_text(encoding="utf-8"))
-    content.setdefault("tool", {})
+    content = filled_in()
     *sections, key = place.split(".")
     section = content
     for name in sections:

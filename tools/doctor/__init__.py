@@ -8,7 +8,6 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -16,14 +15,14 @@ from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.daemon.commissioning import commissioning_of
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
-from shearloop.daemon.rig import open_settings
+from shearloop.daemon.rig import configured_settings
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import missing_library
-from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
-from shearloop.tools.check import CheckEmulators, check_parts
+from shearloop.tools.check import OPEN_KEYS, CheckEmulators, check_parts
 from shearloop.tools.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
 from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, split_cure, trouble
+from shearloop.tools.doctor.robot_values import check_robot_values
 from shearloop.tools.serial_ports import HiddenBoard, has_brltty, list_hidden_boards, list_serial_ports
 from shearloop.yaml_files import read_yaml
 
@@ -193,43 +192,20 @@ def check_files(
     for name, text in parts.texts.items():
         if name != "keys":
             yield good(f"files of {name}", text)
+    # Other findings name these.
+    elsewhere = ("keys", OPEN_KEYS)
     for name, mistake in parts.mistakes.items():
         kind = from_file if "\n" in mistake else from_error
         finding = kind(f"files of {name}", mistake, "the daemon does not start")
-        if name != "keys" and finding.found not in [one.found for one in banks]:
+        if name not in elsewhere and finding.found not in [one.found for one in banks]:
             yield finding
     yield check_keys(config.curve, config.network_addresses)
-
-
-def check_robot_values(path: Path) -> Iterator[Finding]:
-    """Name what the robot's settings in `path` still have from `shearloop init`, or leave open."""
-    with resources.as_file(resources.files("shearloop") / "config" / "ur.yaml") as delivered:
-        initial = read_settings(delivered)
-    try:
-        settings = read_settings(path)
-    except DriverError:
-        # The mistakes are among the findings on files.
-        return
-    subject = "robot's settings"
-    if settings.limits.workspace == initial.limits.workspace:
-        means = "the arm may reach whatever stands within it"
-        yield note(
-            subject, f"{path}: limits.workspace is as `init` wrote it", means, "enter the free space of your cell"
-        )
-    if settings.tool.payload_kg is None:
-        means = "a wrong payload or tool centre point on the pendant is not noticed"
-        yield note(
-            subject,
-            f"{path}: there is no `tool.payload_kg`",
-            means,
-            "enter the pendant's payload and tool centre point",
-        )
 
 
 def check_cap(config: DaemonConfig) -> Iterator[Finding]:
     """Say which cap holds for the robot, and why."""
     try:
-        settings = open_settings(config)
+        settings = configured_settings(config)
         commissioning = commissioning_of(config, settings) if settings is not None else None
     except (DriverError, UserError):
         # The mistakes are among the findings on files.

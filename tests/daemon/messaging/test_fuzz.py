@@ -6,7 +6,6 @@ import random
 import tty
 from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock
 
@@ -22,10 +21,10 @@ from shearloop.daemon.supervisor import resident_memory_mb
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import CommandReply
 from tests.fixtures.daemons import running_daemon
+from tests.fixtures.robots import write_filled_in
 
 FRAMES = REQUESTS = 50_000
 DEADLINE_S = 120
-ROBOT = str(Path(__file__).resolve().parents[3] / "config/ur.yaml")
 # What the daemon may keep of it all: caches, free lists, its sockets' buffers.
 MOST_GROWTH_MB = 16.0
 COMMANDS = ("tare", "start", "pause", "resume", "stop", "status", "unlock")
@@ -82,7 +81,7 @@ def malformed_frames(count: int) -> Iterator[bytes]:
 
 
 @pytest.mark.usefixtures("ur_rtde")
-async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, monkeypatch):
+async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, tmp_path, monkeypatch):
     arm = AsyncMock(return_value=CommandReply())
     monkeypatch.setattr(UrRobot, "send", arm)
     for name in ("run", "next_state"):
@@ -90,7 +89,7 @@ async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, monke
     board, port = os.openpty()
     tty.setraw(port)
     fingertip = {"device": {"path": os.ttyname(port)}, "bank": str(tiny_bank)}
-    path = config(robot=ROBOT, fingertips={"right": fingertip})
+    path = config(robot=str(write_filled_in(tmp_path)), fingertips={"right": fingertip})
     published: Counter[str] = Counter()
     published_one = asyncio.Event()
 

@@ -186,7 +186,11 @@ def test_a_stop_may_brake_harder_than_a_motion_may_accelerate():
         ({"payload_kg": 1.0, "payload_cog_m": (0.0, 0.0, 0.06), "tcp_offset": (0.0,) * 6}, {}, ""),
         ({"payload_kg": 1.0}, {"payload_kg": 1.009}, ""),
         ({"payload_kg": 1.0}, {"payload_kg": 1.02}, "payload_kg 1.02, the robot's settings have 1:"),
-        ({"payload_kg": 0.0}, {"payload_kg": math.nan}, "payload_kg unknown, the robot's settings have 0:"),
+        (
+            {"payload_kg": 0.0},
+            {"payload_kg": math.nan},
+            "does not report payload_kg, and the robot's settings have 0: install PolyScope 3.12",
+        ),
         ({"payload_cog_m": (0.0, 0.0, 0.06)}, {"payload_cog_m": (0.0, 0.002, 0.06)}, "payload_cog_m 0, 0.002, 0.06"),
         ({"tcp_offset": (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)}, {}, "tcp_offset 0, 0, 0, 0, 0, 0"),
         ({"tcp_offset": (0.0,) * 6}, {"tcp_offset": (0.0, 0.0, 0.0, 0.01, 0.0, 0.0)}, "tcp_offset"),

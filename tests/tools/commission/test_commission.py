@@ -15,7 +15,6 @@ import pytest
 import yaml
 
 from shearloop.cli import main
-from shearloop.cli.init import packaged_files
 from shearloop.daemon.commissioning import Line, Report, StageResult
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.rig_identity import RigIdentity
@@ -32,6 +31,7 @@ from shearloop.tools.commission.identity import EMULATED_CHECKSUM, Identity, jud
 from shearloop.tools.commission.operator import DeclinedError, Operator
 from shearloop.tools.commission.report import earlier_report, report_for, save_report
 from tests.emulator_process import EmulatorProcess
+from tests.fixtures.robots import TOOL, write_filled_in
 
 SIX = (0.0,) * 6
 OUTPUTS = RtdeOutputs(0.0, SIX, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 1.0, 0, 0, 0.0, 1.4, (0.0, 0.0, 0.0), SIX)
@@ -53,8 +53,7 @@ def seen(**changed: object) -> Identity:
 
 
 def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
-    robot = yaml.safe_load(packaged_files()[Path("ur.yaml")]) | {"host": host, "tool": {"payload_kg": 1.4}}
-    (folder / "ur.yaml").write_text(yaml.safe_dump(robot))
+    write_filled_in(folder, host=host, tool={**TOOL, "payload_kg": 1.4})
     path = folder / "rig.yaml"
     path.write_text(yaml.safe_dump({"load_cell": {"device": {"serial_number": "7583"}}, "robot": "ur.yaml"}))
     return path

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import yaml
 
 from shearloop.cli import main
 from shearloop.cli.emulator_processes import check_emulators
@@ -292,14 +291,3 @@ def test_boards_without_a_serial_number_are_named_by_their_socket(tmp_path, monk
     (tmp_path / "own").mkdir()
     (tmp_path / "own/pci-0000:00:14.0-usb-0:2:1.0").symlink_to(port)
     assert serial_ports.stable_name_of(str(port), None).startswith(str(tmp_path / "own"))
-
-
-def test_what_the_robots_settings_still_have_from_init_is_named(tmp_path):
-    path = tmp_path / "ur.yaml"
-    path.write_text(Path("config/ur.yaml").read_text())
-    found = [finding.found for finding in doctor.check_robot_values(path)]
-    assert found == [f"{path}: limits.workspace is as `init` wrote it", f"{path}: there is no `tool.payload_kg`"]
-    settings = yaml.safe_load(path.read_text())
-    settings["limits"]["workspace"]["upper_m"] = [0.5, 0.4, 0.6]
-    path.write_text(yaml.safe_dump({**settings, "tool": {"payload_kg": 1.0}}))
-    assert list(doctor.check_robot_values(path)) == []

@@ -534,6 +534,11 @@ def tool_difference(sample: RtdeOutputs, tool: InstalledTool) -> str:
     A value that the controller does not report is NaN and differs.
     """
     load, cog, tcp = tool.payload_kg, tool.payload_cog_m, tool.tcp_offset
+    if not tool.reported and _is_reported(sample.payload_kg):
+        return (
+            "The controller reports its payload, and the robot's settings say that it does not: enter payload_kg, "
+            "payload_cog_m and tcp_offset of `tool` in the place of `reported`."
+        )
     checks = (
         ("payload_kg", load, sample.payload_kg, load is None or abs(sample.payload_kg - load) < PAYLOAD_KG),
         ("payload_cog_m", cog, sample.payload_cog_m, cog is None or math.dist(sample.payload_cog_m, cog) < TOOL_M_RAD),
@@ -543,7 +548,7 @@ def tool_difference(sample: RtdeOutputs, tool: InstalledTool) -> str:
         if not same and not _is_reported(found):
             return (
                 f"The controller does not report {name}, and the robot's settings have {_rounded(configured)}: install "
-                "PolyScope 3.12 (CB3) or 5.5.1 (e-Series), or newer."
+                "PolyScope 3.12 (CB3) or 5.5.1 (e-Series), or write `tool: {reported: false}` into the settings."
             )
         if not same:
             return (

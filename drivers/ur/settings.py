@@ -260,12 +260,22 @@ class InstalledTool(_Checked):
     """Centre of gravity of the load, from the flange."""
     tcp_offset: ranges.ToolOffset | None = None
     """Tool centre point from the flange: position in m, rotation vector in rad."""
+    reported: bool = True
+    """`false` for a controller below PolyScope 3.12 or 5.5.1, which reports none of them: nothing is compared."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that no controller reports."""
+        if not self.reported and len(self.absent) < len(self._values):
+            raise ValueError(f"`reported: false` compares nothing: take {' and '.join(self._values)} out")
 
     @property
-    def open_keys(self) -> list[str]:
-        """The keys that are absent."""
-        values = {"payload_kg": self.payload_kg, "payload_cog_m": self.payload_cog_m, "tcp_offset": self.tcp_offset}
-        return [key for key, value in values.items() if value is None]
+    def _values(self) -> dict[str, object]:
+        return {"payload_kg": self.payload_kg, "payload_cog_m": self.payload_cog_m, "tcp_offset": self.tcp_offset}
+
+    @property
+    def absent(self) -> list[str]:
+        """The keys without a value."""
+        return [key for key, value in self._values.items() if value is None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,7 +340,7 @@ class UrSettings(_Checked):
         found = {}
         if self.limits.workspace is None:
             found["limits.workspace"] = "measure the free space of your cell, and enter lower_m, upper_m and margin_m"
-        if absent := self.tool.open_keys:
+        if self.tool.reported and (absent := self.tool.absent):
             found[f"tool ({', '.join(absent)})"] = "enter what the pendant has for gripper and fingertips"
         return found
 

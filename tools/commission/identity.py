@@ -119,7 +119,7 @@ def _payload(identity: Identity, wanted_kg: float | None) -> Line:
 def _unreported_payload(typed_kg: tuple[float, float] | None, wanted_kg: float | None, promise: str) -> Line:
     if wanted_kg is not None or typed_kg is None:
         value = "not reported: PolyScope has it from 3.12 and 5.5.1 on"
-        limit = "no `tool.payload_kg` in the robot's settings: with it the daemon refuses motion on this controller"
+        limit = "`tool: {reported: false}` in the robot's settings: else the daemon refuses motion on this controller"
         return judged("payload", value, limit, promise, passed=False)
     shown_kg, mounted_kg = typed_kg
     limit = f"the mounted mass, {mounted_kg:g} ± {TYPED_TOLERANCE_KG:g} kg; both typed by the operator"
@@ -132,7 +132,7 @@ def _tool_centre(outputs: RtdeOutputs, tool: InstalledTool) -> Line:
     """Return the line on the tool centre point and the centre of gravity, which the daemon compares if they are set."""
     what, value = "tool centre point", " ".join(f"{value:.4g}" for value in outputs.tcp_offset)
     compared = replace(tool, payload_kg=None)
-    if compared == InstalledTool():
+    if compared in (InstalledTool(), InstalledTool(reported=False)):
         return Line(what=what, value=value)
     differs = tool_difference(outputs, compared)
     limit = "as in the robot's settings; else the daemon refuses motion"

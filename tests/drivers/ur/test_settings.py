@@ -53,6 +53,7 @@ def test_all_mistakes_are_reported_together(tmp_path):
         ("host: 192.168.1.10", f"host: {'a' * 300}", "host is no name or address of a computer"),
         ("host: 192.168.1.10", 'host: "\\ud800"', "host is no name or address of a computer"),
         ("host: 192.168.1.10", "host: 192.168.1.10\ntool: {payload_kg: -1}", "tool.payload_kg: -1 is too small"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\ntool: {payload_kg: 1, reported: false}", "compares nothing: take"),
         ("margin_m: 0.02", "margin_m: 0.45", "no room"),
         ("{inner: 4.0, hard: 8.0}", "{inner: 4.0, hard: 50.0}", "hard: 50.0 is too large; allowed: above 0 to 40"),
         ("margin_m: 0.02", "margin_m: 0", "limits.workspace.margin_m: 0 is too small; allowed: above 0"),
@@ -133,3 +134,9 @@ def test_a_cb3_is_not_asked_for_more_states_than_it_sends(tmp_path) -> None:
     assert read_settings(changed(tmp_path, wrench, ("host: 192.168.1.10", f"{asked}125"))).rate_hz == 125
     with pytest.raises(DriverError, match="rate_hz: a CB3 sends 125 states a second at most, not 500"):
         read_settings(changed(tmp_path, wrench, ("host: 192.168.1.10", f"{asked}500")))
+
+
+def test_a_controller_that_reports_no_payload_needs_no_tool(tmp_path) -> None:
+    added = "host: 192.168.1.10\ntool: {reported: false}"
+    assert read_settings(changed(tmp_path, ("host: 192.168.1.10", added))).left_open() == {}
+    assert "tool" in next(iter(read_settings(changed(tmp_path)).left_open()))

@@ -34,7 +34,7 @@ from tests.emulator_process import EmulatorProcess
 from tests.fixtures.robots import TOOL, write_filled_in
 
 SIX = (0.0,) * 6
-OUTPUTS = RtdeOutputs(0.0, SIX, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 1.0, 0, 0, 0.0, 1.4, (0.0, 0.0, 0.0), SIX)
+OUTPUTS = RtdeOutputs(0.0, SIX, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 1.0, 0, 0, 0.0, 1.4, (0.0, 0.0, 0.06), SIX)
 CONTROLLER = ControllerInfo("5.17.3.0", "20235500001", "RUNNING", "NORMAL", remote=True, registers=UPPER)
 GOOD = Identity(CONTROLLER, OUTPUTS, "A1B2")
 RIG = RigIdentity(
@@ -53,7 +53,7 @@ def seen(**changed: object) -> Identity:
 
 
 def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
-    write_filled_in(folder, host=host, tool={**TOOL, "payload_kg": 1.4})
+    write_filled_in(folder, host=host, tool={**TOOL, "payload_kg": 1.4, "tcp_offset": [0.0] * 6})
     path = folder / "rig.yaml"
     path.write_text(yaml.safe_dump({"load_cell": {"device": {"serial_number": "7583"}}, "robot": "ur.yaml"}))
     return path

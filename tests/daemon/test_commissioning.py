@@ -50,6 +50,8 @@ SUPPLIED = Supplied(
 def write_rig(folder: Path, *, wrist: float = 0.8, **content: object) -> Path:
     robot = filled_in()
     robot["limits"]["wrist_speed_rad_per_s"] = {"inner": wrist, "hard": 1.5 * wrist}
+    # So fast a wrist stands within 0.2 s where it brakes harder.
+    robot["limits"]["wrist_acceleration_rad_per_s2"]["hard"] = 12.0
     robot["limits"]["linear_speed_m_per_s"] = {"inner": 0.2, "hard": 0.3}
     (folder / "ur.yaml").write_text(yaml.safe_dump(robot))
     path = folder / "rig.yaml"

@@ -65,7 +65,9 @@ class Controller:
         self._host = host
         self._closed_ports = closed_ports
         self._rate_hz = rate_hz
-        self._silent_until_s = 0.0
+        self._silent_until_s = self._held_until_s = 0.0
+        # What is held back for each client.
+        self._held: dict[asyncio.StreamWriter, bytes] = {}
         self._rtde: dict[asyncio.StreamWriter, RtdeSession] = {}
         self._connections: Connections = {}
         self._primary_clients: set[asyncio.StreamWriter] = set()
@@ -130,6 +132,7 @@ class Controller:
                 self.robot.change(self._first_spec)
                 self.faults.clear()
                 self.silence(0.0)
+                self.hold_back(0.0)
             case [name, *arguments] if name in FAULTS:
                 raise ValueError(f"{name} does not take {' '.join(arguments) or 'nothing'}")
             case _:
@@ -148,6 +151,10 @@ class Controller:
         """Send nothing on any port for a while; the connections stay open, and the data is lost."""
         self._silent_until_s = time.monotonic() + duration_s
 
+    def hold_back(self, duration_s: float) -> None:
+        """Send nothing on any port for a while, and then all of it, as after a short pull of the cable."""
+        self._held_until_s = time.monotonic() + duration_s
+
     def _drop_all(self) -> None:
         for writer in self._connections.values():
             # Closing waits until everything is sent, and the client may not read.
@@ -157,7 +164,13 @@ class Controller:
                 writer.close()
 
     def _send(self, writer: asyncio.StreamWriter, data: bytes) -> None:
-        if data and time.monotonic() >= self._silent_until_s and not writer.is_closing():
+        now_s = time.monotonic()
+        if not data or now_s < self._silent_until_s or writer.is_closing():
+            return
+        data = self._held.pop(writer, b"") + data
+        if now_s < self._held_until_s:
+            self._held[writer] = data
+        else:
             writer.write(data)
 
     async def _serve_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -287,6 +300,7 @@ _WITHOUT_NUMBER: dict[str, Callable[[Controller], None]] = {
 # The range of each fault's number, what another number is, and how it begins.
 _WITH_NUMBER: dict[str, tuple[float, float, str, Callable[[Controller, float], None]]] = {
     "silence": (0.0, 86400.0, "not a time in seconds from 0 to 86400", Controller.silence),
+    "hold-back": (0.0, 60.0, "not a time in seconds from 0 to 60", Controller.hold_back),
     "payload": (0.0, 100.0, "not a mass in kg from 0 to 100", Controller.weigh),
     "slider": (0.01, 1.0, "not a fraction from 0.01 to 1", lambda one, x: setattr(one.robot.arm, "speed_slider", x)),
     "velocity-noise": (

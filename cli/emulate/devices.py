@@ -33,6 +33,7 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   stop                    press the stop of the program at the pendant
   drop-rtde               close the RTDE connections, but not the dashboard's
   silence SECONDS         send nothing on any port
+  hold-back SECONDS       send nothing on any port, and all of it later, as after a short pull of the cable
   registers-in-use        refuse input registers as if a fieldbus had them
   upper-registers-in-use  refuse those from 24 on as if another RTDE client had them
   local-control           leave remote control

@@ -43,9 +43,15 @@ class UrArm:
     """A connection for samples, one for control, and the dashboard when needed."""
 
     def __init__(
-        self, settings: UrSettings, registers: ScriptRegisters = UPPER, primary: PrimaryPort | None = None
+        self,
+        settings: UrSettings,
+        registers: ScriptRegisters = UPPER,
+        primary: PrimaryPort | None = None,
+        receiver: type[RtdeReceiver] = RtdeReceiver,
     ) -> None:
         """Connect without starting a program, so that this works in a protective stop.
+
+        `receiver` is the connection for samples and deadlines.
 
         Raises:
             RuntimeError: ur-rtde failed.
@@ -56,7 +62,7 @@ class UrArm:
         self._primary = primary
         if reason := why_other_client():
             raise RobotLostError("version", f"{reason[0].upper()}{reason[1:]}.")
-        self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3, registers)
+        self._receiver = receiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3, registers)
         kind = rtde_control.RTDEControlInterface
         watchdog_ns = 1e9 / settings.watchdog_hz
         # The thread that ur-rtde starts here inherits the slack; 0 gives this one its default again.

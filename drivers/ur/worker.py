@@ -21,6 +21,7 @@ from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import (
     REMOTE_CURE,
     SERIAL_NUMBER,
+    RtdeReceiver,
     ask_dashboard,
     check_generation,
     check_ports,
@@ -101,10 +102,13 @@ class Pipe:
             self.open = False
 
 
-def main(adapted: Callable[[UrSettings], UrSettings] | None = None) -> NoReturn:
+def main(
+    adapted: Callable[[UrSettings], UrSettings] | None = None, receiver: type[RtdeReceiver] = RtdeReceiver
+) -> NoReturn:
     """Run until disconnected, or until the daemon or the controller is gone.
 
-    `adapted` returns the settings to drive with, where these are not the daemon's.
+    `adapted` returns the settings to drive with, where these are not the daemon's; `receiver` is the connection for
+    samples and deadlines.
     """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     # The daemon receives the terminal's and the service manager's signals too, and decides when to stop.
@@ -120,7 +124,7 @@ def main(adapted: Callable[[UrSettings], UrSettings] | None = None) -> NoReturn:
             _exit(EXIT_DONE)
         if adapted is not None:
             settings = adapted(settings)
-        control(pipe, settings, connect(pipe, settings))
+        control(pipe, settings, connect(pipe, settings, receiver))
     except RobotLostError as error:
         pipe.send(messages.Failed(error.kind, str(error)))
         _exit(EXIT_FAILED)
@@ -142,7 +146,7 @@ def receive_settings(pipe: Pipe) -> UrSettings | None:
     return None
 
 
-def connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
+def connect(pipe: Pipe, settings: UrSettings, receiver: type[RtdeReceiver] = RtdeReceiver) -> "UrArm":
     """Return the arm behind its connected clients; raises RobotLostError."""
     _set_alarm(settings.connect_timeout_s)
     pipe.send(messages.WorkerPhase("loading ur-rtde"))
@@ -163,7 +167,7 @@ def connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
             raise registers_in_use(host)
         warning = " ".join(filter(None, (untested_sentence(version), primary.warning)))
         pipe.send(messages.WorkerPhase("connecting", warning, controller))
-        return UrArm(settings, registers, primary)
+        return UrArm(settings, registers, primary, receiver)
     except RuntimeError as error:
         text = str(error)
         if "already in use" in text:

@@ -9,9 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shearloop.drivers.defaults import RTDE_PORT
 from shearloop.emulators import ur_controller
 from shearloop.emulators.ur_robot import Robot
 from shearloop.emulators.ur_rtde import RtdeSession, pack, package, unpack, variable
+from tests.emulator_process import own_address
 from tests.slices import slices
 
 GREETING = package(ord("V"), b"\x00\x02") + package(ord("v"), b"")
@@ -23,6 +25,10 @@ CONVERSATION = (
     + package(ord("S"), b"")
     + package(ord("U"), struct.pack(">Bid", 1, 9, 0.25))
 )
+
+# A header, the number of the recipe, and a timestamp, six angles and a mode.
+DATA_BYTES = 3 + 1 + 8 + 6 * 8 + 4
+HOST = own_address(2)
 
 
 def session() -> RtdeSession:
@@ -134,3 +140,37 @@ async def test_clock_runs_on_while_the_emulator_is_paused(monkeypatch):
             pass
     assert variable(robot, "timestamp") == pytest.approx(0.304, abs=0.004)
     assert robot.time_s == pytest.approx(0.024, abs=0.004)
+
+
+async def test_what_is_held_back_comes_late_and_whole(monkeypatch):
+    now_s = 50.0
+    monkeypatch.setattr(ur_controller, "time", SimpleNamespace(monotonic=lambda: now_s))
+    controller = ur_controller.Controller(Robot(), host=HOST)
+    received = bytearray()
+
+    async def pass_time() -> None:
+        async for _ in controller.run():
+            pass
+
+    async def receive(reader: asyncio.StreamReader) -> None:
+        while data := await reader.read(65536):
+            received.extend(data)
+
+    async with controller.open():
+        reader, writer = await asyncio.open_connection(HOST, RTDE_PORT)
+        writer.write(CONVERSATION)
+        await reader.readuntil(package(ord("S"), b"\x01"))
+        controller.command("hold-back 0.5")
+        tasks = [asyncio.create_task(pass_time()), asyncio.create_task(receive(reader))]
+        while len(received) < 80 * DATA_BYTES:
+            assert not received or now_s >= 50.5
+            now_s += 0.008
+            await asyncio.sleep(0.004)
+        writer.close()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    whole = len(received) // DATA_BYTES * DATA_BYTES
+    times_s = [struct.unpack_from(">d", content, 1)[0] for _, content in replies(bytes(received[:whole]))]
+    assert times_s[0] < 0.1
+    assert max(np.diff(times_s)) < 0.05

@@ -21,8 +21,10 @@ SPEED_RAD_PER_S: Final = 0.2
 SIGMAS: Final = 4.0
 _LEAST_REST_RAD_PER_S: Final = 0.002
 TRACKING: Final = 0.03
-# Either way from the confirmed pose; the distance to the bound is for braking.
+# Later stages turn by this, either way from the confirmed pose; the distance to the bound is for braking.
 TURN_RAD: Final = 0.08
+# In this stage no brake is known yet: the distance also holds one of 0.5 rad/s², an eighth of the usual, and the delay.
+FIRST_TURN_RAD: Final = 0.05
 _SLIDER: Final = 0.5
 _COMES_TO_REST_S: Final = 3.0
 
@@ -71,15 +73,15 @@ def measure(context: Context) -> Measured:
     mover, middle_rad = context.ready(), context.pose_rad
     count, speed = context.counts.turns, min(SPEED_RAD_PER_S, context.settings.limits.wrist_speed_rad_per_s.inner)
     context.operator.allow(
-        f"wrist 3 turns {count} times between {middle_rad - TURN_RAD:.3f} and {middle_rad + TURN_RAD:.3f} rad at "
-        f"{speed:g} rad/s; the gripper is empty"
+        f"wrist 3 turns {count} times between {middle_rad - FIRST_TURN_RAD:.3f} and "
+        f"{middle_rad + FIRST_TURN_RAD:.3f} rad at {speed:g} rad/s; the gripper is empty"
     )
     turns = []
-    mover.move("turn", rad_per_s=-speed, to_rad=middle_rad - TURN_RAD)
+    mover.move("turn", rad_per_s=-speed, to_rad=middle_rad - FIRST_TURN_RAD)
     for number in range(count):
         sign = 1.0 if number % 2 == 0 else -1.0
         context.comes_to_rest(_COMES_TO_REST_S)
-        asked_ns = mover.request("turn", rad_per_s=sign * speed, to_rad=middle_rad + sign * TURN_RAD)
+        asked_ns = mover.request("turn", rad_per_s=sign * speed, to_rad=middle_rad + sign * FIRST_TURN_RAD)
         sent = mover.event("sent", asked_ns, _COMES_TO_REST_S)
         if (refusal := mover.ended(asked_ns)) or sent is None:
             raise UserError(f"the wrist did not turn: {refusal}")
@@ -168,8 +170,8 @@ def _slider(context: Context) -> Line:
     context.observer.wait_for(
         lambda seen: abs(seen.outputs.speed_slider - _SLIDER) < 0.2, context.observer.latest().made_ns, 5.0
     )
-    context.operator.allow(f"a turn of {TURN_RAD:g} rad at {SPEED_RAD_PER_S:g} rad/s, which has to be refused")
-    refusal = mover.ended(mover.request("turn", rad_per_s=SPEED_RAD_PER_S, to_rad=here_rad + TURN_RAD))
+    context.operator.allow(f"a turn of {FIRST_TURN_RAD:g} rad at {SPEED_RAD_PER_S:g} rad/s, which has to be refused")
+    refusal = mover.ended(mover.request("turn", rad_per_s=SPEED_RAD_PER_S, to_rad=here_rad + FIRST_TURN_RAD))
     context.operator.act("Set the speed slider back to 100 %", Played("it is set for you", ("robot slider 1",)))
     return judged(
         "slider at 50 %",

@@ -23,6 +23,8 @@ READY_WITHIN_S: Final = 30.0
 _AGAIN_S: Final = 1.0
 # With a long deadline: the robot's watchdog alone ends its straight moves in time.
 WATCHDOG_WORKER: Final = "shearloop.tools.commission.watchdog_worker"
+# It fails on a signal while its process lives.
+FAILING_WORKER: Final = "shearloop.tools.commission.failing_worker"
 _ENDS_WITHIN_S: Final = 6.0
 
 
@@ -36,14 +38,13 @@ class Mover(ABC):
     def __init__(self, settings: UrSettings, clock: Clock = REAL_CLOCK) -> None:
         """Take the settings whose limits bound every motion; nothing is started yet."""
         self.settings = settings
+        # The module of the worker.
+        self.worker = WORKER
         self.events: Arrivals[Event] = Arrivals(lambda event: int(event["t_ns"]), clock)
 
     @abstractmethod
-    def start(self, *, worker: str = WORKER) -> None:
-        """Start what drives the robot; it sends the program to the robot where the robot is ready.
-
-        `worker` is the module of the worker, by default the daemon's own.
-        """
+    def start(self) -> None:
+        """Start what drives the robot; it sends the program to the robot where the robot is ready."""
 
     @abstractmethod
     def kill(self) -> None:
@@ -57,11 +58,11 @@ class Mover(ABC):
     def send(self, request: Event) -> None:
         """Send a request."""
 
-    def restart(self, *, worker: str = WORKER, settings: UrSettings | None = None) -> None:
-        """End what drives the robot, and start it again, from here on with these settings if there are any."""
+    def restart(self, *, worker: str | None = None, settings: UrSettings | None = None) -> None:
+        """End what drives the robot, and start it again, from here on with this worker and with these settings."""
         self.kill()
-        self.settings = settings or self.settings
-        self.start(worker=worker)
+        self.worker, self.settings = worker or self.worker, settings or self.settings
+        self.start()
 
     def event(self, kind: str, since_ns: int, within_s: float) -> Event | None:
         """Return the first event of a kind since a moment, or None after `within_s`."""
@@ -108,7 +109,7 @@ class MoverProcess(Mover, Opened):
         super().__init__(settings)
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
-        self._worker = 0
+        self._worker_pid = 0
 
     def open(self) -> None:
         """Start the process."""
@@ -123,9 +124,9 @@ class MoverProcess(Mover, Opened):
                 self._process.wait(_ENDS_WITHIN_S)
         self.kill()
 
-    def start(self, *, worker: str = WORKER) -> None:
+    def start(self) -> None:
         """Start a process and its worker."""
-        command = [sys.executable, "-m", "shearloop.tools.commission.mover_process", worker]
+        command = [sys.executable, "-m", "shearloop.tools.commission.mover_process", self.worker]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._write(encode(self.settings).decode())
         self._reader = threading.Thread(target=self._read, args=(self._process,), name="mover", daemon=True)
@@ -150,7 +151,7 @@ class MoverProcess(Mover, Opened):
         for line in process.stdout:
             event: Event = json.loads(line)
             if event["event"] == "connected":
-                self._worker = event["worker"]
+                self._worker_pid = event["worker"]
             self.events.add(event)
 
     def kill(self) -> None:
@@ -173,16 +174,16 @@ class MoverProcess(Mover, Opened):
 
     def _kill_worker(self) -> None:
         """End the worker, if one is known, and forget it: its number may be another process's later."""
-        if self._worker:
+        if self._worker_pid:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self._worker, signal.SIGKILL)
-        self._worker = 0
+                os.kill(self._worker_pid, signal.SIGKILL)
+        self._worker_pid = 0
 
     def stop_worker(self) -> int:
         """Stop the worker; return the time."""
-        if not self._worker:
+        if not self._worker_pid:
             # Signals to process 0 go to the whole group of this one.
             raise UserError("no worker is known that could be stopped: the robot has not been connected yet")
         stopped_ns = self.events.clock.now_ns()
-        os.kill(self._worker, signal.SIGSTOP)
+        os.kill(self._worker_pid, signal.SIGSTOP)
         return stopped_ns

@@ -33,6 +33,8 @@ from shearloop.drivers.ur.messages import (
 )
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.tools.commission.bounds import LARGEST_M
+from shearloop.tools.commission.failing_worker import CLOSE_RTDE, NO_DEADLINES
+from shearloop.tools.commission.mover import FAILING_WORKER
 
 # What a request may bring about at full speed: signals to the worker, then to this one.
 CAUSES: Final[Mapping[str, tuple[signal.Signals | None, signal.Signals | None]]] = {
@@ -41,7 +43,11 @@ CAUSES: Final[Mapping[str, tuple[signal.Signals | None, signal.Signals | None]]]
     "daemon killed": (None, signal.SIGKILL),
     "daemon stopped": (None, signal.SIGSTOP),
     "daemon and worker killed": (signal.SIGKILL, signal.SIGKILL),
+    "deadline not written": (NO_DEADLINES, None),
+    "RTDE closed": (CLOSE_RTDE, None),
 }
+# The causes for which the worker has to be another one than the daemon's own.
+WORKERS: Final[Mapping[str, str]] = dict.fromkeys(("deadline not written", "RTDE closed"), FAILING_WORKER)
 # At this share of its speed a motion is at full speed.
 _FULL: Final = 0.95
 # A motion that has not ended by then is stopped.

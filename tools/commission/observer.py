@@ -48,12 +48,15 @@ class Observer(Arrivals[Seen]):
         super().__init__(attrgetter("made_ns"), clock)
 
     def interruption(self, since_ns: int, least_ns: int, within_s: float) -> tuple[Seen, Seen] | None:
-        """Return the samples before and after the first interruption since a moment, or None if none comes in time."""
+        """Return the samples before and after the first time without an arrival since a moment; None if there is none.
+
+        After a short one the controller may send what it has made meanwhile, so that no sample is missing.
+        """
         before: list[Seen] = []
 
         def follows(seen: Seen) -> bool:
             before.append(seen)
-            return len(before) > 1 and seen.made_ns - before[-2].made_ns >= least_ns
+            return len(before) > 1 and seen.arrived_ns - before[-2].arrived_ns >= least_ns
 
         after = self.wait_for(follows, since_ns, within_s)
         return (before[-2], after) if after is not None else None

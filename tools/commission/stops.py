@@ -1,20 +1,21 @@
 """Stage 4: each layer that stops a motion, the wrist's at rising speeds: time and way to rest, mode, recovery."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
 from shearloop.daemon.commissioning import Line, Supplied
-from shearloop.drivers.ur.messages import SAFETY_EMERGENCY_STOPS, SAFETY_MODES, SAFETY_NORMAL, SAFETY_REDUCED, tool_axis
+from shearloop.drivers.ur.client import WORKER
+from shearloop.drivers.ur.messages import SAFETY_MODES, SAFETY_NORMAL, SAFETY_REDUCED, tool_axis
 from shearloop.drivers.ur.settings import Six
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S, LARGEST_RAD
 from shearloop.tools.commission.context import STOPS_NEEDED, Context
+from shearloop.tools.commission.hand_stops import stops_by_hand
 from shearloop.tools.commission.mover import WATCHDOG_WORKER
-from shearloop.tools.commission.mover_process import CAUSES
+from shearloop.tools.commission.mover_process import CAUSES, WORKERS
 from shearloop.tools.commission.observer import Seen
-from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, has_failed, judged
 
 STAGE: Final = "4 stops"
@@ -33,8 +34,6 @@ _MODE_AFTER_S: Final = 0.5
 # Two samples of the controller, which may not be the first of their kind.
 _RESOLUTION_S: Final = 0.016
 _SAFE: Final = (SAFETY_NORMAL, SAFETY_REDUCED)
-# The connection is interrupted where no sample is made for this time.
-_INTERRUPTED_NS: Final = 500_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +165,9 @@ def measure(context: Context) -> Measured:
     if has_failed(found):
         return Measured(lines)
     lines += [_watchdog_at_rest(context), _watchdog_in_motion(context)]
-    lines += _by_hand(context, _slowly_rad_per_s(context))
+    by_hand, largest_by_hand_rad = stops_by_hand(context, speeds)
+    lines += by_hand
+    largest_rad = max(largest_rad, largest_by_hand_rad)
     enough = context.counts.stops >= STOPS_NEEDED and passed_rad_per_s > 0
     supplies = (
         Supplied(wrist_speed_rad_per_s=passed_rad_per_s, stop_rad=round(largest_rad, 4)) if enough else Supplied()
@@ -179,13 +180,21 @@ def _all_layers(context: Context, motion: Motion) -> tuple[list[Stop], list[Line
     stops: list[Stop] = []
     count, longest_s = context.counts.stops, context.limits.rest_s(context.settings)
     for layer in CAUSES:
+        _use_worker(context, WORKERS.get(layer, WORKER))
         context.operator.allow(f"{motion.shown.format(count=count)}; each is ended by: {layer}")
         for _ in range(count):
             stops.append(_stop(context, layer, motion))
             lines = judge_stops(stops, motion.at, motion.unit, longest_s)
             if has_failed(lines):
                 return stops, lines
+    _use_worker(context, WORKER)
     return stops, lines
+
+
+def _use_worker(context: Context, worker: str) -> None:
+    """Drive the robot through this worker from here on."""
+    if context.mover.worker != worker:
+        context.mover.restart(worker=worker)
 
 
 def _stop(context: Context, layer: str, motion: Motion) -> Stop:
@@ -298,7 +307,7 @@ def _watchdog_in_motion(context: Context) -> Line:
         rest = context.observer.rest_since(cause["t_ns"], context.settings.rest_rad_per_s, _RESTS_WITHIN_S)
         end_ns, rest_ns = ((seen.made_ns if seen is not None else math.inf) for seen in (ended, rest))
         times_s.append(((end_ns - cause["t_ns"]) / 1e9, (rest_ns - end_ns) / 1e9))
-        mover.restart()
+        mover.restart(worker=WORKER)
     end_s, after_s = max(end for end, _ in times_s), max(after for _, after in times_s)
     context.ready()
     motion.prepare()
@@ -309,90 +318,4 @@ def _watchdog_in_motion(context: Context) -> Line:
         "a program without its client ends in motion, and the arm stops",
         passed=end_s <= longest_s and after_s <= rest_s,
         count=count,
-    )
-
-
-def _by_hand(context: Context, speed: float) -> list[Line]:
-    """Return the lines on the stops that only the operator can bring about."""
-    return [
-        _stopped_by(
-            context,
-            speed,
-            "emergency stop",
-            "press the emergency stop",
-            Played("it is pressed for you", ("robot emergency-stop",)),
-            lambda seen: seen.outputs.safety_mode in SAFETY_EMERGENCY_STOPS,
-            "Make the cell safe, and release the emergency stop",
-        ),
-        _stopped_by(
-            context,
-            speed,
-            "stop at the pendant",
-            "press the stop of the program at the pendant",
-            Played("it is pressed for you", ("robot stop",)),
-            lambda seen: not seen.plays,
-            "",
-        ),
-        _cable(context, speed),
-    ]
-
-
-def _swing(context: Context, speed: float, action: str, played: Played) -> int:
-    """Turn to and fro, and have the operator stop that; return when it began."""
-    mover = context.ready()
-    context.observer.forget()
-    context.operator.allow(
-        f"wrist 3 turns to and fro at {speed:g} rad/s within {LARGEST_RAD:g} rad; during it {action}"
-    )
-    asked_ns = mover.request("swing", rad_per_s=speed, middle_rad=context.pose_rad, by_rad=0.5 * LARGEST_RAD)
-    if context.observer.wait_for(lambda seen: abs(seen.wrist_rad_per_s) > 0.9 * speed, asked_ns, 5.0) is None:
-        raise UserError(f"the wrist did not turn: {mover.ended(asked_ns)}")
-    context.operator.act(f"Now {action}", played)
-    return asked_ns
-
-
-def _stopped_by(
-    context: Context, speed: float, what: str, action: str, played: Played, stopped: Callable[[Seen], bool], after: str
-) -> Line:
-    asked_ns = _swing(context, speed, action, played)
-    first = context.observer.wait_for(stopped, asked_ns, _RESTS_WITHIN_S)
-    rest = None
-    if first is not None:
-        rest = context.observer.rest_since(first.made_ns, context.settings.rest_rad_per_s, _RESTS_WITHIN_S)
-    time_s = (rest.made_ns - first.made_ns) / 1e9 if first is not None and rest is not None else math.inf
-    longest_s = context.limits.rest_s(context.settings)
-    if after:
-        context.operator.act(after, Played("it is released for you", ("robot release",)))
-    refusal = context.mover.unlock()
-    return judged(
-        what,
-        f"{time_s:.3f} s to rest" + (f", then: {refusal}" if refusal else ", recovered"),
-        f"at most {longest_s:g} s, recovery",
-        "a person stops the wrist",
-        passed=time_s <= longest_s and not refusal,
-    )
-
-
-def _cable(context: Context, speed: float) -> Line:
-    """Return the line on a pulled cable: nothing is seen meanwhile, so that the angle counts."""
-    asked_ns = _swing(
-        context,
-        speed,
-        "pull the robot's network cable, wait for 3 s, and plug it in again",
-        Played("it is pulled for you, and plugged in again", ("robot silence 1.2",)),
-    )
-    mover, observer = context.mover, context.observer
-    found = observer.interruption(asked_ns, _INTERRUPTED_NS, 10.0)
-    longest_s = context.limits.rest_s(context.settings)
-    largest_rad = speed * longest_s
-    angle_rad = abs(found[1].wrist_rad - found[0].wrist_rad) if found is not None else math.inf
-    mover.restart()
-    refusal = mover.unlock()
-    return judged(
-        "cable pulled",
-        (f"{angle_rad:.4f} rad" if found is not None else "the connection was not interrupted")
-        + (f", then: {refusal}" if refusal else ", recovered"),
-        f"at most {largest_rad:.4f} rad, as in {longest_s:g} s, and recovery",
-        "the wrist stops without a connection",
-        passed=angle_rad <= largest_rad and not refusal,
     )

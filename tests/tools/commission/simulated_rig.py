@@ -17,7 +17,6 @@ from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand, GripperState, ObjectStatus, fault_of
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.socket_client import ALWAYS, IN_TURN, IN_TURN_S
-from shearloop.drivers.ur.client import WORKER
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import (
@@ -38,8 +37,9 @@ from shearloop.emulators.synthetic_frames import RigFrames
 from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, ControllerSpec
 from shearloop.emulators.ur_rtde import variable
 from shearloop.tools.commission.arrivals import Arrivals
+from shearloop.tools.commission.failing_worker import NO_DEADLINES
 from shearloop.tools.commission.mover import WATCHDOG_WORKER, Mover
-from shearloop.tools.commission.mover_process import CAUSES, Driver
+from shearloop.tools.commission.mover_process import CAUSES, WORKERS, Driver
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
 from tests.drivers.ur import robots
@@ -58,7 +58,13 @@ class SimulatedArm(ScriptedArm):
     def __init__(self, rig: "SimulatedRig", settings: UrSettings) -> None:
         super().__init__(robots.control_script(settings), settings, rig.robot, CYCLE_S)
         self._rig = rig
+        # As the worker of `failing_worker` can be told.
+        self.forgets_deadlines = False
         self.look()
+
+    def _write_deadline(self, left_s: float) -> None:
+        if not self.forgets_deadlines:
+            super()._write_deadline(left_s)
 
     def step(self) -> None:
         self._rig.pass_cycle()
@@ -104,22 +110,22 @@ class SimulatedRobot:
     """The worker, a cycle at a time, as the daemon's client of the robot has it."""
 
     def __init__(self, rig: "SimulatedRig", settings: UrSettings) -> None:
-        self._rig, self._arm = rig, SimulatedArm(rig, settings)
-        self._handler = CommandHandler(settings, self._arm, rig.now_ns())
+        self._rig, self.arm = rig, SimulatedArm(rig, settings)
+        self._handler = CommandHandler(settings, self.arm, rig.now_ns())
         self._number = self._cycle = 0
         self._replies: dict[int, CommandReply] = {}
 
     def cycle(self) -> None:
         """Run a cycle; raises RobotLostError as a worker does."""
-        self._arm.look()
+        self.arm.look()
         self._cycle += 1
-        ended = self._handler.tick(self._arm.reading, self._rig.now_ns())
+        ended = self._handler.tick(self.arm.reading, self._rig.now_ns())
         if ended is not None:
             self._replies[ended[0]] = ended[1]
 
     @property
     def state(self) -> RobotState:
-        return self._handler.state(self._arm.reading, self._cycle)
+        return self._handler.state(self.arm.reading, self._cycle)
 
     async def next_state(self) -> RobotState:
         await _NextCycle()
@@ -128,14 +134,14 @@ class SimulatedRobot:
     async def send(self, command: Command) -> CommandReply:
         self._number += 1
         number = self._number
-        reply = self._handler.request(number, command, self._arm.reading, self._rig.now_ns())
+        reply = self._handler.request(number, command, self.arm.reading, self._rig.now_ns())
         while reply is None:
             await _NextCycle()
             reply = self._replies.pop(number, None)
         return reply
 
     def keep_moving(self) -> None:
-        self._handler.request(0, Heartbeat(), self._arm.reading, self._rig.now_ns())
+        self._handler.request(0, Heartbeat(), self.arm.reading, self._rig.now_ns())
 
 
 class SimulatedMover(Mover):
@@ -149,8 +155,8 @@ class SimulatedMover(Mover):
         self._running: Coroutine[Any, Any, None] | None = None
         self._daemon_runs = False
 
-    def start(self, *, worker: str = WORKER) -> None:
-        settings = for_watchdog_alone(self.settings) if worker == WATCHDOG_WORKER else self.settings
+    def start(self) -> None:
+        settings = for_watchdog_alone(self.settings) if self.worker == WATCHDOG_WORKER else self.settings
         self._robot = SimulatedRobot(self._rig, settings)
         self._driver, self._daemon_runs = Driver(settings, self._robot, self), True
 
@@ -193,8 +199,11 @@ class SimulatedMover(Mover):
 
     def bring_about(self, cause: str) -> None:
         to_worker, to_daemon = CAUSES[cause]
+        assert cause not in WORKERS or self.worker == WORKERS[cause]
         self.report("cause", cause=cause)
-        if to_worker is not None:
+        if to_worker == NO_DEADLINES:
+            self._robot.arm.forgets_deadlines = True
+        elif to_worker is not None:
             self._robot = None
         if to_daemon is not None:
             self._daemon_runs = False
@@ -291,7 +300,9 @@ class SimulatedRig:
         )
         self.robot = self.emulated.controller.robot
         self.clock = SimulatedClock(self)
-        self._silent_until_s = -math.inf
+        # Until then nothing comes from the robot. The observer gets what is held back later.
+        self._silent_until_s, self._holds_back = -math.inf, False
+        self._held: list[tuple[int, RtdeOutputs]] = []
         self._mover: SimulatedMover | None = None
         self._observer: Observer | None = None
         self._boards = {
@@ -321,8 +332,12 @@ class SimulatedRig:
         """Let a cycle of the controller pass, in which the devices measure."""
         self.robot.step(CYCLE_S)
         now_ns = self.now_ns()
+        if self._observer is not None and (self._holds_back or not self.is_silent):
+            self._held.append((now_ns, self.outputs(UPPER)))
         if self._observer is not None and not self.is_silent:
-            self._observer.add(Seen(now_ns, now_ns, self.outputs(UPPER)))
+            for made_ns, outputs in self._held:
+                self._observer.add(Seen(made_ns, now_ns, outputs))
+            self._held.clear()
         for one in self._boards.values():
             if self.robot.clock_s >= one.due_s:
                 one.due_s += one.period_s
@@ -335,7 +350,9 @@ class SimulatedRig:
         """Carry out a command of `emulate rig`."""
         match command.split():
             case ["silence", "robot", seconds] | ["robot", "silence", seconds]:
-                self._silent_until_s = self.robot.clock_s + float(seconds)
+                self._silent_until_s, self._holds_back = self.robot.clock_s + float(seconds), False
+            case ["robot", "hold-back", seconds]:
+                self._silent_until_s, self._holds_back = self.robot.clock_s + float(seconds), True
             case _:
                 self.emulated.command(command)
         # As an operator does, until everything rests.

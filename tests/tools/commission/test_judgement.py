@@ -19,6 +19,7 @@ from shearloop.tools.commission.boards import judge_frames, judge_load
 from shearloop.tools.commission.bounds import LARGEST_RAD, LARGEST_RAD_PER_S, bounded
 from shearloop.tools.commission.curves import middle_s, step_s
 from shearloop.tools.commission.gripper import judge_widths
+from shearloop.tools.commission.hand_stops import HandStop, hand_speeds, judge_hand_stops
 from shearloop.tools.commission.limits import EMULATED, REAL
 from shearloop.tools.commission.motion import SIGMAS, Turn, judge_noise
 from shearloop.tools.commission.observer import Seen
@@ -121,6 +122,47 @@ GOOD = Stop("worker killed", 0.15, 0.02, 1, "")
 )
 def test_one_bad_stop_fails_its_line(stop, lines):
     assert failed(judge_stops([GOOD, stop], "at 0.2 rad/s", "rad", REAL.rest_s(DELIVERED))) == lines
+
+
+HAND = HandStop(0.5, 0.47, 0.05, 0.02, 1)
+
+
+@pytest.mark.parametrize(
+    ("stop", "asked", "verdict"),
+    [
+        (HAND, 2, "passed"),
+        (HAND, 3, "failed"),
+        (dataclasses.replace(HAND, time_s=0.21), 2, "failed"),
+        (dataclasses.replace(HAND, time_s=math.inf, rad=math.inf), 2, "failed"),
+        (dataclasses.replace(HAND, time_s=None, rad=0.09), 2, "passed"),
+        (dataclasses.replace(HAND, time_s=None, rad=0.11), 2, "failed"),
+        (dataclasses.replace(HAND, refusal="no"), 2, "failed"),
+        (dataclasses.replace(HAND, safety_mode=7), 2, "passed"),
+    ],
+)
+def test_a_stop_by_hand_is_judged_by_time_angle_and_recovery(stop, asked, verdict):
+    line = judge_hand_stops("emergency stop", [HAND, stop], asked, REAL.rest_s(DELIVERED))
+    assert (line.verdict, line.count) == (verdict, 2)
+
+
+def test_a_line_on_stops_by_hand_has_time_angle_mode_recovery_and_count():
+    stops = [dataclasses.replace(HAND, asked_rad_per_s=0.05, time_s=0.03), dataclasses.replace(HAND, safety_mode=7)]
+    line = judge_hand_stops("emergency stop", stops, 2, 0.2)
+    for part in ("0.030 to 0.050 s", "0.0200 rad", "0.47 rad/s", "robot emergency stop", "recovery 2 of 2"):
+        assert part in line.value
+    assert judge_hand_stops("cable pulled", [], 5, 0.2, "never").value == "never"
+
+
+@pytest.mark.parametrize(
+    ("passed", "count", "speeds"),
+    [
+        ((0.05, 0.2, 0.5), 5, [0.05, 0.2, 0.5, 0.5, 0.5]),
+        ((0.05, 0.2, 0.45), 2, [0.05, 0.2]),
+        ((0.2,), 3, [0.2, 0.2, 0.2]),
+    ],
+)
+def test_stops_by_hand_come_once_at_each_speed_and_then_at_the_largest(passed, count, speeds):
+    assert hand_speeds(passed, count) == speeds
 
 
 READING = Reading(SIX, 0.5, 0.02)

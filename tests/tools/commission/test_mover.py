@@ -5,16 +5,22 @@ import io
 import json
 import os
 import signal
+import socket
 import subprocess
 
 import pytest
 
+from shearloop.drivers.defaults import RTDE_PORT
+from shearloop.drivers.ur.control_box import RtdeReceiver
 from shearloop.errors import UserError
 from shearloop.tools.commission import mover
+from shearloop.tools.commission.failing_worker import ForgetfulReceiver, close_rtde
 from shearloop.tools.commission.mover import MoverProcess
 from shearloop.tools.commission.mover_process import Driver
 from tests.drivers.ur.robots import DELIVERED
+from tests.emulator_process import own_address
 
+HOST = own_address(6)
 WORKER, LATER_WORKER = 4_190_001, 4_190_002
 
 
@@ -89,3 +95,36 @@ def test_a_request_that_fails_is_reported(capsys):
     assert (event, facts["do"]) == ("ended", "turn")
     assert "rad_per_s" in str(facts["refusal"])
     assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_worker_without_deadlines_writes_none_from_its_signal_on(monkeypatch):
+    class Receiver(ForgetfulReceiver):
+        """One of this test's own."""
+
+        def __init__(self) -> None:
+            """Connect nowhere."""
+
+    written: list[int] = []
+    monkeypatch.setattr(RtdeReceiver, "write_deadline", lambda _, ticks: written.append(ticks))
+    receiver = Receiver()
+    receiver.write_deadline(3)
+    Receiver.forget()
+    receiver.write_deadline(4)
+    assert written == [3]
+
+
+def test_a_worker_closes_each_of_its_connections_to_rtde_and_no_other():
+    with socket.create_server((HOST, RTDE_PORT)) as rtde, socket.create_server((HOST, 0)) as other:
+        ends = []
+        for server in (rtde, rtde, other):
+            client = socket.create_connection(server.getsockname())
+            ends.append((client, server.accept()[0]))
+        close_rtde()
+        for client, peer in ends:
+            client.settimeout(5.0)
+            with client, peer:
+                if client.getpeername()[1] != RTDE_PORT:
+                    peer.sendall(b"x")
+                    assert client.recv(1) == b"x"
+                else:
+                    assert client.recv(1) == b""

@@ -15,6 +15,7 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.rig import open_settings
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Counts
+from shearloop.tools.commission.mover_process import CAUSES
 from shearloop.tools.commission.operator import DeclinedError
 from shearloop.tools.commission.procedure import STAGES, commission
 from tests.paper_curve import paper_curve
@@ -77,6 +78,15 @@ class Lab:
             if command == before:
                 self.rig.robot.arm.q_rad = self.rig.robot.arm.q_rad + np.array([0.0] * 5 + [rad])
             self.rig.order(command)
+
+        self.operator = ScriptedOperator(order, self.rig.stop_program)
+
+    def do_instead(self, of: str, others: list[list[str]]) -> None:
+        """Have the operator do something else the first times: each time some commands, or nothing."""
+
+        def order(command: str) -> None:
+            for one in others.pop(0) if command == of and others else [command]:
+                self.rig.order(one)
 
         self.operator = ScriptedOperator(order, self.rig.stop_program)
 
@@ -155,9 +165,11 @@ FAULTS = [
 
 @pytest.mark.parametrize(("fault", "stage", "line"), FAULTS)
 def test_each_seeded_fault_turns_its_own_line_red(lab, fault, stage, line):
+    """The procedure runs as a whole up to the line; for those of late stages, which take long, its stage does."""
     lab.rig.order(fault)
-    report, _ = lab.run(stage)
+    report, _ = lab.run("" if stage <= "4" else stage)
     assert failed(report) == [line]
+    assert report.stages[-1].stage.startswith(stage)
 
 
 def test_an_answer_of_12_ms_a_variable_is_fast_enough_for_the_daemon(lab):
@@ -188,3 +200,51 @@ def test_a_faster_stop_is_raised_by_five_of_each_layer(lab):
     assert failed(report) == []
     assert report.supplied().wrist_speed_rad_per_s == 0.2
     assert 0 < report.supplied().stop_rad < 0.05
+    lines = {line.what: line for line in report.stages[0].lines}
+    for what in ("emergency stop", "stop at the pendant", "cable pulled"):
+        assert lines[what].count == 5
+        assert "recovery 5 of 5" in lines[what].value
+    assert "then robot emergency stop" in lines["emergency stop"].value
+    for layer in CAUSES:
+        assert lines[f"{layer} at 0.2 rad/s"].count == 5
+    asked = [question for question in lab.operator.asked if "Now pull" in question]
+    assert [
+        f"stop {n} of 5, at {speed} rad/s" in question
+        for n, speed, question in zip(range(1, 6), (0.05, 0.2, 0.2, 0.2, 0.2), asked, strict=True)
+    ] == [True] * 5
+    allowed = [question for question in lab.operator.asked if "pull" in question and "MOTION" in question]
+    assert len(allowed) == 1
+    assert "5 times" in allowed[0]
+    assert "0.05, 0.2, 0.2, 0.2, 0.2 rad/s" in allowed[0]
+
+
+def cable_line(report):
+    (line,) = (line for line in report.stages[0].lines if line.what == "cable pulled")
+    return line
+
+
+def test_a_cable_whose_samples_come_late_shows_the_whole_stop(lab):
+    lab.do_instead("silence robot 1.2", [["robot hold-back 1.2"]])
+    report, _ = lab.run("4")
+    assert failed(report) == []
+    assert "s to rest" in cable_line(report).value
+
+
+@pytest.mark.parametrize(
+    ("first", "verdict"), [([["robot silence 0.2"]], "passed"), ([[], []], "passed"), ([[], [], []], "failed")]
+)
+def test_a_cable_that_was_pulled_too_shortly_or_not_at_all_is_asked_for_again(lab, first, verdict):
+    lab.do_instead("silence robot 1.2", list(first))
+    report, _ = lab.run("4")
+    assert cable_line(report).verdict == verdict
+    assert len([question for question in lab.operator.asked if "Now pull" in question]) == min(3, len(first) + 1)
+    assert ("not interrupted" in cable_line(report).value) == (verdict == "failed")
+
+
+def test_an_emergency_stop_of_a_wrist_that_stands_is_none(lab):
+    """A swing ends by itself while nobody presses."""
+    lab.do_instead("emergency-stop", [["object none"] * 80 + ["emergency-stop"]])
+    report, _ = lab.run("4")
+    assert failed(report) == []
+    assert "ended its turn before the stop" in " ".join(lab.operator.said)
+    assert "0.000 to" not in next(line.value for line in report.stages[0].lines if line.what == "emergency stop")

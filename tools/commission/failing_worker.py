@@ -1,0 +1,52 @@
+"""The worker that fails on a signal while its process lives, so that the script on the robot alone stops the arm.
+
+`python -m shearloop.tools.commission.failing_worker`, as the daemon's own. After `NO_DEADLINES` it goes on without
+writing a deadline; `CLOSE_RTDE` closes its RTDE connections.
+"""
+
+import os
+import signal
+import socket
+from contextlib import suppress
+from pathlib import Path
+from typing import ClassVar, Final
+
+from shearloop.drivers.defaults import RTDE_PORT
+from shearloop.drivers.ur.control_box import RtdeReceiver
+from shearloop.drivers.ur.worker import main
+
+NO_DEADLINES: Final = signal.SIGUSR1
+CLOSE_RTDE: Final = signal.SIGUSR2
+
+
+class ForgetfulReceiver(RtdeReceiver):
+    """A connection whose deadlines can end."""
+
+    _forgets: ClassVar[bool] = False
+
+    @classmethod
+    def forget(cls) -> None:
+        """Write no deadline from now on."""
+        cls._forgets = True
+
+    def write_deadline(self, script_ticks: int) -> None:
+        """Write when the motion has to end, unless deadlines have ended."""
+        if not self._forgets:
+            super().write_deadline(script_ticks)
+
+
+def close_rtde() -> None:
+    """Close every RTDE connection of this process, whoever holds it."""
+    for entry in Path("/proc/self/fd").iterdir():
+        if not entry.is_socket():
+            continue
+        # A socket without a peer has no name of one, and is none of RTDE.
+        with socket.socket(fileno=os.dup(int(entry.name))) as connection, suppress(OSError):
+            if connection.getpeername()[1] == RTDE_PORT:
+                connection.shutdown(socket.SHUT_RDWR)
+
+
+if __name__ == "__main__":
+    signal.signal(NO_DEADLINES, lambda *_: ForgetfulReceiver.forget())
+    signal.signal(CLOSE_RTDE, lambda *_: close_rtde())
+    main(receiver=ForgetfulReceiver)

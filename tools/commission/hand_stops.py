@@ -1,0 +1,248 @@
+"""The stops of stage 4 that only a person can bring about: emergency stop, stop at the pendant, pulled cable."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+from shearloop.daemon.commissioning import Line
+from shearloop.drivers.ur.messages import SAFETY_EMERGENCY_STOPS, SAFETY_MODES
+from shearloop.errors import UserError
+from shearloop.tools.commission.bounds import LARGEST_RAD
+from shearloop.tools.commission.context import Context
+from shearloop.tools.commission.observer import Observer, Seen
+from shearloop.tools.commission.operator import NOTHING_TO_DO, Played
+from shearloop.tools.commission.report import judged
+
+# Where the wrist turns round, from the pose.
+_TURNS_ROUND_RAD: Final = 0.5 * LARGEST_RAD
+_STARTS_WITHIN_S: Final = 5.0
+_RESTS_WITHIN_S: Final = 5.0
+# A stop that was brought about is seen by then, and the controller again after a pulled cable.
+_SEEN_WITHIN_S: Final = 5.0
+_CONNECTED_WITHIN_S: Final = 20.0
+# A mode that follows a stop has come by then.
+_MODE_AFTER_S: Final = 0.5
+# The connection was interrupted where no sample came for this time; the wrist has stopped long before.
+INTERRUPTED_NS: Final = 500_000_000
+# A wrist that turned until the stop was at half its speed within this time before: it stands while it turns round.
+_TURNED_WITHIN_NS: Final = 500_000_000
+# How often a stop that was not seen is asked for.
+_TRIES: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What the observer saw of a stop: the last sample before it, and the first one at rest, if there is one.
+
+    `whole`: samples of the whole way were received, so that the time to rest is known too.
+    """
+
+    before: Seen
+    rest: Seen | None
+    whole: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class HandStop:
+    """One stop: the speed that was asked for, the one before the stop, time and angle to rest, mode, why no recovery.
+
+    The time is None where nothing was seen until rest, and infinite for an arm that did not come to rest.
+    """
+
+    asked_rad_per_s: float
+    rad_per_s: float
+    time_s: float | None
+    rad: float
+    safety_mode: int
+    refusal: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One way to stop the wrist by hand; `find` returns the stop, or None where it is not seen."""
+
+    what: str
+    action: str
+    played: Played
+    find: Callable[[Context, int], Found | None]
+    unseen: str
+    # What the operator does before the recovery.
+    after: str = ""
+    played_after: Played | None = None
+    # Whether the processes that drive the robot have lost it.
+    loses_robot: bool = False
+
+
+def _found_since(context: Context, asked_ns: int, stopped: Callable[[Seen], bool]) -> Found | None:
+    """Return the stop that begins with the first sample that `stopped` is true of."""
+    observer = context.observer
+    first = observer.wait_for(stopped, asked_ns, _SEEN_WITHIN_S)
+    before = observer.since(asked_ns, first.made_ns) if first is not None else []
+    if first is None or not before:
+        return None
+    return Found(before[-1], observer.rest_since(first.made_ns, context.settings.rest_rad_per_s, _RESTS_WITHIN_S))
+
+
+def _emergency_stop(context: Context, asked_ns: int) -> Found | None:
+    return _found_since(context, asked_ns, lambda seen: seen.outputs.safety_mode in SAFETY_EMERGENCY_STOPS)
+
+
+def _program_stop(context: Context, asked_ns: int) -> Found | None:
+    return _found_since(context, asked_ns, lambda seen: not seen.plays)
+
+
+def _outage(context: Context, asked_ns: int) -> Found | None:
+    """Return the stop at an outage. Of a short one the samples may come late, and show the whole way."""
+    observer = context.observer
+    gap = observer.interruption(asked_ns, INTERRUPTED_NS, _CONNECTED_WITHIN_S)
+    if gap is None:
+        return None
+    before, _ = gap
+    rest = observer.rest_since(before.made_ns, context.settings.rest_rad_per_s, _RESTS_WITHIN_S)
+    return Found(before, rest, whole=rest is not None and _is_whole(observer, before, rest))
+
+
+def _is_whole(observer: Observer, before: Seen, rest: Seen) -> bool:
+    """Return whether no sample is missing between two."""
+    samples = observer.since(before.made_ns, rest.made_ns + 1)
+    return all(later.made_ns - one.made_ns < INTERRUPTED_NS for one, later in pairwise(samples))
+
+
+LAYERS: Final = (
+    Layer(
+        "emergency stop",
+        "press the emergency stop",
+        Played("it is pressed for you", ("robot emergency-stop",)),
+        _emergency_stop,
+        "No emergency stop was seen.",
+        "Make the cell safe, and release the emergency stop",
+        Played("it is released for you", ("robot release",)),
+    ),
+    Layer(
+        "stop at the pendant",
+        "press the stop of the program at the pendant",
+        Played("it is pressed for you", ("robot stop",)),
+        _program_stop,
+        "The end of the program was not seen.",
+    ),
+    Layer(
+        "cable pulled",
+        "pull the robot's network cable, wait for 5 s, and plug it in again",
+        Played("it is pulled for you, and plugged in again", ("robot silence 1.2",)),
+        _outage,
+        f"The connection was not interrupted for {INTERRUPTED_NS / 1e9:g} s.",
+        loses_robot=True,
+    ),
+)
+
+
+def hand_speeds(passed_rad_per_s: Sequence[float], count: int) -> list[float]:
+    """Return the speed of each stop by hand: each speed once in rising order, and the largest for all that are left."""
+    return [passed_rad_per_s[min(number, len(passed_rad_per_s) - 1)] for number in range(count)]
+
+
+def stops_by_hand(context: Context, passed_rad_per_s: Sequence[float]) -> tuple[list[Line], float]:
+    """Have each layer stop the wrist at speeds that all other layers passed; return the lines and the largest angle."""
+    speeds = hand_speeds(passed_rad_per_s, context.counts.stops)
+    lines: list[Line] = []
+    largest_rad = 0.0
+    for layer in LAYERS:
+        shown = ", ".join(f"{speed:g}" for speed in speeds)
+        context.operator.allow(
+            f"wrist 3 turns to and fro within {LARGEST_RAD:g} rad of the pose, {len(speeds)} times until you stop it, "
+            f"at {shown} rad/s; during each turn {layer.action}"
+        )
+        stops: list[HandStop] = []
+        for number, speed in enumerate(speeds, 1):
+            stop = _stop(context, layer, speed, f"{number} of {len(speeds)}, at {speed:g} rad/s")
+            if stop is None:
+                break
+            stops.append(stop)
+        unseen = "" if len(stops) == len(speeds) else layer.unseen
+        lines.append(judge_hand_stops(layer.what, stops, len(speeds), context.limits.rest_s(context.settings), unseen))
+        largest_rad = max([largest_rad, *(stop.rad for stop in stops)])
+    return lines, largest_rad
+
+
+def _stop(context: Context, layer: Layer, speed: float, which: str) -> HandStop | None:
+    """Turn to and fro, have the operator stop that, and recover; return None where no stop is seen after some tries."""
+    for _ in range(_TRIES):
+        asked_ns = _swing(context, speed)
+        context.operator.act(
+            f"Now {layer.action} (stop {which}). After your word the arm gets ready, for the next turn", layer.played
+        )
+        found = layer.find(context, asked_ns)
+        context.observer.listen(_MODE_AFTER_S)
+        mode = context.observer.latest().outputs.safety_mode
+        if layer.after and mode in SAFETY_EMERGENCY_STOPS:
+            context.operator.act(layer.after, layer.played_after or NOTHING_TO_DO)
+        if found is None:
+            context.operator.say(f"{layer.unseen} The stop is asked for again.")
+        elif not _turned(context.observer, asked_ns, found.before, speed):
+            context.operator.say("The wrist had ended its turn before the stop. The stop is asked for again.")
+        else:
+            if layer.loses_robot:
+                context.mover.restart()
+            return _hand_stop(speed, found, mode, context.mover.unlock())
+        context.mover.restart()
+    return None
+
+
+def _swing(context: Context, speed: float) -> int:
+    """Begin to turn to and fro; return when that was asked for."""
+    mover = context.ready()
+    context.observer.forget()
+    asked_ns = mover.request("swing", rad_per_s=speed, middle_rad=context.pose_rad, by_rad=_TURNS_ROUND_RAD)
+    turns = context.observer.wait_for(lambda seen: abs(seen.wrist_rad_per_s) > 0.9 * speed, asked_ns, _STARTS_WITHIN_S)
+    if turns is None:
+        raise UserError(f"the wrist did not turn: {mover.ended(asked_ns)}")
+    return asked_ns
+
+
+def _turned(observer: Observer, asked_ns: int, before: Seen, speed: float) -> bool:
+    """Return whether the wrist turned until a stop: a swing ends by itself after a while."""
+    since_ns = max(asked_ns, before.made_ns - _TURNED_WITHIN_NS)
+    return any(abs(seen.wrist_rad_per_s) > 0.5 * speed for seen in observer.since(since_ns, before.made_ns + 1))
+
+
+def _hand_stop(speed: float, found: Found, mode: int, refusal: str) -> HandStop:
+    before, rest = found.before, found.rest
+    time_s: float | None = math.inf
+    if rest is not None:
+        time_s = (rest.made_ns - before.made_ns) / 1e9 if found.whole else None
+    angle_rad = abs(rest.wrist_rad - before.wrist_rad) if rest is not None else math.inf
+    return HandStop(speed, abs(before.wrist_rad_per_s), time_s, angle_rad, mode, refusal)
+
+
+def judge_hand_stops(what: str, stops: Sequence[HandStop], asked: int, longest_s: float, unseen: str = "") -> Line:
+    """Return the line on all stops of a layer: time and angle to rest, mode and recovery; `unseen` is why some lack."""
+    limit = f"at most {longest_s:g} s, and the angle at the asked speed meanwhile; recovery {asked} of {asked}"
+    promise = "a person, or a lost connection, stops the wrist"
+    if not stops:
+        return judged(what, unseen, limit, promise, passed=False, count=0)
+    times_s = [stop.time_s for stop in stops if stop.time_s is not None]
+    time = f"{min(times_s):.3f} to {max(times_s):.3f} s to rest" if times_s else "time to rest not seen"
+    angle = f"up to {max(stop.rad for stop in stops):.4f} rad"
+    speeds = [stop.rad_per_s for stop in stops]
+    modes = ", ".join(dict.fromkeys(_mode_name(stop.safety_mode) for stop in stops))
+    failed = [stop.refusal for stop in stops if stop.refusal]
+    recovery = f"recovery {len(stops) - len(failed)} of {asked}" + (f": {failed[0]}" if failed else "")
+    parts = [time, angle, f"from {min(speeds):.2f} to {max(speeds):.2f} rad/s", f"then {modes}", recovery, unseen]
+    return judged(
+        what,
+        "; ".join(filter(None, parts)),
+        limit,
+        promise,
+        passed=len(stops) == asked and not failed and all(_is_short(stop, longest_s) for stop in stops),
+        count=len(stops),
+    )
+
+
+def _is_short(stop: HandStop, longest_s: float) -> bool:
+    return (stop.time_s is None or stop.time_s <= longest_s) and stop.rad <= stop.asked_rad_per_s * longest_s
+
+
+def _mode_name(mode: int) -> str:
+    return SAFETY_MODES.get(mode, f"unknown mode {mode}")

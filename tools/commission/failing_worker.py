@@ -38,12 +38,17 @@ class ForgetfulReceiver(RtdeReceiver):
 def close_rtde() -> None:
     """Close every RTDE connection of this process, whoever holds it."""
     for entry in Path("/proc/self/fd").iterdir():
-        if not entry.is_socket():
-            continue
-        # A socket without a peer has no name of one, and is none of RTDE.
-        with socket.socket(fileno=os.dup(int(entry.name))) as connection, suppress(OSError):
-            if connection.getpeername()[1] == RTDE_PORT:
-                connection.shutdown(socket.SHUT_RDWR)
+        # A socket without a peer, or one that was closed meanwhile, is none of RTDE.
+        with suppress(OSError):
+            if entry.is_socket():
+                _shut_down(os.dup(int(entry.name)))
+
+
+def _shut_down(fd: int) -> None:
+    """Close a connection to RTDE, for all who hold it."""
+    with socket.socket(fileno=fd) as connection:
+        if connection.getpeername()[1] == RTDE_PORT:
+            connection.shutdown(socket.SHUT_RDWR)
 
 
 if __name__ == "__main__":

@@ -102,8 +102,8 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
         if failed := [one.stage for one in context.report.stages if not one.passed and one.stage < stage]:
             raise UserError(f"stage {failed[0]} failed: mend it and run it again before stage {stage}")
         operator.say(f"Stage {stage}")
-        context.operator = left.before(stage)
-        measured = measure(context)
+        with left.during(stage) as context.operator:
+            measured = measure(context)
         result = StageResult(
             stage=stage,
             operator=name,

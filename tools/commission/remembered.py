@@ -1,5 +1,7 @@
 """What the last program left of a robot: a commissioning shows it, and begins once the operator has acknowledged it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Self
@@ -9,7 +11,7 @@ from shearloop.daemon.rig import keeps_memory
 from shearloop.daemon.rig_memory import Remembered, read_memories, write_memories
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.errors import UserError
-from shearloop.tools.commission import boards, gripper, tool
+from shearloop.tools.commission import boards, gripper, identity, tool
 from shearloop.tools.commission.operator import Operator, Played
 
 # Stages that open the fingers.
@@ -36,6 +38,8 @@ class LeftRobot:
     operator: Operator
     # Whether the configuration has a gripper, which stages open.
     opens: bool
+    # Whether the robot outlives this process.
+    keeps: bool
     state: Remembered
 
     @classmethod
@@ -44,8 +48,8 @@ class LeftRobot:
 
         A grip is still remembered afterwards. Raises DeclinedError, and UserError where the state cannot be written.
         """
-        left = cls(files, operator, config.gripper is not None, Remembered())
-        if not keeps_memory(config):
+        left = cls(files, operator, config.gripper is not None, keeps_memory(config), Remembered())
+        if not left.keeps:
             return left
         state = read_memories(files)
         held = state.held
@@ -61,11 +65,24 @@ class LeftRobot:
         left._keep(replace(state, stop=(), running=""))
         return left
 
-    def before(self, stage: str) -> Operator:
-        """Return who is asked in a stage. One that opens the fingers begins once a tool that may be in them is secured.
+    @contextmanager
+    def during(self, stage: str) -> Iterator[Operator]:
+        """Yield who is asked in a stage; a process that is killed meanwhile leaves a stop, as with an experiment.
 
-        Raises DeclinedError, and UserError where the state cannot be written.
+        A stage that opens the fingers begins once a tool that may be in them is secured. Raises DeclinedError, and
+        UserError where the state cannot be written.
         """
+        operator = self._secured(stage)
+        if stage == identity.STAGE or not self.keeps:
+            yield operator
+            return
+        self._keep(replace(self.state, running=f"commissioning, stage {stage}"))
+        try:
+            yield operator
+        finally:
+            self._keep(replace(self.state, running=""))
+
+    def _secured(self, stage: str) -> Operator:
         held = self.state.held
         if held and self.opens and stage in _OPENING:
             self.operator.act(f"{held[0].upper()}{held[1:]}. Stage {stage} opens the fingers, and it drops: secure it")
@@ -81,7 +98,7 @@ class LeftRobot:
         except OSError as error:
             at: Path = self.files.states[0]
             raise UserError(
-                f"what was acknowledged cannot be kept in {at} ({error.strerror}): make room, or make the folder "
-                "writable"
+                f"the robot's state cannot be kept in {at} ({error.strerror}), and a stop would be forgotten with this "
+                "process: make room, or make the folder writable"
             ) from error
         self.state = state

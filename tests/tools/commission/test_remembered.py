@@ -1,13 +1,14 @@
 """A commissioning of a robot that another program has left with a stop, a crash or a grip."""
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
 
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.safety import FaultCode
-from shearloop.daemon.rig_memory import Remembered, read_memory, write_memory
+from shearloop.daemon.rig_memory import Remembered, read_memories, read_memory, write_memory
 from shearloop.daemon.robot_files import RobotFiles, memory_path
 from shearloop.errors import UserError
 from shearloop.tools.commission.operator import DeclinedError, Operator
@@ -75,9 +76,22 @@ def test_the_fingers_open_once_a_tool_that_may_be_held_is_secured_and_the_grip_i
     assert not any("may be in the fingers" in motion for motion in motions(lab))
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_commissioning_that_is_killed_in_a_stage_leaves_a_stop(fails):
+    files = RobotFiles.of(HOST)
+    left = LeftRobot(files, Operator(pytest.fail, pytest.fail), opens=True, keeps=True, state=Remembered())
+    with pytest.raises(UserError) if fails else nullcontext(), left.during("3 empty gripper"):
+        # As another process finds it after a kill at this moment.
+        (fault,) = read_memories(files).faults
+        assert "'commissioning, stage 3 empty gripper' was under way" in fault.sentence
+        if fails:
+            raise UserError("the arm does not come to rest")
+    assert read_memories(files) == Remembered()
+
+
 def test_an_acknowledgement_that_cannot_be_kept_is_none(lab):
     memory_path(HOST).mkdir(parents=True)
-    with pytest.raises(UserError, match="what was acknowledged cannot be kept in"):
+    with pytest.raises(UserError, match="the robot's state cannot be kept in"):
         lab.run("0")
 
 
@@ -86,5 +100,6 @@ def test_devices_that_end_with_the_rehearsal_have_no_past(lab):
     config = load_daemon_config(lab.path).model_copy(update={"autostart": True})
     operator = Operator(pytest.fail, lambda _: None)
     left = LeftRobot.acknowledged(config, RobotFiles.of(HOST), operator)
-    assert left.before("2 gripper") is operator
+    with left.during("2 gripper") as asked:
+        assert asked is operator
     assert read_memory(memory_path(HOST)) == LEFT

@@ -57,7 +57,7 @@ def blocks(text: str) -> list[str]:
 BLOCKS = [
     pytest.param(block, id=f"{page.stem}-{n}") for page in PAGES for n, block in enumerate(blocks(page.read_text()))
 ]
-SYSTEM_PROGRAMS = {"sudo", "apt", "pip", "uvx", "ssh", "dask", "docker", "systemctl", "journalctl"}
+SYSTEM_PROGRAMS = {"cd", "git", "sudo", "apt", "pip", "uvx", "ssh", "dask", "docker", "systemctl", "journalctl"}
 
 
 @pytest.mark.parametrize("block", BLOCKS)
@@ -73,6 +73,29 @@ def test_every_block_is_valid(block, tmp_path):
         for line in block.splitlines():
             for command in re.split(r" && | & ", re.sub(r" +#.*| &$", "", line)):
                 check_command(command)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_benchmarks_command_has_its_required_arguments(page):
+    for name, given in re.findall(r"python -m benchmarks\.(\w+)([^`\n]*)", page.read_text()):
+        doc = ast.get_docstring(ast.parse((ROOT / "benchmarks" / f"{name}.py").read_text())) or ""
+        (usage,) = re.findall(rf"^ *python -m benchmarks\.{name}(.*)$", doc, re.MULTILINE)[:1]
+        required = [word for word in re.sub(r"\[.*?\]", "", usage).split() if word.startswith("--") or word.isupper()]
+        missing = {word for word in required if word.startswith("--") or word == "RECORDINGS"} - {*given.split()}
+        assert not missing, f"{page.name}: {name}{given}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_imports_the_recordings_that_it_judges_and_builds_the_banks_of_its_commands(page):
+    """A file that a command reads by name is made on the page, or on the page that it links to."""
+    text = page.read_text()
+    linked = [(page.parent / one).read_text() for one in re.findall(r"\]\(((?!http)[^)#]+\.md)", text)]
+    made = re.findall(r"--out (\S+)", "\n".join([text, *linked]))
+    # The demo's folder has its own bank.
+    made += ["run/demo.bank"]
+    for block in blocks(text):
+        for name in re.findall(r"(?<=\s)((?:\d+mm_\d|\d{8}_\d{6})\.mcap|run/\w+\.bank)", block):
+            assert name in made, f"{page.name}: {name}"
 
 
 def check_yaml(block: str, folder: Path) -> None:

@@ -142,11 +142,11 @@ class Commands:
 
     async def _unlock(self, request: Request) -> Reply:
         rig = required_rig(self.rig)
-        confirmed, sentence = bool(request.get("confirmed")), rig.control_loop.unlock_question()
+        confirmed, sentence = bool(request.get("confirmed")), rig.control_loop.operator.unlock_question()
         if sentence:
             question = Question(
                 f"Unlock? {_capital(sentence)}.",
-                digest_of("unlock", *rig.occasion(), *rig.control_loop.release_stakes()),
+                digest_of("unlock", *rig.occasion(), *rig.control_loop.operator.release_stakes()),
             )
             _refuse_if(rig.runner.unlock_refusal())
             if not confirmed:
@@ -159,9 +159,10 @@ class Commands:
     async def _release(self, request: Request) -> Reply:
         rig = required_rig(self.rig)
         _refuse_if(rig.runner.release_refusal())
-        sentence = rig.control_loop.release_question()
+        sentence = rig.control_loop.operator.release_question()
         question = Question(
-            f"Release? {_capital(sentence)}.", digest_of("release", *rig.occasion(), *rig.control_loop.release_stakes())
+            f"Release? {_capital(sentence)}.",
+            digest_of("release", *rig.occasion(), *rig.control_loop.operator.release_stakes()),
         )
         if request.get("ask"):
             return dict(question.facts)
@@ -205,7 +206,7 @@ class Commands:
         """Stop what moves or is about to, else the daemon; return what was stopped."""
         # A word that is not known may be a misspelt `spare_daemon`.
         spare_daemon = bool(request.get("spare_daemon") or request.keys() - {"command", "by", "spare_daemon"})
-        held = self.rig.control_loop.may_still_hold if self.rig is not None else None
+        held = self.rig.control_loop.tool.may_still_hold if self.rig is not None else None
         stopped = None
         if self.rig is not None:
             # Where something may be held, a stop keeps the daemon, and the next start waits.

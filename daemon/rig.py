@@ -228,7 +228,7 @@ class Rig:
 
         The first step of an experiment that is about to begin may grip a tool, whose torque would become the zero.
         """
-        return self._start_under_way() or self.control_loop.tare_refusal(confirmed=confirmed)
+        return self._start_under_way() or self.control_loop.operator.tare_refusal(confirmed=confirmed)
 
     def reading_refusal(self) -> str | None:
         """Return why no file of the folders is read for the list now, or None.
@@ -281,7 +281,7 @@ class Rig:
         if (reason := self.start_refusal()) is not None:
             raise UserError(reason)
         experiment = await self.experiments.read(path)
-        if (reason := self.control_loop.file_refusal(experiment.file)) is not None:
+        if (reason := self.control_loop.operator.file_refusal(experiment.file)) is not None:
             raise UserError(reason)
         return self._question_of(experiment)
 
@@ -291,13 +291,14 @@ class Rig:
         limits = robot.settings.limits if robot is not None else None
         motion = first_motion(file, self.experiments.gripper, speeds_of(limits))
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=self.control_loop.warm_up_s)
-        note = self.control_loop.activation_note(file)
+        operator, tool = self.control_loop.operator, self.control_loop.tool
+        note = operator.activation_note(file)
         text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
-        held = self.control_loop.release_stakes() if self.control_loop.may_hold() else ()
+        held = operator.release_stakes() if tool.may_hold() else ()
         # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.
         digest = digest_of(experiment.data, text, *sentences, *self.occasion(), *held)
         # The width in this note wavers.
-        return Question(text + self.control_loop.held_note(file), digest, sentences)
+        return Question(text + operator.held_note(file), digest, sentences)
 
     def occasion(self) -> tuple[str, ...]:
         """Return what changes with each process, stop and run: a question from before it asks for another moment."""
@@ -335,7 +336,7 @@ def build_rig(
         gripper = make_gripper(config.gripper, loop, publisher, clock, patience_of(config), supplied)
     sensors = build_sensors(config, publisher, clock, recorder, sessions, loop, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), settings_for=commissioning.on_controller)
-    robot.holds = loop.may_hold
+    robot.holds = loop.tool.may_hold
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning)
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}

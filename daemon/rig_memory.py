@@ -104,16 +104,16 @@ class Remembered:
         """Return the present state of a control loop."""
         running = loop.running.file.name if loop.running is not None else ""
         stop = tuple((fault.code.name, fault.detail) for fault in loop.safety.stop_faults)
-        return cls(running, stop, **asdict(loop.grip))
+        return cls(running, stop, **asdict(loop.tool.grip))
 
     def restore(self, loop: ControlLoop, on_judged: OnJudged = lambda _: None) -> None:
         """Give the stored state to a new control loop; a restored stop keeps the grip, even if it had opened it."""
         for fault in self.faults:
             loop.safety.stop(fault)
-        if not loop.has_gripper:
-            loop.restore_clamped(self.origin_rad)
+        if not loop.tool.has_gripper:
+            loop.tool.restore_clamped(self.origin_rad)
         elif self.grips:
-            loop.restore_grip(self.grip, on_judged)
+            loop.tool.restore_grip(self.grip, on_judged)
 
 
 @dataclass(slots=True)
@@ -150,7 +150,7 @@ class RigMemory:
         elsewhere = (*files.other_states, *files.lapsed_states)
         if len(files.states) == 1 and not any(path.exists() for path in elsewhere):
             self._written = remembered
-        if not self.loop.has_gripper:
+        if not self.loop.tool.has_gripper:
             # Zeros are kept for a grip alone.
             return
         # Until the gripper answers, its grip counts as the one before.
@@ -221,10 +221,10 @@ class RigMemory:
         """Write the present state, unless the file has it already."""
         state = Remembered.of(self.loop)
         state = replace(state, running=state.running or self.starting)
-        if self.load_cell is not None and self.loop.may_hold() and self._knows_load_zero:
+        if self.load_cell is not None and self.loop.tool.may_hold() and self._knows_load_zero:
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)
-        if self.robot is not None and self.loop.may_hold():
+        if self.robot is not None and self.loop.tool.may_hold():
             state = replace(state, wrench_zero=self.robot.wrench_zero, wrench_tared=self._knows_wrench_zero)
         await self.save(state)
 

@@ -77,7 +77,7 @@ class ActionExecutor:
     def release(self) -> None:
         """Open the gripper after a stop."""
         if self.gripper is not None:
-            self._final_task = self._start("open", self.gripper.release, self.control_loop.on_release_ended)
+            self._final_task = self._start("open", self.gripper.release, self.control_loop.tool.on_release_ended)
 
     def cancel(self) -> None:
         """Cancel the present action; moving fingers are halted."""
@@ -205,7 +205,7 @@ class ActionExecutor:
                 except NotBegunError:
                     # A halt would only make the gripper forget that it holds something.
                     self.fingers_move = False
-                    self.control_loop.on_grip_refused()
+                    self.control_loop.tool.on_grip_refused()
                     raise
                 self.fingers_move = False
             case TareStep():

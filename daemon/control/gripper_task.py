@@ -6,12 +6,13 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.control_loop import ControlLoop, activation_sentence
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import GripStep, Opening, opening
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.finger_motion import FingerMotion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.inputs import GripperStatus
+from shearloop.daemon.control.operator_view import activation_sentence
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.errors import DriverError

@@ -151,7 +151,7 @@ class ControlLoopRunner:
             return ENDING
         if self.actions.unlocking:
             return UNLOCKING
-        return self._control_loop.start_refusal() or self._taring()
+        return self._control_loop.operator.start_refusal() or self._taring()
 
     def _taring(self) -> str | None:
         """Return why no experiment can begin with the zeros of now, or None."""
@@ -182,7 +182,7 @@ class ControlLoopRunner:
         refusal = None
         # The control loop refuses while an experiment runs or a stop waits for the operator; a stopped arm must not be
         # enabled on the way.
-        if self._stop_count == stops_before and self._control_loop.start_refusal() is None:
+        if self._stop_count == stops_before and self._control_loop.operator.start_refusal() is None:
             refusal = await self._enable()
         if self._stop_count != stops_before:
             if not self._closed:
@@ -272,7 +272,7 @@ class ControlLoopRunner:
         state = self._robot.state
         if state is not None and not (state.rests and state.motion == "idle"):
             return "the arm is moving; wait until it stands still, or stop it"
-        return self._control_loop.release_refusal()
+        return self._control_loop.operator.release_refusal()
 
     async def release(self) -> str | None:
         """Open the gripper on the operator's confirmed command; return None, or why not."""
@@ -282,7 +282,7 @@ class ControlLoopRunner:
             await self.actions.open_by_operator()
         except (ActionError, DriverError) as error:
             return str(error)
-        self._control_loop.on_release_ended()
+        self._control_loop.tool.on_release_ended()
         return None
 
     def stop_unlocking(self) -> str | None:

@@ -447,7 +447,7 @@ async def test_a_tool_that_is_exchanged_while_no_daemon_runs_has_no_force_and_no
             watcher = Watcher(daemon)
             state = await watcher.until("loop.state", lambda state: FaultCode.GRIP_UNKNOWN.text in state["faults"])
             assert "mm wide, with an unknown force" in state["reasons"]
-            assert daemon.rig.control_loop.grip.origin_rad is None
+            assert daemon.rig.control_loop.tool.grip.origin_rad is None
 
 
 async def test_a_daemon_of_another_user_that_gets_the_arm_after_a_kill_moves_nothing(

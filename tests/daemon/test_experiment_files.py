@@ -246,10 +246,8 @@ def rig(folder: Path, runner: Runner) -> Rig:
             warm_up_s=0.0,
             runs=1,
             safety=SimpleNamespace(acknowledged=0),
-            activation_note=lambda _: "",
-            held_note=lambda _: "",
-            may_hold=lambda: False,
-            file_refusal=lambda _: None,
+            tool=SimpleNamespace(may_hold=lambda: False),
+            operator=SimpleNamespace(activation_note=lambda _: "", held_note=lambda _: "", file_refusal=lambda _: None),
         ),
         runner,
         {},
@@ -374,17 +372,17 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
     assert runner.started == []
     await start({"experiment": str(path), "digest": refused.value.facts["digest"]})
     path.write_bytes(before)
-    subject.control_loop.activation_note = lambda _: " Before step 1 the gripper is activated."
+    subject.control_loop.operator.activation_note = lambda _: " Before step 1 the gripper is activated."
     with pytest.raises(CommandRefusedError, match="what its start does to a held tool"):
         await start({"experiment": str(path), "digest": asked["digest"]})
-    subject.control_loop.activation_note = lambda _: ""
-    subject.control_loop.may_hold = lambda: True
-    subject.control_loop.release_stakes = lambda: ("held", "one tool")
+    subject.control_loop.operator.activation_note = lambda _: ""
+    subject.control_loop.tool.may_hold = lambda: True
+    subject.control_loop.operator.release_stakes = lambda: ("held", "one tool")
     asked_again = await start({"experiment": str(path), "ask": True})
-    subject.control_loop.release_stakes = lambda: ("held", "another tool")
+    subject.control_loop.operator.release_stakes = lambda: ("held", "another tool")
     with pytest.raises(CommandRefusedError, match="a held tool"):
         await start({"experiment": str(path), "digest": asked_again["digest"]})
-    subject.control_loop.may_hold = lambda: False
+    subject.control_loop.tool.may_hold = lambda: False
     # Somebody has pressed STOP since.
     runner.stop_count = 1
     with pytest.raises(CommandRefusedError, match="has changed since its plan was shown"):

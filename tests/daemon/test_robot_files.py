@@ -115,7 +115,7 @@ async def test_a_robot_with_a_new_address_keeps_stop_crash_and_grip(names, has_o
     assert details[0] == STOP[1]
     assert any("'loosen' was under way" in detail for detail in details)
     assert any("had the address 192.168.1.10 then and has 192.168.1.20 at present" in detail for detail in details)
-    assert (loop.grip.origin_rad, loop.grip.force_n) == (0.3, 60.0)
+    assert (loop.tool.grip.origin_rad, loop.tool.grip.force_n) == (0.3, 60.0)
     # Until it is written, the next program meets the same.
     assert read_memories(RobotFiles.of("ur.lab")).running == "loosen"
     loop.acknowledge()

@@ -113,7 +113,7 @@ def test_a_tighter_grip_of_the_same_tool_keeps_the_angle_of_the_grip():
     rig.run(60)
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
     assert rig.wrist_rad - begun_rad == pytest.approx(0.19, abs=0.01), "the second twist counts from the same grip"
-    assert rig.control_loop.grip.force_n == 100.0
+    assert rig.control_loop.tool.grip.force_n == 100.0
 
 
 def test_each_message_tells_the_step_and_its_own_activity():
@@ -248,7 +248,7 @@ def test_a_gripper_that_another_program_commands_stops_the_twist_and_says_what_i
     started(rig, GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
     assert phase(rig) is ExperimentPhase.RUNNING
-    assert "30.0 mm wide, with at most 60 N" in rig.control_loop.release_question()
+    assert "30.0 mm wide, with at most 60 N" in rig.control_loop.operator.release_question()
     rig.hand, rig.force_n, rig.width_mm = replace(rig.hand, others_requests=2, **sense), force_n, 19.7
     rig.step()
     assert phase(rig) is ExperimentPhase.STOPPED
@@ -257,9 +257,9 @@ def test_a_gripper_that_another_program_commands_stops_the_twist_and_says_what_i
     rig.step()
     codes = [fault.code for fault in rig.control_loop.status.decision.reported]
     assert (FaultCode.TOOL_GRIPPED in codes) is note
-    question = rig.control_loop.release_question()
+    question = rig.control_loop.operator.release_question()
     assert ("hold something 19.7 mm wide, with an unknown force" in question) is note
-    assert ("does not say that it holds something" in question) is not note
+    assert ("the gripper reports no object" in question) is not note
 
 
 def test_what_another_program_asked_before_a_start_does_not_stop_it_again():
@@ -282,8 +282,8 @@ def test_a_grip_that_another_program_has_changed_has_neither_our_force_nor_our_a
     rig.run(2)
     stop(rig)
     rig.run(0.1)
-    assert rig.control_loop.grip.origin_rad is not None
-    assert "with at most 60 N" in (rig.control_loop.held or "")
+    assert rig.control_loop.tool.grip.origin_rad is not None
+    assert "with at most 60 N" in (rig.control_loop.tool.held or "")
     rig.hand = replace(rig.hand, others_requests=1, requested_counts=250)
     if seen_moving:
         standing, force_n = rig.hand, rig.force_n
@@ -291,13 +291,13 @@ def test_a_grip_that_another_program_has_changed_has_neither_our_force_nor_our_a
         rig.run(0.1)
         rig.hand, rig.force_n = standing, force_n
     rig.run(0.1)
-    assert not rig.control_loop.grip.known
+    assert not rig.control_loop.tool.grip.known
     assert "has commanded it since then" in rig.control_loop.status.decision.reasons[-1]
-    assert "with an unknown force" in (rig.control_loop.held or "")
+    assert "with an unknown force" in (rig.control_loop.tool.held or "")
     rig.control_loop.acknowledge()
     started(rig, GRIP, {"do": "wait", "wait_s": 60})
     rig.run(2)
-    assert "with at most 60 N" in (rig.control_loop.held or "")
+    assert "with at most 60 N" in (rig.control_loop.tool.held or "")
     assert phase(rig) is ExperimentPhase.RUNNING
 
 
@@ -305,7 +305,7 @@ def test_a_grip_of_an_earlier_process_that_another_program_changes_is_not_the_pr
     """Also where its first states show the fingers in motion, and then on something of the same width."""
     judged: list[str] = []
     loop = new_loop()
-    loop.restore_grip(Grip(0.3, 60.0, 30.0, 230), judged.append)
+    loop.tool.restore_grip(Grip(0.3, 60.0, 30.0, 230), judged.append)
     states = [
         {"holding": False, "moving": True, "requested_counts": 230},
         {"holding": False, "moving": True, "requested_counts": 250, "others_requests": 1},
@@ -314,7 +314,7 @@ def test_a_grip_of_an_earlier_process_that_another_program_changes_is_not_the_pr
     for number, state in enumerate(states):
         loop.on_gripper(GripperStatus(number, 30.0, **state))
     assert judged == ["another program, or the pendant, has commanded it since then"]
-    assert not loop.grip.known
+    assert not loop.tool.grip.known
 
 
 @pytest.mark.parametrize(
@@ -678,10 +678,10 @@ def test_a_refused_grip_leaves_an_unknown_grip_unknown():
     while not rig.begun:
         rig.step()
     rig.pending.clear()
-    rig.control_loop.on_grip_refused()
+    rig.control_loop.tool.on_grip_refused()
     rig.control_loop.on_action_ended("a grip to 50 mm would open them and drop it")
     rig.run(0.1)
-    assert "with an unknown force" in (rig.control_loop.held or "")
+    assert "with an unknown force" in (rig.control_loop.tool.held or "")
     assert FaultCode.GRIP_UNKNOWN in [fault.code for fault in rig.control_loop.status.decision.faults]
 
 
@@ -703,7 +703,7 @@ def test_a_grip_that_would_drop_the_held_tool_cannot_be_asked():
 
     def refusal(*steps: dict[str, Any]) -> str:
         content = {"name": "one", "torque_source": "right", "steps": list(steps)}
-        return rig.control_loop.file_refusal(ExperimentFile.model_validate(content)) or ""
+        return rig.control_loop.operator.file_refusal(ExperimentFile.model_validate(content)) or ""
 
     wide = {**GRIP, "width_mm": 35.0}
     assert "step 1 (grip) to 35 mm would open them and drop it: put a `release` before" in refusal(wide)
@@ -711,7 +711,7 @@ def test_a_grip_that_would_drop_the_held_tool_cannot_be_asked():
     assert "step 1 (tare): its fingers hold something" in refusal({"do": "tare"}, GRIP)
     assert refusal({"do": "release"}, {"do": "tare"}, GRIP) == ""
     assert "is not a measured torque" in (
-        rig.control_loop.file_refusal(
+        rig.control_loop.operator.file_refusal(
             ExperimentFile.model_validate({"name": "a", "torque_source": "x", "steps": [GRIP]})
         )
         or ""
@@ -722,6 +722,6 @@ def test_a_gripper_that_is_too_hot_says_what_a_release_does_and_grips_nothing():
     rig = Rig(new_loop())
     rig.hand, rig.force_n = replace(rig.hand, too_hot=True), 60.0
     rig.run(0.6)
-    assert "it is activated first: the fingers open and close once" in rig.control_loop.release_question()
+    assert "it is activated first: the fingers open and close once" in rig.control_loop.operator.release_question()
     file = ExperimentFile.model_validate({"name": "one", "torque_source": "right", "steps": [GRIP]})
-    assert "too hot for step 1 (grip): let it cool down" in (rig.control_loop.file_refusal(file) or "")
+    assert "too hot for step 1 (grip): let it cool down" in (rig.control_loop.operator.file_refusal(file) or "")

@@ -47,9 +47,9 @@ def stopped_fingers(rig: Rig, step: dict[str, Any], width_mm: float, sense: dict
 def test_a_tighter_grip_that_was_stopped_keeps_the_angle_of_the_grip(width_mm, sense):
     """The halt leaves the gripper in doubt. Fingers that close tighter press a soft tool together."""
     rig = twisted()
-    gripped_rad = rig.control_loop.grip.origin_rad
+    gripped_rad = rig.control_loop.tool.grip.origin_rad
     stopped_fingers(rig, {**GRIP, "force_n": 100.0}, width_mm, sense)
-    assert rig.control_loop.grip.origin_rad == gripped_rad
+    assert rig.control_loop.tool.grip.origin_rad == gripped_rad
     started(rig, {**GRIP, "force_n": 100.0}, TWIST_AGAIN, **TWISTED)
     while not rig.pending:
         rig.step()
@@ -60,7 +60,7 @@ def test_a_tighter_grip_that_was_stopped_keeps_the_angle_of_the_grip(width_mm, s
     rig.run(20)
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
     assert rig.wrist_rad - gripped_rad == pytest.approx(0.25, abs=0.01)
-    assert rig.control_loop.grip == Grip(gripped_rad, 100.0, 30.0)
+    assert rig.control_loop.tool.grip == Grip(gripped_rad, 100.0, 30.0)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_a_tighter_grip_that_was_stopped_keeps_the_angle_of_the_grip(width_mm, s
 )
 def test_fingers_that_let_the_tool_go_begin_a_grip_with_an_angle_of_its_own(step, width_mm, sense):
     rig = stopped_fingers(twisted(), step, width_mm, sense)
-    assert not rig.control_loop.grip.known
+    assert not rig.control_loop.tool.grip.known
     again_rad = rig.wrist_rad
     started(rig, GRIP, TWIST_AGAIN, **TWISTED)
     rig.hand = replace(rig.hand, uncertain=False)
@@ -110,9 +110,9 @@ def test_the_question_before_a_tighter_grip_says_that_the_angle_is_not_known():
     rig = Rig(new_loop())
     rig.force_n = 60.0
     rig.run(0.6)
-    assert "its angle counts from the start" in rig.control_loop.held_note(tighter)
-    assert rig.control_loop.held_note(after_release) == ""
-    assert twisted().control_loop.held_note(tighter) == "", "its angle goes on"
+    assert "its angle counts from the start" in rig.control_loop.operator.held_note(tighter)
+    assert rig.control_loop.operator.held_note(after_release) == ""
+    assert twisted().control_loop.operator.held_note(tighter) == "", "its angle goes on"
 
 
 FILES = RobotFiles("192.168.1.10", ("192.168.1.10",))
@@ -139,18 +139,21 @@ def test_the_angle_of_a_clamped_tool_goes_on_from_start_to_start_until_another_o
     assert turn_to_limit(rig) == pytest.approx(0.25, abs=0.01)
     assert turn_to_limit(rig) == pytest.approx(0.0, abs=0.01)
     file = ExperimentFile.model_validate({"name": "test", "steps": [TWIST_AGAIN]})
-    assert "it is turned by +0.249 rad; if another tool is clamped, `shearloop command" in rig.control_loop.held_note(
-        file
+    assert (
+        "it is turned by +0.249 rad; if another tool is clamped, `shearloop command"
+        in rig.control_loop.operator.held_note(file)
     )
     rig.wrist_rad += 0.1
     started(rig, TWIST_AGAIN, **TWISTED)
     rig.run(1)
     assert "`shearloop command release --yes` lets it count anew" in rig.control_loop.experiment.stop_reason
     rig.control_loop.acknowledge()
-    assert rig.control_loop.release_refusal() is None
-    assert "nothing opens, because no gripper is configured; the angle of" in rig.control_loop.release_question()
-    rig.control_loop.on_release_ended()
-    assert rig.control_loop.held_note(file) == ""
+    assert rig.control_loop.operator.release_refusal() is None
+    assert (
+        "nothing opens, because no gripper is configured; the angle of" in rig.control_loop.operator.release_question()
+    )
+    rig.control_loop.tool.on_release_ended()
+    assert rig.control_loop.operator.held_note(file) == ""
     assert turn_to_limit(rig) == pytest.approx(0.25, abs=0.01)
 
 
@@ -163,14 +166,14 @@ async def test_the_angle_of_a_clamped_tool_outlives_the_process():
     after.wrist_rad = before.wrist_rad
     RigMemory(FILES, after.control_loop)
     assert turn_to_limit(after) == pytest.approx(0.0, abs=0.01)
-    after.control_loop.on_release_ended()
+    after.control_loop.tool.on_release_ended()
     memory = RigMemory(FILES, after.control_loop)
-    assert after.control_loop.grip == before.control_loop.grip, "what is on the disk counts"
-    after.control_loop.on_release_ended()
+    assert after.control_loop.tool.grip == before.control_loop.tool.grip, "what is on the disk counts"
+    after.control_loop.tool.on_release_ended()
     await memory.save_present()
     again = clamped_rig()
     RigMemory(FILES, again.control_loop)
-    assert not again.control_loop.grip.known
+    assert not again.control_loop.tool.grip.known
 
 
 async def test_a_daemon_that_has_lost_its_gripper_keeps_the_angle_and_none_of_the_zeros():
@@ -184,7 +187,7 @@ async def test_a_daemon_that_has_lost_its_gripper_keeps_the_angle_and_none_of_th
     after.wrist_rad = before.wrist_rad
     RigMemory(FILES, after.control_loop, cell)
     assert cell.calibration.tare_counts == 8000.0
-    assert after.control_loop.grip == Grip(before.control_loop.grip.origin_rad)
+    assert after.control_loop.tool.grip == Grip(before.control_loop.tool.grip.origin_rad)
 
 
 async def test_the_operator_says_that_another_tool_is_clamped():
@@ -193,6 +196,6 @@ async def test_the_operator_says_that_another_tool_is_clamped():
         assert await cell.runner.release() is not None, "an experiment runs"
         cell.runner.stop()
         await cell.cycles(50)
-        assert cell.control_loop.grip.known
+        assert cell.control_loop.tool.grip.known
         assert await cell.runner.release() is None
-        assert not cell.control_loop.grip.known
+        assert not cell.control_loop.tool.grip.known

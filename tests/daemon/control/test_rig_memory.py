@@ -93,7 +93,7 @@ def test_the_force_of_a_grip_is_remembered_while_the_fingers_close():
     after = after_restart(rig)
     assert (
         "with at most 60 N unless it was gripped again before this daemon began"
-        in after.control_loop.release_question()
+        in after.control_loop.operator.release_question()
     )
 
 
@@ -112,10 +112,10 @@ def test_the_angle_of_a_grip_is_remembered_and_forgotten_with_the_grip():
     rig.run(5)
     gripped_rad = rig.wrist_rad
     after = after_restart(rig)
-    assert after.control_loop.grip == Grip(pytest.approx(gripped_rad), 60.0, 30.0)
+    assert after.control_loop.tool.grip == Grip(pytest.approx(gripped_rad), 60.0, 30.0)
     after.force_n = 0.0
     after.run(0.1)
-    assert not after.control_loop.grip.known
+    assert not after.control_loop.tool.grip.known
 
 
 def load_cell(scale_n_per_count: float = 0.001) -> LoadCell:
@@ -128,7 +128,7 @@ class Restarted:
     WRENCH_ZERO = (0.0, 1.0, 0.0, 0.0, 0.0, -0.11)
 
     def __init__(self, before: Rig) -> None:
-        grip = before.control_loop.grip
+        grip = before.control_loop.tool.grip
         state = Remembered(load_zero=8321.5, load_nm_per_count=load_cell().calibration.nm_per_count)
         write_memory(FILES.states[0], replace(state, **asdict(grip), wrench_zero=self.WRENCH_ZERO))
         self.rig = after = Rig(new_loop())
@@ -179,12 +179,12 @@ def test_a_grip_that_changed_while_no_daemon_ran_is_one_that_nobody_knows(how, r
     exchange(rig, how)
     assert restarted.zeros == KEPT, "until the gripper answers, nobody knows of another grip"
     rig.run(0.1)
-    assert not rig.control_loop.grip.known
+    assert not rig.control_loop.tool.grip.known
     assert restarted.zeros == TAKEN_BACK
     (warning,) = (line for line in logged if line["log_level"] == "warning")
     assert "does not have the grip of the last daemon" in warning["event"]
     if rig.force_n:
-        assert "with an unknown force" in rig.control_loop.release_question()
+        assert "with an unknown force" in rig.control_loop.operator.release_question()
         assert FaultCode.GRIP_UNKNOWN.value.kind in restarted.told
     else:
         assert FaultCode.GRIP_UNKNOWN.value.kind not in restarted.told
@@ -200,7 +200,7 @@ def test_a_load_cell_that_was_tared_since_the_restart_keeps_that_zero(restarted)
 def test_a_grip_of_unknown_force_may_hold_until_the_gripper_answers():
     loop = new_loop()
     Remembered(wrench_zero=Restarted.WRENCH_ZERO).restore(loop)
-    assert loop.may_hold()
+    assert loop.tool.may_hold()
 
 
 def test_a_twist_of_a_tool_that_was_exchanged_begins_where_the_wrist_is(restarted):
@@ -216,10 +216,10 @@ def test_a_twist_of_a_tool_that_was_exchanged_begins_where_the_wrist_is(restarte
 
 
 def test_a_wrist_that_was_turned_by_hand_keeps_the_angle_of_its_grip(restarted):
-    rig, gripped_rad = restarted.rig, restarted.rig.control_loop.grip.origin_rad
+    rig, gripped_rad = restarted.rig, restarted.rig.control_loop.tool.grip.origin_rad
     rig.wrist_rad += 0.2
     rig.run(0.1)
-    assert rig.control_loop.grip.origin_rad == gripped_rad
+    assert rig.control_loop.tool.grip.origin_rad == gripped_rad
     assert restarted.zeros == KEPT
 
 
@@ -242,12 +242,12 @@ def test_a_soft_tool_that_gives_way_slowly_is_the_same(restarted):
     rig = restarted.rig
     rig.width_mm -= SAME_WIDTH_MM - 0.1
     rig.run(0.1)
-    assert (restarted.zeros, rig.control_loop.grip.force_n) == (KEPT, 60.0)
+    assert (restarted.zeros, rig.control_loop.tool.grip.force_n) == (KEPT, 60.0)
     for _ in range(10):
         rig.width_mm -= FOLLOWED_MM + 0.1
         rig.run(0.1)
-    assert rig.control_loop.grip.force_n == 60.0
-    assert rig.control_loop.grip.width_mm == rig.width_mm
+    assert rig.control_loop.tool.grip.force_n == 60.0
+    assert rig.control_loop.tool.grip.width_mm == rig.width_mm
 
 
 @pytest.mark.parametrize("steps", [[GRIP], [{"do": "release"}, GRIP]])
@@ -258,11 +258,11 @@ def test_a_gripper_that_lost_its_power_opens_on_no_tool_unsaid(steps, restarted)
     rig.hand = replace(rig.hand, uncertain=True, inactive=True, requested_counts=0)
     rig.run(0.6)
     file = ExperimentFile.model_validate({"name": "next", "steps": steps})
-    assert "Before step 1 the gripper is activated" in rig.control_loop.activation_note(file)
+    assert "Before step 1 the gripper is activated" in rig.control_loop.operator.activation_note(file)
     refused = rig.control_loop.start(file, rig.t_ns)
     assert (refused is None) == (len(steps) == 2)
     assert refused is None or "release --yes`, or put a `release` before it" in refused
-    assert "it is activated first" in rig.control_loop.release_question()
+    assert "it is activated first" in rig.control_loop.operator.release_question()
 
 
 def test_a_tool_that_was_exchanged_while_the_gripper_was_away_is_another_one(restarted):
@@ -273,7 +273,7 @@ def test_a_tool_that_was_exchanged_while_the_gripper_was_away_is_another_one(res
     exchange(rig, "another width")
     rig.silent.clear()
     rig.run(0.1)
-    assert not rig.control_loop.grip.known
+    assert not rig.control_loop.tool.grip.known
     assert FaultCode.GRIP_UNKNOWN.value.kind in restarted.told
     rig.force_n = 0.0
     rig.run(0.1)
@@ -489,10 +489,10 @@ async def test_no_zero_is_taken_before_the_gripper_shows_what_it_holds():
     RigMemory(FILES, after.control_loop)
     after.silent.add("hand")
     after.run(0.6)
-    assert "the gripper has not answered yet" in (after.control_loop.tare_refusal(confirmed=True) or "")
+    assert "the gripper has not answered yet" in (after.control_loop.operator.tare_refusal(confirmed=True) or "")
     # A stop keeps the daemon: without it, no command opens the fingers.
-    assert "an earlier daemon had gripped a tool" in (after.control_loop.may_still_hold or "")
+    assert "an earlier daemon had gripped a tool" in (after.control_loop.tool.may_still_hold or "")
     after.silent.clear()
     after.run(0.1)
-    assert after.control_loop.may_still_hold is None
-    assert after.control_loop.tare_refusal(confirmed=True) is None, "it holds nothing"
+    assert after.control_loop.tool.may_still_hold is None
+    assert after.control_loop.operator.tare_refusal(confirmed=True) is None, "it holds nothing"

@@ -61,7 +61,10 @@ async def test_a_tool_is_released_after_any_stop_and_without_an_experiment(befal
         if befalls is not None:
             befalls(cell)
         await cell.cycles(10)
-        assert "its fingers hold something 30.0 mm wide, with an unknown force" in cell.control_loop.release_question()
+        assert (
+            "its fingers hold something 30.0 mm wide, with an unknown force"
+            in cell.control_loop.operator.release_question()
+        )
         assert await released(cell) is None
         assert cell.gripper.asked == ["open"]
 
@@ -210,7 +213,7 @@ def held(**sense: bool) -> Rig:
 
 def test_no_tare_while_something_is_held():
     rig = held()
-    refusal = rig.control_loop.tare_refusal(confirmed=True) or ""
+    refusal = rig.control_loop.operator.tare_refusal(confirmed=True) or ""
     assert "its fingers hold something" in refusal
     assert "shearloop command release" in refusal
 
@@ -222,28 +225,28 @@ def test_after_a_grip_fingers_that_were_halted_may_still_hold_the_tool(gripped):
     stop(rig)
     rig.force_n, rig.hand = 0.0, replace(rig.hand, uncertain=True)
     rig.run(0.6)
-    said = rig.control_loop.may_still_hold
+    said = rig.control_loop.tool.may_still_hold
     assert ("does not know whether it holds a tool" in said) if gripped else said is None
 
 
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
 def test_a_tare_with_an_uncertain_gripper_has_to_be_confirmed(sense):
     rig = held(**sense)
-    assert "does not know whether it holds a tool" in (rig.control_loop.tare_refusal() or "")
-    assert rig.control_loop.tare_refusal(confirmed=True) is None
+    assert "does not know whether it holds a tool" in (rig.control_loop.operator.tare_refusal() or "")
+    assert rig.control_loop.operator.tare_refusal(confirmed=True) is None
 
 
 @pytest.mark.parametrize(("torque_nm", "refused"), [(2 * LOADED_NM, True), (0.5 * LOADED_NM, False)])
 def test_a_tare_under_load_has_to_be_confirmed(torque_nm, refused):
     loop = ControlLoop(LoopConfig(), {"load_cell": LOAD}, ("robot",))
     loop.on_torque(TorqueSample("load_cell", torque_nm, "", 0, 0))
-    assert ("load_cell measures +0.100 N·m" in (loop.tare_refusal() or "")) is refused
-    assert loop.tare_refusal(confirmed=True) is None
+    assert ("load_cell measures +0.100 N·m" in (loop.operator.tare_refusal() or "")) is refused
+    assert loop.operator.tare_refusal(confirmed=True) is None
 
 
 def test_a_running_experiment_refuses_a_tare():
     rig = started(Rig(new_loop()), WAIT)
-    assert "is running" in (rig.control_loop.tare_refusal(confirmed=True) or "")
+    assert "is running" in (rig.control_loop.operator.tare_refusal(confirmed=True) or "")
 
 
 def test_a_tare_step_with_a_held_tool_is_refused():
@@ -411,15 +414,15 @@ def test_the_question_before_a_turn_says_what_is_held():
         ExperimentFile.model_validate({"name": "test", "steps": steps})
         for steps in ([twist], [{"do": "release"}, twist])
     )
-    note = rig.control_loop.held_note(file)
+    note = rig.control_loop.operator.held_note(file)
     assert note.startswith(
         " At present its fingers hold something 140.0 mm wide, with an unknown force. The grip is not"
     )
     assert note.endswith("its angle counts from the start.")
-    assert rig.control_loop.held_note(after_release) == ""
+    assert rig.control_loop.operator.held_note(after_release) == ""
     rig.force_n = 0.0
     rig.step()
-    assert rig.control_loop.held_note(file) == ""
+    assert rig.control_loop.operator.held_note(file) == ""
 
 
 @pytest.mark.parametrize("sense", [{}, {"uncertain": True}])

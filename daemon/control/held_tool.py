@@ -1,0 +1,208 @@
+"""The tool that the gripper holds, or that is clamped to the wrist: its grip, its angle, and what is known of both."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from shearloop.daemon.control.experiment_schema import GripStep, Opening
+from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
+from shearloop.daemon.control.inputs import GripperStatus, LatestInputs
+
+# Why nobody knows yet whether something is held.
+GRIPPED_BEFORE = "the gripper has not answered yet, and an earlier daemon had gripped a tool"
+
+
+class _KnownGrip(NamedTuple):
+    """What was known of a grip; the names are those of `HeldTool`."""
+
+    grip: Grip
+    is_earlier: bool
+    another: str
+
+
+@dataclass(slots=True)
+class HeldTool:
+    """What is known of the tool; the control loop tells of each gripper state, grip, release and start.
+
+    `has_gripper`: a gripper of ours holds it; without one it is clamped by other means, and its grip is an angle alone.
+    """
+
+    inputs: LatestInputs
+    has_gripper: bool
+    # The present grip.
+    grip: Grip = NO_GRIP
+    # Whether an earlier process has closed it: the pendant may have gripped the same tool again, as far closed.
+    is_earlier: bool = False
+    # Why the object is of another grip than the last one that was known.
+    another: str = ""
+    # Requests of other programs to the gripper that are known; one that comes during an experiment is a fault.
+    others_requests: int = 0
+    # Whether the experiment should have a tool between the fingers.
+    expected: bool = False
+    # Why a release after a stop did not open the gripper, until the operator acknowledges it.
+    release_error: str | None = None
+    # Whether the fingers close tighter on what they hold already: the grip and its angle stay.
+    _tightens: bool = False
+    # What was known as the present `grip` step began, which may be refused.
+    _before_closing: _KnownGrip | None = None
+    # Awaits the gripper's first state that shows whether a grip of an earlier process is the present one.
+    _on_judged: OnJudged | None = None
+
+    def restore_grip(self, grip: Grip, on_judged: OnJudged) -> None:
+        """Take the grip that a process before this one has closed, until the gripper shows whether it still has it."""
+        self.grip, self.is_earlier, self._on_judged = grip, True, on_judged
+
+    def restore_clamped(self, origin_rad: float | None) -> None:
+        """Take where a process before this one began to count the angle of the clamped tool."""
+        self.grip = Grip(origin_rad)
+
+    def on_gripper(self, gripper: GripperStatus, *, judges: bool) -> None:
+        """Take the gripper's latest state; `judges` whether it still has the grip, as it does between experiments."""
+        if self._tightens:
+            self.grip = self.grip.pressed(gripper)
+        if judges:
+            self.judge(gripper)
+        if self._on_judged is None:
+            self.grip = self.grip.followed(gripper)
+
+    def judge(self, gripper: GripperStatus) -> None:
+        """Forget a grip that the gripper does not have at present: the next one has an angle of its own."""
+        judged = self._on_judged
+        why = self.grip.why_another(gripper)
+        if gripper.others_requests != self.others_requests:
+            self.others_requests = gripper.others_requests
+            # The tool may have been exchanged, or gripped tighter.
+            why = why or "another program, or the pendant, has commanded it since then"
+        if judged is not None and (why or not gripper.moving):
+            self._on_judged = None
+            judged(why)
+        if why and (self.grip.known or judged is not None):
+            self.grip, self.another = NO_GRIP, why
+        if not (gripper.holding or gripper.moving):
+            self.another = ""
+
+    def begin_experiment(self) -> None:
+        """Take that an experiment begins; the angle belongs to the grip, and goes on."""
+        gripper = self.inputs.gripper
+        # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
+        self.expected = not self.has_gripper or (gripper is not None and gripper.holding)
+        self._tightens, self._before_closing = False, None
+
+    def count_angle(self, wrist_rad: float) -> float:
+        """Return the wrist's angle from which the tool's angle counts: the present one where none counts yet."""
+        if self.grip.origin_rad is None:
+            self.grip = replace(self.grip, origin_rad=wrist_rad)
+            return wrist_rad
+        return self.grip.origin_rad
+
+    @property
+    def twisted_rad(self) -> float:
+        """How far the wrist has turned since the grip; 0 where no angle counts."""
+        arm, origin_rad = self.inputs.arm, self.grip.origin_rad
+        return 0.0 if arm is None or origin_rad is None else arm.wrist_rad - origin_rad
+
+    def begin_grip(self, action: GripStep, origin_rad: float) -> None:
+        """Note what is known of the tool as the fingers begin to move."""
+        # A process that dies while the fingers close leaves this force behind.
+        force_n = max(self.grip.force_n or 0.0, action.force_n)
+        self._before_closing = _KnownGrip(self.grip, self.is_earlier, self.another)
+        self._tightens = not isinstance(action, Opening) and self._has_grip()
+        # While fingers open, their last width on the tool tells whether they have let it go.
+        width_mm = self.grip.width_mm if self._tightens or isinstance(action, Opening) else None
+        self.grip = Grip(origin_rad, force_n, width_mm)
+        self.is_earlier = False
+        self.another = ""
+
+    def _has_grip(self) -> bool:
+        """Return whether the fingers hold something, or may still hold it in the grip that is known."""
+        gripper = self.inputs.gripper
+        # An activation opens the fingers before they close.
+        if gripper is None or self.activates:
+            return False
+        was_held = self.grip.width_mm is not None
+        return gripper.holding or (was_held and (gripper.uncertain or gripper.moving))
+
+    def on_grip_ended(self, action: GripStep) -> None:
+        """Take what the fingers have done; fingers that closed tighter keep the grip and its angle."""
+        gripper, arm = self.inputs.gripper, self.inputs.arm
+        holding = gripper is not None and gripper.holding
+        if isinstance(action, Opening) and not holding:
+            self.grip = NO_GRIP
+        elif not self._tightens:
+            origin_rad = arm.wrist_rad if arm is not None else None
+            self.grip = replace(self.grip, origin_rad=origin_rad, force_n=action.force_n)
+        self._tightens = False
+        # An unexpected object is watched as well.
+        self.expected = action.expect_object or holding
+
+    def on_grip_refused(self) -> None:
+        """Take that the present `grip` step was refused before the fingers moved: what they hold is as it was."""
+        if self._before_closing is not None:
+            self.grip, self.is_earlier, self.another = self._before_closing
+            self._tightens = False
+
+    def on_release_ended(self, error: str | None = None) -> None:
+        """Take the end of a release after a stop or by the operator, and why the gripper did not open, if so."""
+        self.release_error = error
+        if error is None:
+            self.grip = NO_GRIP
+
+    @property
+    def held(self) -> str | None:
+        """The object between the fingers, with its width and the force of the grip, or None."""
+        gripper, force_n = self.inputs.gripper, self.grip.force_n
+        if not self.has_gripper or gripper is None or not gripper.holding:
+            return None
+        known = force_n is not None and gripper.others_requests == self.others_requests
+        force = f"with at most {force_n:g} N" if known else "with an unknown force"
+        if known and self.is_earlier:
+            force += " unless it was gripped again before this daemon began"
+        return f"{gripper.fingers}, {force}"
+
+    @property
+    def unknown_grip(self) -> str:
+        """Why the present grip is not known; empty where it is, or where nothing is held."""
+        # A turn gives a grip an angle, and only a `grip` step its force.
+        known = self.grip.force_n is not None
+        if self.another or known or self.held is None or self._on_judged is not None:
+            return self.another
+        return "no experiment of this rig has closed its fingers on it"
+
+    @property
+    def uncertain(self) -> str | None:
+        """Why the gripper cannot say whether it holds a tool, or None."""
+        gripper = self.inputs.gripper
+        if not self.has_gripper or gripper is None or not (gripper.uncertain or gripper.moving):
+            return None
+        left = "stand where a stop, an activation or a lack of power has left them"
+        doubt = "are moving" if gripper.moving else left
+        width = f"{gripper.width_mm:.1f} mm apart"
+        return f"the gripper does not know whether it holds a tool: its fingers, {width}, {doubt}"
+
+    @property
+    def may_still_hold(self) -> str | None:
+        """The object between the fingers, or why a tool that was gripped may still be there; None without one."""
+        if self.inputs.gripper is None:
+            return GRIPPED_BEFORE if self.may_hold() else None
+        if self.held is not None or self.grip.force_n is None:
+            return self.held
+        return self.uncertain
+
+    def may_hold(self) -> bool:
+        """Return whether the gripper holds something, or does not know; a grip of an earlier process counts."""
+        if not self.has_gripper:
+            return False
+        gripper = self.inputs.gripper
+        if gripper is None:
+            return self._on_judged is not None or self.grip.force_n is not None
+        return gripper.holding or gripper.moving or gripper.uncertain
+
+    @property
+    def awaits_judgement(self) -> bool:
+        """Whether the gripper has not shown yet if it still has the grip of an earlier process."""
+        return self._on_judged is not None
+
+    @property
+    def activates(self) -> bool:
+        """Whether the gripper is activated before its next motion, as after a fault or a loss of power."""
+        gripper = self.inputs.gripper
+        return gripper is not None and (bool(gripper.fault) or gripper.inactive or gripper.too_hot)

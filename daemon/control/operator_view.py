@@ -1,0 +1,237 @@
+"""What the operator may do now, why not, and what it would do to a held tool: refusals, and questions before them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from shearloop.daemon.control.experiment import Experiment
+from shearloop.daemon.control.experiment_check import not_measured, too_noisy
+from shearloop.daemon.control.experiment_schema import (
+    ApproachStep,
+    ExperimentFile,
+    GripStep,
+    TareStep,
+    first_gripper_step,
+    first_motion_before_grip,
+    first_turn_before_tare,
+)
+from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
+from shearloop.daemon.control.inputs import LatestInputs
+from shearloop.daemon.control.safety import SafetyMonitor
+from shearloop.daemon.torques import CONFIRM_TARE, TorqueSource, loaded_sentence
+
+
+def activation_sentence(what: str) -> str:
+    """Return what an activation does after a fault, and to what."""
+    return f"after its fault the gripper is activated again, which opens its fingers, and a tool in it drops; {what}"
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorView:
+    """Answers of the present moment, by what the control loop knows; nothing here moves or changes anything.
+
+    `zero_known` says of each source whether its zero is; `running` gives the experiment that runs.
+    """
+
+    inputs: LatestInputs
+    tool: HeldTool
+    safety: SafetyMonitor
+    sources: Mapping[str, TorqueSource]
+    zero_known: Mapping[str, bool]
+    running: Callable[[], Experiment | None]
+
+    def start_refusal(self) -> str | None:
+        """Return why no experiment at all can begin, or None."""
+        if (running := self.running()) is not None:
+            return f"the experiment {running.file.name!r} is still running; stop it first"
+        if self.safety.stopped:
+            first, *others = self.safety.stop_faults
+            also = f" Also: {'; '.join(fault.cause for fault in others)}." if others else ""
+            return f"{first.sentence}{also}"
+        return None
+
+    def file_refusal(self, file: ExperimentFile) -> str | None:
+        """Return why this experiment cannot begin with the tool and the zeros of now, or None."""
+        if (reason := self.why_no_source(file) or self.why_not_with_tool(file)) is not None:
+            return reason
+        if isinstance(file.steps[0], TareStep) and (reason := self.why_no_tare_step()) is not None:
+            return f"step 1 (tare): {reason}"
+        return None
+
+    def tare_refusal(self, *, confirmed: bool = False) -> str | None:
+        """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
+        if (running := self.running()) is not None:
+            return (
+                f"the experiment {running.file.name!r} is running, and a new zero would change its "
+                "torques; stop it first, or give it a step `tare`"
+            )
+        if (held := self.tool.held) is not None:
+            return f"{held}, and its torque would become the zero; open the gripper first (`shearloop command release`)"
+        if self.inputs.gripper is None and self.tool.may_hold():
+            return f"{GRIPPED_BEFORE}: wait until it answers"
+        if confirmed:
+            return None
+        if (uncertain := self.tool.uncertain) is not None:
+            return f"{uncertain}; {CONFIRM_TARE}"
+        if loaded := self._loaded():
+            return f"{loaded}, which would become the zero; {CONFIRM_TARE}"
+        return None
+
+    def why_no_tare_step(self) -> str | None:
+        """Return why an experiment cannot take a zero now, or None: nobody is there to confirm it."""
+        if (reason := self.tool.held or self.tool.uncertain) is not None:
+            return f"{reason}; put a `release` before it"
+        if loaded := self._loaded():
+            cure = "if nothing is loaded, `shearloop command tare --yes` takes the zero before the start"
+            return f"{loaded}, which would become the zero; take the load off ({cure})"
+        return None
+
+    def _loaded(self) -> str:
+        """Return which sensor measures a load that does not come from its drift, or an empty string."""
+        # Fingers that are known to be empty do not load a fingertip: its torque is drift.
+        empty = self.tool.has_gripper and self.inputs.gripper is not None
+        judged = {
+            name: latest.torque_nm
+            for name, latest in self.inputs.torques.items()
+            if not self.sources[name].from_robot and not (empty and self.sources[name].warm_up_s)
+        }
+        return loaded_sentence(judged)
+
+    def release_refusal(self) -> str | None:
+        """Return why the operator cannot open the gripper now, or None; the arm is not asked."""
+        if (running := self.running()) is not None:
+            return f"the experiment {running.file.name!r} is running; stop it first"
+        if not self.tool.has_gripper:
+            return None
+        gripper = self.inputs.gripper
+        if gripper is None or "gripper" in self.inputs.lost:
+            reason = self.inputs.lost.get("gripper", "it has not answered yet")
+            return f"the gripper is not connected: {reason.removesuffix('.')}; `shearloop doctor CONFIG` examines it"
+        return None
+
+    def release_question(self) -> str:
+        """Return what a release does now, for the operator who confirms it."""
+        if not self.tool.has_gripper:
+            present = f"at present {turned}" if (turned := self._clamped_turn()) else "no angle counts at present"
+            anew = "the angle of the clamped tool counts anew from the next start"
+            return f"nothing opens, because no gripper is configured; {anew}; {present}"
+        gripper = self.inputs.gripper
+        apart = f"its fingers are {gripper.width_mm:.0f} mm apart" if gripper is not None else "its width is unknown"
+        what = self.tool.held or f"the gripper reports no object, and {apart}"
+        renewed = "; it is activated first: the fingers open and close once" if self.tool.activates else ""
+        return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
+
+    def release_stakes(self) -> tuple[str, ...]:
+        """Return what a confirmation of `release_question` depends on; a width that wavers is not part of it."""
+        held = "held" if self.tool.held is not None else "nothing held"
+        renewed = "renewed" if self.tool.activates else "as it is"
+        # A tool that was exchanged is held by another request, or from another angle.
+        gripper, grip = self.inputs.gripper, self.tool.grip
+        requests = f"{gripper.requested_counts}, {gripper.others_requests} of others" if gripper is not None else "none"
+        return held, renewed, requests, f"{grip.force_n} N from {grip.origin_rad} rad"
+
+    def unlock_question(self) -> str:
+        """Return what an unlock drops, for the operator who confirms it; empty where it opens no fingers on a tool."""
+        gripper = self.inputs.gripper
+        if gripper is None or not gripper.fault or not self.tool.may_hold():
+            return ""
+        may_hold = f"its fingers are {gripper.width_mm:.1f} mm apart, and may hold a tool"
+        return activation_sentence(self.tool.held or may_hold)
+
+    def activation_note(self, file: ExperimentFile) -> str:
+        """Return what the first step with the gripper does besides, for the operator who starts; or an empty string."""
+        first = first_gripper_step(file)
+        if first is None or not self.tool.activates or not self.tool.may_hold():
+            return ""
+        return f" Before step {first[0]} the gripper is activated: its fingers open and close once, and a tool drops."
+
+    def held_note(self, file: ExperimentFile) -> str:
+        """Return what is held as an experiment begins to turn it, for the operator's question; or an empty string."""
+        if not self.tool.has_gripper:
+            turned = self._clamped_turn()
+            anew = "if another tool is clamped, `shearloop command release --yes` lets its angle count anew"
+            return f" At present the clamped tool's angle counts on: {turned}; {anew}." if turned else ""
+        held, unknown, first = self.tool.held, self.tool.unknown_grip, first_gripper_step(file)
+        # A `grip` closes tighter on what is held, and its angle stays as unknown as it is.
+        turns = first_motion_before_grip(file) is not None
+        turns = turns or bool(unknown and first is not None and isinstance(first[1], GripStep))
+        if held is None or not turns:
+            return ""
+        angle = f" The grip is not known ({unknown}): its angle counts from the start." if unknown else ""
+        return f" At present {held}.{angle}"
+
+    def _clamped_turn(self) -> str:
+        """Return how far a clamped tool is turned, as a sentence; empty where no angle counts."""
+        arm, origin_rad = self.inputs.arm, self.tool.grip.origin_rad
+        if arm is None or origin_rad is None:
+            return ""
+        return f"it is turned by {arm.wrist_rad - origin_rad:+.3f} rad"
+
+    def why_no_source(self, file: ExperimentFile) -> str | None:
+        """Return why its torque cannot drive an experiment, or None."""
+        measured = [name for name, source in self.sources.items() if source.measures_torque]
+        if file.torque_source not in measured:
+            known = ", ".join(measured)
+            return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
+        driving = self.sources[file.torque_source]
+        if driving.noise_nm >= file.tightest_nm:
+            return too_noisy(driving.name, driving.noise_nm, file.tightest_nm)
+        unmeasured = next(not_measured(file, driving), None)
+        if unmeasured is not None:
+            place, why_not = unmeasured
+            return f"step {place + 1}: {why_not}"
+        return None
+
+    def why_not_with_tool(self, file: ExperimentFile) -> str | None:
+        """Return why the tool that is held, or may be, forbids an experiment, or its torque's zero does."""
+        driving = self.sources[file.torque_source]
+        if reason := self._why_no_activation(file) or self._why_no_grip(file) or self._why_no_zero(file, driving):
+            return reason
+        number, uncertain = first_motion_before_grip(file), self.tool.uncertain
+        if number is None:
+            return None
+        step = file.steps[number - 1]
+        straight = isinstance(step, ApproachStep)
+        # The limits watch a turn of a held tool. Nothing watches what a straight move does to it.
+        why = uncertain or (f"the gripper is closed: {self.tool.held}" if straight and self.tool.held else None)
+        if why is None:
+            return None
+        motion = f"step {number} ({step.do}), which {'moves the arm' if straight else 'turns the wrist'}"
+        return f"{why}; put a `grip` or a `release` before {motion}"
+
+    def _why_no_activation(self, file: ExperimentFile) -> str | None:
+        """Return why an experiment must not activate the gripper, or None: its grip would drop what is held."""
+        first, held = first_gripper_step(file), self.tool.may_still_hold
+        if first is None or not isinstance(first[1], GripStep) or not self.tool.activates or held is None:
+            return None
+        if self.inputs.gripper is not None and self.inputs.gripper.too_hot:
+            return f"{held}; the gripper is too hot for step {first[0]} (grip): let it cool down"
+        return (
+            f"{held}; step {first[0]} (grip) would activate the gripper first, which opens its fingers, and the tool "
+            "drops: take it out with `shearloop command release --yes`, or put a `release` before it"
+        )
+
+    def _why_no_grip(self, file: ExperimentFile) -> str | None:
+        """Return why the first `grip` would open the fingers on what they hold, or None."""
+        first, gripper, held = first_gripper_step(file), self.inputs.gripper, self.tool.held
+        if first is None or gripper is None or held is None:
+            return None
+        number, step = first
+        if not isinstance(step, GripStep) or step.width_mm <= gripper.width_mm:
+            return None
+        return (
+            f"{held}; step {number} (grip) to {step.width_mm:g} mm would open them and drop it: put a `release` before "
+            "it, or correct `width_mm`"
+        )
+
+    def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
+        """Return why no tool can be turned by a torque without a zero, or None: every limit would be off by it."""
+        number = first_turn_before_tare(file, holds=self.tool.may_hold())
+        if number is None or not driving.needs_zero or self.zero_known.get(driving.name, False):
+            return None
+        # A command tares sensors, and an experiment the robot's wrench, too.
+        command = "" if driving.from_robot else ", or send `shearloop command tare` with nothing gripped"
+        tare = "a `release` and a `tare`" if self.tool.may_hold() else "a `tare`"
+        return (
+            f"no zero of the {driving.name} is known since this daemon began, so that its torques and limits may be "
+            f"off by any load: put {tare} before step {number} ({file.steps[number - 1].do}){command}"
+        )

@@ -65,9 +65,10 @@ def run(args: argparse.Namespace) -> int:
     if args.experiment is not None:
         # The daemon may run in another folder.
         arguments["experiment"] = str(args.experiment.resolve())
-    address, keys, request, reply = args.connect, None, {"command": args.name, **arguments}, None
+    address, request, reply = args.connect, {"command": args.name, **arguments}, None
     timeout_s = args.timeout or addresses.COMMAND_TIMEOUT_S
-    if args.name in ("stop", "status") and args.key is None and not addresses.needs_keys(address):
+    on_this_computer = not addresses.needs_keys(address) or stop_client.is_here(address)
+    if args.name in ("stop", "status") and args.key is None and on_this_computer:
         # These two need no key on the daemon's own machine.
         try:
             reply = stop_client.send_to_stop_socket(address, request, timeout_s)
@@ -76,9 +77,8 @@ def run(args: argparse.Namespace) -> int:
         except TimeoutError:
             # The daemon may have stopped the motion by now. A second `stop` must not end the daemon.
             request["spare_daemon"] = True
-    else:
-        keys = client_keys(args)
     if reply is None:
+        keys = client_keys(args)
         # It imports too much for a `stop` on a busy computer.
         from shearloop.daemon.messaging.client import send_command
 

@@ -42,6 +42,19 @@ def owners(address: str) -> set[int]:
     return found | (at_address or {uid for ip, uid in listeners if ip.is_unspecified})
 
 
+def is_here(address: str) -> bool:
+    """Return whether a tcp address has the number of an interface of this computer; no name is looked up."""
+    host = address.removeprefix("tcp://").rpartition(":")[0].strip("[]")
+    try:
+        ip = ipaddress.ip_address(host)
+        with socket.socket(socket.AF_INET if ip.version == 4 else socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+            # It sends nothing, and fails for an address of another computer.
+            probe.bind((host, 0))
+    except (ValueError, OSError):
+        return False
+    return True
+
+
 def _listeners() -> Iterator[tuple[_IpAddress, int, int]]:
     """Yield address, port and user of each listening TCP socket of this computer."""
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
@@ -81,8 +94,8 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
             if uid not in owners(address):
                 raise StopSocketTakenError(
                     f"the stop socket of {address} is held by the user {uid}, who does not run the daemon at this "
-                    "address: that it has stopped anything is not believed; `sudo ss -xlp` names the process, end it "
-                    "and restart the daemon"
+                    "address: that it has stopped anything is not believed; give the daemon's address with --connect, "
+                    "or find the process with `sudo ss -xlp`, end it and restart the daemon"
                 )
     try:
         # It has no arrays; `messages.decode` would import numpy.

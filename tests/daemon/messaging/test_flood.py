@@ -14,6 +14,7 @@ import zmq
 import zmq.asyncio
 
 from shearloop.cli import main
+from shearloop.daemon.messaging import stop_client
 from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.command_server import (
@@ -275,3 +276,26 @@ def test_who_listens_at_another_address_of_the_same_port_is_not_believed(theirs,
     port = free_port()
     with listener_of(NOBODY, theirs, port):
         assert (NOBODY in owners(f"tcp://{asked}:{port}")) is believed
+
+
+async def test_a_stop_to_a_daemon_of_this_computer_at_its_network_address_needs_no_key(monkeypatch):
+    address = f"tcp://192.0.2.1:{free_port()}"
+    # An address of this computer, which a test cannot know.
+    monkeypatch.setattr(stop_client, "is_here", lambda asked: asked == address)
+    async with stop_socket(address, Refusals()):
+        assert await asyncio.to_thread(main, ["command", "stop", "--connect", address]) == 0
+
+
+@pytest.mark.parametrize(
+    ("address", "here"),
+    [
+        ("tcp://127.0.0.1:7762", True),
+        ("tcp://127.5.6.7:7762", True),
+        ("tcp://192.0.2.254:7762", False),
+        ("tcp://[2001:db8::1]:7762", False),
+        ("tcp://lab-pc:7762", False),
+        ("ipc:///tmp/commands", False),
+    ],
+)
+def test_only_the_number_of_an_interface_is_of_this_computer(address, here):
+    assert stop_client.is_here(address) is here

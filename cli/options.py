@@ -70,12 +70,14 @@ def _expanded(expand: Callable[[str], Expanded], text: str) -> Expanded:
 
 
 def time_range(text: str) -> tuple[float, float]:
-    """Return the shares of FROM:TO, as the type of an option."""
+    """Return the fractions of FROM:TO, as the type of an option."""
     with contextlib.suppress(ValueError):
         start, stop = map(float, text.split(":"))
         if 0 <= start < stop <= 1:
             return start, stop
-    raise argparse.ArgumentTypeError(f"{text} is not two shares that rise from 0 or more to 1 or less, such as 0.5:1")
+    raise argparse.ArgumentTypeError(
+        f"{text} is not two fractions that rise from 0 or more to 1 or less, such as 0.5:1"
+    )
 
 
 TIMEOUT_S = positive(high=86_400.0)

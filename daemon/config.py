@@ -107,7 +107,7 @@ class SerialDevice(ConfigModel):
 class CreepConfig(ConfigModel):
     """Loss of a gel's torque under a held shear."""
 
-    share: float = Field(ge=0, lt=1, description="final loss, as a share of the torque")
+    share: float = Field(ge=0, lt=1, description="final loss, as a fraction of the torque")
     time_s: float = Field(gt=0, le=3600, description="time constant")
 
 

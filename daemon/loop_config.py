@@ -22,8 +22,8 @@ class LoopConfig(ConfigModel):
     angle_bandwidth_per_s: float = Field(default=5.0, gt=0, le=80, description="how fast the wrist approaches an angle")
     torque_bandwidth_per_s: float = Field(default=4.0, gt=0, le=30, description="how fast it approaches a torque")
     actuation_s: float = Field(default=0.02, ge=0, le=0.2, description="from sending a speed until the angle shows it")
-    gain_margin: float = Field(default=2.0, ge=1, le=100, description="least gain margin, as a factor")
-    phase_margin_deg: float = Field(default=45.0, ge=0, le=90, description="least phase margin")
+    gain_margin: float = Field(default=2.0, ge=1, le=100, description="minimum gain margin, as a factor")
+    phase_margin_deg: float = Field(default=45.0, ge=0, le=90, description="minimum phase margin")
 
     @property
     def planned_acceleration_rad_per_s2(self) -> float:

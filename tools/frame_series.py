@@ -94,7 +94,7 @@ def part_of(series: Series, start: float, stop: float) -> Series:
     n = len(series.t_s)
     first, end = round(start * n), round(stop * n)
     if first == end:
-        raise UserError(f"none of {n} frames lies between the shares {start:g} and {stop:g}; use a longer part")
+        raise UserError(f"none of {n} frames lies between the fractions {start:g} and {stop:g}; use a longer part")
     return series.between(first, end)
 
 

@@ -206,7 +206,7 @@ class ReleaseStep(_Step):
 
     do: Literal["release"]
     width_mm: FingerWidth = Field(
-        LARGEST_STROKE_MM, description="least width to open to; a smaller gripper opens fully"
+        LARGEST_STROKE_MM, description="minimum width to open to; a smaller gripper opens fully"
     )
 
 

@@ -213,7 +213,7 @@ class LoopState(Message):
         "", "kind of slice that `recording export` makes of a held angle: torque, diameter, or nothing"
     )
     activity: str = column("", "what the loop does or waits for")
-    progress: float = column("", "share of the experiment that is done, 0 to 1")
+    progress: float = column("", "fraction of the experiment that is done, 0 to 1")
     remaining_s: float = column("s", "estimated time to the end")
     tool_mm: float | None = column("mm", "diameter of the tool, if the experiment names it")
     torque_source: str = column("", "source of the torque that the loop controls")

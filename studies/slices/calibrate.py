@@ -107,6 +107,7 @@ def _range_ends(span: SliceRange) -> str:
     if below_nm >= high_nm and above_nm <= low_nm:
         where = f"all intervals reach from {lowest_nm:g} to {highest_nm:g} N·m at least, and the torque is useless"
     return (
-        f"Torques beyond the calibrated {low_nm:g} to {high_nm:g} N·m may be estimated within them, as the outermost "
-        f"were when they were left out: {where}. Calibrate on all torques that will occur, and add --assume-full-range."
+        f"A torque beyond the calibrated {low_nm:g} to {high_nm:g} N·m may read as one within them: the outermost ones "
+        f"did when they were left out. So {where}. Calibrate on all torques that will occur, and add "
+        "--assume-full-range."
     )

@@ -497,7 +497,7 @@ def test_two_sides_are_paired_by_time(mat_folder, tmp_path):
     assert np.isfinite(both.torque_at_frames()[2:55]).all()
     early, later = part_of(both, 0, 0.25), part_of(both, 0.25, 1)
     assert (len(early.t_s), len(later.t_s)) == (15, 45)
-    with pytest.raises(UserError, match=r"none of 60 frames lies between the shares 0 and 0\.001"):
+    with pytest.raises(UserError, match=r"none of 60 frames lies between the fractions 0 and 0\.001"):
         part_of(both, 0, 0.001)
 
 

@@ -127,7 +127,9 @@ def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, 
     printed = ran(*calibrate).out
     span = fitted[-1].torque.regressor.range
     assert np.isinf(span.low_end)
-    ends = f": intervals of estimates above {span.high_end:.3g} N·m reach to {span.highest:.3g} N·m at least. Calibrate"
+    ends = (
+        f"So intervals of estimates above {span.high_end:.3g} N·m reach to {span.highest:.3g} N·m at least. Calibrate"
+    )
     assert ends in printed
     assert result_of(*calibrate)["reads_beyond"] is False
     evaluate = ["evaluate", tmp_path / "a.cal", slices_folder / "torque_slices"]
@@ -223,11 +225,11 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
     [
         (
             ["calibrate", "{slices}", "--time-range", "0.5", "--out", "x"],
-            "--time-range 0.5 is not two shares that rise",
+            "--time-range 0.5 is not two fractions that rise",
         ),
         (
             ["calibrate", "{slices}", "--time-range", "0.9:0.5", "--out", "x"],
-            "--time-range 0.9:0.5 is not two shares that rise",
+            "--time-range 0.9:0.5 is not two fractions that rise",
         ),
         (["calibrate", "{slices}", "--sides", "middle", "--out", "x"], "--sides middle is not right or left"),
         (["calibrate", "{slices}", "--estimator", "bank", "--out", "x"], "needs a bank"),

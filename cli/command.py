@@ -5,11 +5,14 @@ import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, with_connection
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.callers import caller
+
+if TYPE_CHECKING:
+    from shearloop.daemon.messaging.keys import ClientKeys
 
 DAEMON_COMMANDS = {
     "tare": "set the zero of the torque sensors, with nothing gripped and no experiment running",
@@ -22,7 +25,8 @@ DAEMON_COMMANDS = {
     "release": "open the gripper, and a tool drops; or count a clamped one's angle anew; after a stop too; needs --yes",
     "unlock": "allow motion again after a stop, when no person is within reach; --yes where it opens the gripper",
 }
-
+# `stop` is never refused, and the others change nothing.
+_ACTS_ON_NOTHING_SHOWN = ("stop", "status", "experiments")
 
 EPILOG = """
 examples:
@@ -57,36 +61,69 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Send one command and print its reply; status 1 if the daemon refused it."""
-    arguments: dict[str, Any] = {"by": caller("shearloop command")}
-    if args.source is not None:
-        arguments["source"] = args.source
-    if args.yes:
-        arguments["confirmed"] = True
-    if args.experiment is not None:
-        # The daemon may run in another folder.
-        arguments["experiment"] = str(args.experiment.resolve())
-    address, request, reply = args.connect, {"command": args.name, **arguments}, None
-    timeout_s = args.timeout or addresses.COMMAND_TIMEOUT_S
-    on_this_computer = not addresses.needs_keys(address) or stop_client.is_here(address)
+    request = _request(args)
+    reply = None
+    on_this_computer = not addresses.needs_keys(args.connect) or stop_client.is_here(args.connect)
     if args.name in ("stop", "status") and args.key is None and on_this_computer:
         # These two need no key on the daemon's own machine.
+        timeout_s = args.timeout or addresses.COMMAND_TIMEOUT_S
         try:
-            reply = stop_client.send_to_stop_socket(address, request, timeout_s)
+            reply = stop_client.send_to_stop_socket(args.connect, request, timeout_s)
         except stop_client.StopSocketTakenError as error:
             print(f"shearloop command: {error}; `{args.name}` is sent to the command address instead", file=sys.stderr)
         except TimeoutError:
             # The daemon may have stopped the motion by now. A second `stop` must not end the daemon.
             request["spare_daemon"] = True
     if reply is None:
-        keys = client_keys(args)
-        # It imports too much for a `stop` on a busy computer.
-        from shearloop.daemon.messaging.client import send_command
+        reply = _sent(args, request, client_keys(args))
+    return _told(args, reply)
 
-        if args.name in addresses.SLOW and args.timeout is None:
-            # A missing daemon is reported without the long timeout.
-            send_command(address, {"command": "status"}, addresses.COMMAND_TIMEOUT_S, keys)
-            timeout_s = addresses.UNLOCK_TIMEOUT_S
-        reply = send_command(address, request, timeout_s, keys)
+
+def _request(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the request that the arguments stand for."""
+    request: dict[str, Any] = {"command": args.name, "by": caller("shearloop command")}
+    if args.source is not None:
+        request["source"] = args.source
+    if args.yes:
+        request["confirmed"] = True
+    if args.experiment is not None:
+        # The daemon may run in another folder.
+        request["experiment"] = str(args.experiment.resolve())
+    return request
+
+
+def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys | None") -> dict[str, Any]:
+    """Send a request to the command address and return the reply; raises UserError without one.
+
+    One that acts is meant for the daemon that runs now, and an unlock for the stop that waits there now.
+    """
+    # It imports too much for a `stop` on a busy computer.
+    from shearloop.daemon.messaging.client import meant_for, send_command
+
+    timeout_s = args.timeout
+    if timeout_s is None:
+        timeout_s = addresses.UNLOCK_TIMEOUT_S if args.name in addresses.SLOW else addresses.COMMAND_TIMEOUT_S
+    if args.name not in _ACTS_ON_NOTHING_SHOWN:
+        # A missing daemon is reported without a long timeout.
+        short_s = min(timeout_s, addresses.COMMAND_TIMEOUT_S)
+        status = send_command(args.connect, {"command": "status"}, short_s, keys)
+        if not status.get("ok"):
+            return status
+        request |= meant_for(status)
+        if args.name == "unlock":
+            request |= _acknowledged(status.get("loop", {}))
+    return send_command(args.connect, request, timeout_s, keys)
+
+
+def _acknowledged(loop: Mapping[str, Any]) -> dict[str, int]:
+    """Return which stop an unlock names, and say what it is."""
+    if loop.get("stop_causes"):
+        print(f"unlock acknowledges the stop: {loop['stop_causes']}.", file=sys.stderr)
+    return {"stop": loop["stop"]} if "stop" in loop else {}
+
+
+def _told(args: argparse.Namespace, reply: dict[str, Any]) -> int:
+    """Print a reply; return the exit status."""
     accepted = bool(reply.pop("ok", False))
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
@@ -94,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
         print(with_connection("\n".join(_lines(args.name, reply)), args, addresses.COMMAND_ADDRESS))
     else:
         reason = with_connection(str(reply.get("reason")), args, addresses.COMMAND_ADDRESS)
-        if args.experiment is not None and not (addresses.needs_keys(address) or args.experiment.exists()):
+        if args.experiment is not None and not (addresses.needs_keys(args.connect) or args.experiment.exists()):
             # The daemon does not say it: it may see more than this user.
             reason = f"there is no file {args.experiment} on this computer; {reason}"
         print(f"shearloop command: {args.name} was refused: {reason}", file=sys.stderr)

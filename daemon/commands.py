@@ -2,8 +2,9 @@
 
 import asyncio
 import os
+import secrets
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -26,10 +27,14 @@ EXPERIMENTS = "experiments"
 ARGUMENTS: Mapping[str, Mapping[str, type]] = {
     "tare": {"source": str, "confirmed": bool},
     "start": {"experiment": str, "ask": bool, "digest": str},
-    "unlock": {"confirmed": bool, "digest": str},
+    "unlock": {"confirmed": bool, "digest": str, "stop": int},
     "release": {"confirmed": bool, "ask": bool, "digest": str},
 }
+# An argument that each of them may have: the process that it is meant for.
+_OF_ALL: Mapping[str, type] = {"instance": str}
+_KINDS: Mapping[type, str] = {bool: "true or false", int: "a whole number", str: "text"}
 STOP_DELAY_S = 0.05
+_ANOTHER_DAEMON = "it is meant for an earlier daemon, and this one has begun since; look at the rig, and send it again"
 
 
 class TareRefusal(Protocol):
@@ -63,6 +68,8 @@ class Commands:
     tare_refusal: TareRefusal
     # Receives each answered command, except questions.
     report: Callable[["Answered"], None] = lambda _: None
+    # Of this process: in a container, each has the same number.
+    instance: str = field(default_factory=lambda: secrets.token_hex(8))
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
@@ -85,6 +92,8 @@ class Commands:
         refusal = None
         try:
             check_arguments(name, request)
+            if name != STOP and request.get("instance", self.instance) != self.instance:
+                raise CommandRefusedError(_ANOTHER_DAEMON)
             return await handler(request)
         except CommandRefusedError as error:
             refusal = str(error)
@@ -142,14 +151,21 @@ class Commands:
 
     async def _unlock(self, request: Request) -> Reply:
         rig = required_rig(self.rig)
-        confirmed, sentence = bool(request.get("confirmed")), rig.control_loop.operator.unlock_question()
-        if sentence:
+        loop, confirmed = rig.control_loop, bool(request.get("confirmed"))
+        _refuse_if(rig.runner.unlock_refusal())
+        # A stop since the latest state waits too.
+        rig.runner.decide_now()
+        another, drops = loop.operator.why_another_stop(request.get("stop")), loop.operator.unlock_question()
+        if another or drops:
+            sentence = "; ".join(filter(None, (another, drops)))
+            what = "drops" if drops else "acknowledges", f"stop {loop.safety.waiting}"
             question = Question(
                 f"Unlock? {_capital(sentence)}.",
-                digest_of("unlock", *rig.occasion(), *rig.control_loop.operator.release_stakes()),
+                digest_of("unlock", *what, *rig.occasion(), *loop.operator.release_stakes()),
             )
-            _refuse_if(rig.runner.unlock_refusal())
-            if not confirmed:
+            if another and request.get("digest") != question.digest:
+                raise CommandRefusedError(f"{another}; look at the rig, and unlock it again", **question.facts)
+            if drops and not confirmed:
                 reason = f"{sentence}; secure it, then confirm it with `shearloop command unlock --yes`"
                 raise CommandRefusedError(reason, **question.facts)
             _refuse_if_changed(question, sentence, request)
@@ -193,7 +209,7 @@ class Commands:
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()
-        daemon = {"process": os.getpid(), "folder": os.getcwd(), "rig": self.health.rig}
+        daemon = {"process": os.getpid(), "instance": self.instance, "folder": os.getcwd(), "rig": self.health.rig}
         if self.rig is None:
             return {"tasks": tasks, "daemon": daemon}
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}
@@ -233,16 +249,16 @@ def check_arguments(name: str, request: Request) -> None:
     """
     if name == STOP:
         return
-    known = ARGUMENTS.get(name, {})
+    own = ARGUMENTS.get(name, {})
+    known = {**own, **_OF_ALL}
     for key, value in request.items():
         if key in ("command", "by"):
             continue
         if key not in known:
-            has = f"; it has {', '.join(known)}" if known else "; it has none"
+            has = f"; it has {', '.join(own)}" if own else "; it has none"
             raise CommandRefusedError(f"`{name}` has no argument {printable(key)[:40]!r}{has}")
-        if not isinstance(value, known[key]) or value == "":
-            kind = "true or false" if known[key] is bool else "text"
-            raise CommandRefusedError(f"`{key}` is {printable(repr(value))[:40]}, and has to be {kind}")
+        if type(value) is not known[key] or value == "":
+            raise CommandRefusedError(f"`{key}` is {printable(repr(value))[:40]}, and has to be {_KINDS[known[key]]}")
 
 
 def required_rig(rig: "Rig | None") -> "Rig":

@@ -43,7 +43,7 @@ from shearloop.errors import UserError
 # What `status` shows of `loop.state`.
 LOOP_KEYS = (
     *("phase", "run", "experiment", "step", "steps", "step_name", "activity", "progress"),
-    *("cause", "faults", "reasons"),
+    *("stop", "cause", "faults", "reasons"),
 )
 
 
@@ -309,7 +309,7 @@ class Rig:
     def state(self) -> Mapping[str, Any]:
         """Return what `status` shows of the control loop."""
         state = loop_state(self.control_loop, 0.0, 0)
-        return {key: getattr(state, key) for key in LOOP_KEYS}
+        return {**{key: getattr(state, key) for key in LOOP_KEYS}, "stop_causes": self.control_loop.safety.stop_causes}
 
 
 def build_rig(

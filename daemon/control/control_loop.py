@@ -259,8 +259,7 @@ class ControlLoop:
         self.tool.release_error = None
         self._later_stop = ""
         if self.safety.stopped:
-            causes = "; ".join(fault.cause for fault in self.safety.stop_faults)
-            self._acknowledged = f"the stop is acknowledged; its cause was: {causes}"
+            self._acknowledged = f"the stop is acknowledged; its cause was: {self.safety.stop_causes}"
         self.safety.acknowledge()
 
     def tick(self, t_ns: int, late_s: float = 0.0, sent_rad_per_s: float | None = None) -> ControlOutput:

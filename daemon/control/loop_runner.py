@@ -253,10 +253,13 @@ class ControlLoopRunner:
             return reason
         # A stop since the latest state is carried out and published as the stop that it is.
         self.decide_now()
+        waiting = self._control_loop.safety.waiting
         try:
             await self.actions.unlock(confirmed=confirmed)
         except (ActionError, DriverError) as error:
             return str(error)
+        if another := self._control_loop.operator.why_another_stop(waiting):
+            return f"robot and gripper are unlocked, and meanwhile there was a stop; {another}; unlock it again"
         self._control_loop.acknowledge()
         return None
 
@@ -344,7 +347,8 @@ class ControlLoopRunner:
             self._timed = experiment
             # The stop before may still wait for its standstill.
             self.states.publish_stop(self._timeline.end())
-            self._timeline.begin(experiment.file.name, status.activity, status.decision, now_ns)
+            run, name = self._control_loop.runs, experiment.file.name
+            self._timeline.begin(run, name, status.activity, status.decision, now_ns)
         if is_new or not self._stopped:
             self._stopped = True
             self.actions.cancel()

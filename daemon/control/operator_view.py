@@ -120,6 +120,15 @@ class OperatorView:
         renewed = "; it is activated first: the fingers open and close once" if self.tool.activates else ""
         return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
 
+    def why_another_stop(self, named: int | None) -> str:
+        """Return how the stop that waits differs from the one that an unlock names, if any; empty where it does not.
+
+        One that somebody else has acknowledged is none that an unlock could clear unseen.
+        """
+        if named in (None, self.safety.waiting) or not self.safety.stopped:
+            return ""
+        return f"another stop waits than the one that was shown: {self.safety.stop_causes}"
+
     def release_stakes(self) -> tuple[str, ...]:
         """Return what a confirmation of `release_question` depends on; a width that wavers is not part of it."""
         held = "held" if self.tool.held is not None else "nothing held"

@@ -319,6 +319,8 @@ class SafetyMonitor:
         self._patience = patience
         # How many stops the operator has acknowledged.
         self.acknowledged = 0
+        # How many causes have begun a stop, or joined one that waits for the operator.
+        self.stops = 0
         # Hold timers of faults and of the wrist, and the faults that held it at the last judgement.
         self._held_ns: dict[str, int] = {}
         self._wrist_ns = 0
@@ -343,6 +345,7 @@ class SafetyMonitor:
         decision = SafetyDecision(response, self._explained(active, _explaining(active)))
         if response >= Response.STOP_AND_KEEP_GRIP and (self._stop is None or response > self._stop.response):
             self._stop = decision
+            self.stops += 1
         return decision if self._stop is None else self._with_stop(self._stop, active)
 
     def report(self, faults: Iterable[Fault]) -> SafetyDecision:
@@ -351,11 +354,17 @@ class SafetyMonitor:
         self._reset_timers()
         for fault in active:
             if fault.rule.stops_at_rest:
-                self.stop(fault)
+                # One that lasts is one cause.
+                self.stops += fault.code not in {known.code for known in self.stop_faults}
+                self._add(fault)
         return SafetyDecision(Response.NOTE, active) if self._stop is None else self._with_stop(self._stop, active)
 
     def stop(self, fault: Fault) -> None:
         """Begin a stop that no input shows, such as an operator's; it keeps the grip, and a stronger one stays."""
+        self.stops += 1
+        self._add(fault)
+
+    def _add(self, fault: Fault) -> None:
         begun = self._stop or SafetyDecision(Response.STOP_AND_KEEP_GRIP)
         earlier = (one for one in begun.faults if one.code is not fault.code)
         self._stop = SafetyDecision(begun.response, (*earlier, fault))
@@ -372,9 +381,19 @@ class SafetyMonitor:
         return self._stop is not None
 
     @property
+    def waiting(self) -> int:
+        """The number of the stop that waits for the operator, which grows with each further cause; 0 without one."""
+        return self.stops if self.stopped else 0
+
+    @property
     def stop_faults(self) -> tuple[Fault, ...]:
         """The faults of the stop that waits for the operator; empty without one."""
         return self._stop.faults if self._stop is not None else ()
+
+    @property
+    def stop_causes(self) -> str:
+        """The causes of the stop that waits for the operator, without their cures; empty without one."""
+        return "; ".join(fault.cause for fault in self.stop_faults)
 
     @classmethod
     def _explained(cls, active: tuple[Fault, ...], cause: Fault | None) -> tuple[Fault, ...]:

@@ -35,7 +35,7 @@ class StopTimeline:
         """Note that a person, or the daemon's end, asks for a stop; it counts until the next `update`."""
         self._requested_ns = now_ns
 
-    def begin(self, experiment: str, reason: str, decision: SafetyDecision, now_ns: int) -> None:
+    def begin(self, run: int, experiment: str, reason: str, decision: SafetyDecision, now_ns: int) -> None:
         """Take the decision; its cause is the request, or the oldest measurement that shows a fault."""
         measured = [one.t_ns for one in decision.faults if one.t_ns is not None and not one.is_consequence]
         cause_ns = min(measured, default=now_ns) if self._requested_ns is None else self._requested_ns
@@ -44,6 +44,7 @@ class StopTimeline:
         self._stop = LoopStop(
             source="loop",
             t_mono_ns=cause_ns,
+            run=run,
             experiment=experiment,
             cause=reason,
             faults=decision.codes,

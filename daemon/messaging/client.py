@@ -130,13 +130,17 @@ async def ask(
     may_act = content.get("command") not in ("status", "experiments") and not content.get("ask")
     with context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
+        # Nothing waits in this socket for a daemon that begins later.
+        socket.setsockopt(zmq.IMMEDIATE, 1)
         connect(socket, address, keys)
+        sent = False
         try:
             async with asyncio.timeout(timeout_s):
                 await socket.send(encode(content))
+                sent = True
                 return decode(await socket.recv())
         except TimeoutError as error:
-            late = ". One that runs may still carry it out: see `shearloop command status`" if may_act else ""
+            late = ". One that runs may still carry it out: see `shearloop command status`" if may_act and sent else ""
             if content.get("command") == "stop":
                 late = ". Nothing says that the arm stands: use the emergency stop"
             raise UserError(
@@ -145,6 +149,15 @@ async def ask(
             ) from error
         except ValueError as error:
             raise foreign_reply(address, error) from error
+
+
+def meant_for(status: Mapping[str, Any]) -> dict[str, str]:
+    """Return what binds a request to the daemon that gave this reply to `status`: one that begins later refuses it.
+
+    Nothing for a daemon that does not say which one it is.
+    """
+    instance = status.get("daemon", {}).get("instance")
+    return {"instance": instance} if isinstance(instance, str) else {}
 
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:

@@ -229,6 +229,7 @@ class LoopState(Message):
     speed_command_rad_per_s: float = column("rad/s", "the commanded wrist speed, before clipping")
     speed_sent_rad_per_s: float = column("rad/s", "the wrist speed that was sent, after clipping")
     response: str = column("", "the safety response")
+    stop: int = column("", "number of the stop that waits for `unlock`, larger after each further cause; 0 without one")
     cause: str = column("", "the first of the reasons, which may have caused the others; empty without one")
     faults: str = column("", "their codes, separated by commas, the cause's first; see faults.md")
     reasons: str = column("", "every reason for holding or stopping, in sentences")
@@ -238,6 +239,7 @@ class LoopState(Message):
 class LoopStop(Message):
     """One stop of an experiment, with the times since its cause; its own time is the cause's."""
 
+    run: int = column("", "number of the experiment since the daemon began, from 1")
     experiment: str = column("", "name of the experiment")
     cause: str = column("", "why it stopped, in sentences")
     faults: str = column("", "codes of the faults that stopped it, separated by commas, the cause's first")

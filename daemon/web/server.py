@@ -29,7 +29,7 @@ from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.callers import caller
-from shearloop.daemon.messaging.client import ask, connect
+from shearloop.daemon.messaging.client import ask, connect, meant_for
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to_stop_socket
@@ -52,7 +52,7 @@ NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock", "release")
 # Those that the page asks about first, with the daemon's question. The confirmation gives back the question's digest.
 ASKED = ("start", "release")
 # What a request may say of each command; a word that is not known must not pass for a confirmation.
-WORDS = {"start": ("experiment", "digest"), "unlock": ("digest",), "release": ("digest",)}
+WORDS = {"start": ("experiment", "digest"), "unlock": ("digest", "stop"), "release": ("digest",)}
 # Those that are carried out at once, unless the daemon's refusal has a question; the digest answers it.
 ASKED_IF_NEEDED = ("unlock",)
 # The parts of a question, which a refusal has as well where another one is to be answered.
@@ -81,6 +81,8 @@ MAX_PAGES = 16
 # At this number of connections, the oldest that waits for a request is closed for a new one.
 MAX_CONNECTIONS, ACCEPTED_AT_ONCE = 128, 16
 MAX_BODY_BYTES = 4096
+# Of the number of a stop.
+_MOST_DIGITS = 9
 # The largest message is a heatmap of 200 × 200 float32.
 MAX_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 1000
@@ -160,12 +162,13 @@ class Bridge:
         finally:
             self._socket.unsubscribe(messages.EitHeatmap.topic)
 
-    async def command(self, name: str, **arguments: bool | str) -> dict[str, Any]:
+    async def command(self, name: str, **arguments: bool | int | str) -> dict[str, Any]:
         """Return the daemon's reply to a command; raise UserError without a reply."""
+        content = {"command": name, "by": caller(PROGRAM), **arguments}
         if name != "experiments":
             status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
             self._check_shown(status.get("daemon", {}).get("process"), "nothing was sent to it")
-        content = {"command": name, "by": caller(PROGRAM), **arguments}
+            content |= meant_for(status)
         return await self._request(content, UNLOCK_TIMEOUT_S if name in SLOW else COMMAND_TIMEOUT_S)
 
     def _check_shown(self, process: int | None, done: str) -> None:
@@ -368,7 +371,12 @@ class _Page:
         if unknown := [word for word in request.query if word not in words]:
             has = f"there are {', '.join(words)}" if words else "there are none"
             return self._refuse(400, f"`{name}` has no word {unknown[0][:40]!r} here; {has}")
-        arguments: dict[str, bool | str] = {word: text for word, text in request.query.items() if text}
+        arguments: dict[str, bool | int | str] = {word: text for word, text in request.query.items() if text}
+        if "stop" in arguments:
+            number = request.query["stop"]
+            if not (number.isascii() and number.isdecimal() and len(number) <= _MOST_DIGITS):
+                return self._refuse(400, f"`stop` is {number[:40]!r}, and has to be a whole number")
+            arguments["stop"] = int(number)
         # The first press asks, the second one confirms what was asked.
         if name in ASKED and "digest" not in arguments:
             arguments["ask"] = True

@@ -187,7 +187,6 @@ def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, m
         (["command", "stop", "--connect", "tcp://127.0.0.1:7762a", "--timeout", "0.05"], "a whole number up to 65535"),
         (["listen", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no message came"),
         (["command", "tare", "--connect", "ipc:///nobody", "--timeout", "0.05"], "no daemon answered at ipc:///nobody"),
-        (["command", "tare", "--connect", "ipc:///nobody", "--timeout", "0.05"], "that runs may still carry it out"),
     ],
 )
 def test_a_command_line_mistake_is_one_sentence(arguments, part, mistake):
@@ -599,10 +598,30 @@ def test_what_takes_long_waits_and_a_missing_daemon_is_reported_at_once(monkeypa
     assert main(["command", "unlock"]) == 0
     assert main(["command", "start"]) == 0
     assert main(["command", "unlock", "--timeout", "5"]) == 0
+    assert main(["command", "pause", "--timeout", "0.5"]) == 0
     assert main(["command", "stop", "--connect", f"ipc://{tmp_path}/commands"]) == 0
     long = [("status", 2.0), ("unlock", 60.0), ("status", 2.0), ("start", 60.0)]
-    assert asked == [*long, ("unlock", 5.0), ("stop", 2.0)]
+    given = [("status", 2.0), ("unlock", 5.0), ("status", 0.5), ("pause", 0.5)]
+    assert asked == [*long, *given, ("stop", 2.0)]
     assert "unlock: done" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["tare", "start", "pause", "resume", "release", "unlock"])
+def test_what_acts_is_meant_for_the_daemon_that_runs_and_an_unlock_for_the_stop_that_waits(name, monkeypatch, capsys):
+    asked: list[dict[str, Any]] = []
+    loop = {"stop": 3, "stop_causes": "the operator stopped it: nothing was under way"}
+
+    def answers(_address: str, content: dict[str, Any], *_: object) -> dict[str, Any]:
+        asked.append(content)
+        status = {"daemon": {"instance": "a1"}, "loop": loop} if content["command"] == "status" else {}
+        return {"ok": True, "taring": [], **status}
+
+    monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", answers)
+    assert main(["command", name, "--timeout", "60"]) == 0
+    assert [one["command"] for one in asked] == ["status", name]
+    assert (asked[1]["instance"], asked[1].get("stop")) == ("a1", 3 if name == "unlock" else None)
+    said = "unlock acknowledges the stop: the operator stopped it: nothing was under way.\n"
+    assert capsys.readouterr().err == (said if name == "unlock" else "")
 
 
 @pytest.mark.parametrize("given", [(), ("--connect", "tcp://127.0.0.1:9762")])

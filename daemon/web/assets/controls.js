@@ -66,6 +66,8 @@ export class Controls {
     if (received && (!this.received || (ended && !this.listed))) this.offer();
     this.received = received;
     this.busy = busy;
+    // An unlock acknowledges the stop that is shown, and no other.
+    this.stopShown = loop?.stop;
   }
 
   // Fill the picker with the experiments that the daemon offers.
@@ -134,6 +136,7 @@ export class Controls {
     const words = new URLSearchParams();
     if (digest) words.set("digest", digest);
     if (name === "start" && picked) words.set("experiment", picked);
+    if (name === "unlock" && Number.isInteger(this.stopShown)) words.set("stop", this.stopShown);
     this.tell(`${name} …`);
     const reply = await this.ask(`commands/${name}?${words}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
     // A refusal of the first press with a question is no more than the question.

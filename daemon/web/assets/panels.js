@@ -364,9 +364,9 @@ export function loopPanel(link) {
   put(byId("other-reasons"), others);
 }
 
-// The times of the stop of this experiment, from its cause.
+// The times of the stop of this run, from its cause.
 function stopTimes(link, current) {
   const stop = link.get("loop.stop");
-  if (stop?.content.experiment !== current.experiment) return "";
+  if (stop?.content.run !== current.run) return "";
   return `From its cause: ${stop.times}.`;
 }

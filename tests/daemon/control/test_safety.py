@@ -34,6 +34,25 @@ def test_a_hold_that_lasts_too_long_becomes_a_stop(event):
     assert gate.judge([trouble(event)], int(longest_s * SECOND) + 1).response is Response.STOP_AND_KEEP_GRIP
 
 
+def test_a_stop_has_a_larger_number_after_each_further_cause_and_not_while_one_lasts():
+    gate = SafetyMonitor()
+    assert gate.waiting == 0
+    for _ in range(3):
+        gate.report([trouble(FaultCode.PROTECTIVE_STOP), trouble(FaultCode.SENSOR_LOST)])
+        assert gate.waiting == 1
+    gate.stop(trouble(FaultCode.OPERATOR_STOP))
+    gate.report([trouble(FaultCode.PROTECTIVE_STOP)])
+    assert gate.waiting == 2
+    # A second person presses the same button.
+    gate.stop(trouble(FaultCode.OPERATOR_STOP))
+    assert gate.waiting == 3
+    gate.acknowledge()
+    assert gate.waiting == 0
+    assert gate.judge([trouble(FaultCode.TORQUE_LIMIT)], 0).response in STOPS
+    gate.judge([trouble(FaultCode.TORQUE_LIMIT)], SECOND)
+    assert gate.waiting == 4
+
+
 TICK_S = 0.008
 
 

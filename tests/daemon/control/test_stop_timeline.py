@@ -19,7 +19,7 @@ def state(at_ms: float, *, rests: bool, blocked: str = "") -> RobotState:
 
 def begun() -> StopTimeline:
     timeline = StopTimeline()
-    timeline.begin("test", "why", SafetyDecision(Response.STOP_AND_KEEP_GRIP), 10 * MS)
+    timeline.begin(1, "test", "why", SafetyDecision(Response.STOP_AND_KEEP_GRIP), 10 * MS)
     return timeline
 
 

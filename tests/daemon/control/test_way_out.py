@@ -170,6 +170,66 @@ async def test_an_unlock_that_drops_nothing_asks_nothing(hand):
         assert answered.result() == {}
 
 
+async def unlocked(cell: Cell, unlock: Any, **arguments: Any) -> dict[str, Any]:
+    answered = asyncio.create_task(unlock(arguments))
+    while not answered.done():
+        await cell.cycles(1)
+    return answered.result()
+
+
+async def test_an_unlock_acknowledges_the_stop_that_was_shown_and_no_other():
+    """A second person presses STOP just before the unlock of the first one arrives, and a third one after that."""
+    async with with_gripper() as cell:
+        rig = RigOfDaemon(cell.control_loop, cell.runner, {}, None, None)
+        unlock = commands_with(rig)["unlock"]
+        cell.runner.stop(also_idle=True)
+        await cell.cycles(3)
+        shown = rig.state()
+        assert (shown["stop"], shown["stop_causes"]) == (1, "the operator stopped it: nothing was under way")
+        cell.runner.stop(also_idle=True)
+        sent = len(cell.robot.commands)
+        with pytest.raises(
+            CommandRefusedError, match="another stop waits than the one that was shown: the oper"
+        ) as one:
+            await unlocked(cell, unlock, stop=shown["stop"])
+        assert one.value.facts["question"].startswith("Unlock? Another stop waits than the one that was shown: the op")
+        cell.runner.stop(also_idle=True)
+        with pytest.raises(CommandRefusedError, match="another stop waits") as two:
+            await unlocked(cell, unlock, stop=shown["stop"], digest=one.value.facts["digest"])
+        assert (cell.control_loop.safety.waiting, len(cell.robot.commands)) == (3, sent)
+        # The question that comes with the refusal can be confirmed at once.
+        digest = two.value.facts["digest"]
+        assert await unlocked(cell, unlock, stop=shown["stop"], digest=digest, confirmed=True) == {}
+        assert not cell.control_loop.safety.stopped
+
+
+@pytest.mark.parametrize("named", [{}, {"stop": 1}])
+async def test_an_unlock_of_the_stop_that_waits_or_of_whatever_waits_asks_nothing(named):
+    async with with_gripper() as cell:
+        cell.runner.stop(also_idle=True)
+        await cell.cycles(3)
+        assert await unlocked(cell, commands_of(cell)["unlock"], **named) == {}
+        assert not cell.control_loop.safety.stopped
+        # Another person has acknowledged it meanwhile.
+        assert await unlocked(cell, commands_of(cell)["unlock"], stop=1) == {}
+
+
+async def test_a_stop_during_an_unlocking_is_not_acknowledged_by_it():
+    async with with_gripper() as cell:
+        cell.runner.stop(also_idle=True)
+        await cell.cycles(3)
+        cell.gripper.there.clear()
+        unlocking = asyncio.create_task(commands_of(cell)["unlock"]({"stop": 1}))
+        await cell.cycles(5)
+        emergency_stop(cell)
+        await cell.cycles(5)
+        cell.gripper.there.set()
+        await cell.cycles(3)
+        with pytest.raises(CommandRefusedError, match=r"meanwhile there was a stop; .* emergency stop is pressed"):
+            await unlocking
+        assert cell.control_loop.safety.waiting == 2
+
+
 async def test_no_release_while_the_wrist_moves_or_an_experiment_runs():
     async with with_gripper({**TWIST, "angles_rad": [3.0]}) as cell:
         await cell.cycles(60)

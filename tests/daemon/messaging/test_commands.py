@@ -16,7 +16,7 @@ from shearloop.cli.command import DAEMON_COMMANDS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import EXPERIMENTS, Commands
 from shearloop.daemon.messaging.callers import UNKNOWN, caller, caller_of
-from shearloop.daemon.messaging.client import receive_messages, send_command
+from shearloop.daemon.messaging.client import ask, meant_for, receive_messages, send_command
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, CommandServer, RequestExecutor
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
@@ -74,6 +74,34 @@ async def test_req_and_dealer_clients_are_answered():
                 client.connect(server.address)
                 await client.send(b"\xc1 not msgpack")
                 assert not decode(await client.recv())["ok"]
+
+
+async def test_only_a_request_that_was_sent_may_still_be_carried_out(tmp_path):
+    request = {"command": "release", "confirmed": True}
+    with zmq.asyncio.Context() as context, context.socket(zmq.ROUTER) as silent:
+        silent.bind(f"ipc://{tmp_path}/silent")
+        for name, sent in (("nobody", False), ("silent", True)):
+            with pytest.raises(UserError, match="no daemon answered") as refused:
+                await ask(context, f"ipc://{tmp_path}/{name}", request, 0.2, None)
+            assert ("may still carry it out" in str(refused.value)) is sent
+
+
+@pytest.mark.parametrize("name", sorted({*DAEMON_COMMANDS} - {STATUS, STOP, EXPERIMENTS}))
+async def test_a_request_for_an_earlier_daemon_is_refused(name):
+    """The daemon was restarted between the status that a person has seen and the command."""
+    commands = Commands(None, None, None, None, asyncio.Event(), None)
+    with pytest.raises(CommandRefusedError, match="is meant for an earlier daemon, and this one has begun since"):
+        await commands.handlers()[name]({"command": name, "instance": "of the earlier one"})
+
+
+async def test_a_stop_is_for_every_daemon_and_another_request_may_be():
+    health = SimpleNamespace(tasks=dict, rig="bench")
+    commands = Commands(None, SimpleNamespace(tareable={}), None, health, asyncio.Event(), lambda **_: "held")
+    status = await commands.handlers()[STATUS]({})
+    for bound in (meant_for(status), {}):
+        with pytest.raises(CommandRefusedError, match="held"):
+            await commands.handlers()["tare"](bound)
+    assert (await commands.handlers()[STOP]({"instance": "another", "spare_daemon": True}))["stopped"] == ""
 
 
 def test_an_address_in_use_is_an_error():

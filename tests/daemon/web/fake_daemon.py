@@ -120,7 +120,8 @@ async def serve(folder: Path) -> None:
             if name in asks and request.get("digest") != told["digest"]:
                 raise CommandRefusedError("the file has changed", **question)
             with (folder / "asked").open("a") as asked:
-                asked.write(" ".join(filter(None, (name, Path(request.get("experiment", "")).stem))) + "\n")
+                subject = str(request.get("stop", "")) or Path(request.get("experiment", "")).stem
+                asked.write(" ".join(filter(None, (name, subject))) + "\n")
             if told["refusal"]:
                 raise CommandRefusedError(told["refusal"])
             return REPLIES.get(name, {})

@@ -268,6 +268,19 @@ def test_what_is_invalid_or_faulty_says_why_and_shows_no_number(said, shown, bro
     assert browsed.layout()["spilt"] == []
 
 
+def test_a_stop_has_the_times_of_its_own_run(browsed):
+    """The experiment of the same name is stopped again, and the times of its stop come later."""
+    stopped = {"phase": "stopped", "response": "stop and keep grip", "cause": CAUSE, "reasons": CAUSE}
+    browsed.open()
+    browsed.daemon.say(loop={**stopped, "run": 1, "step": 1})
+    browsed.until("#stop-times", "standstill after 0.123 s")
+    browsed.daemon.say(loop={**stopped, "run": 2, "step": 2})
+    browsed.until("#phase-name", "step 2 of")
+    assert browsed.text("#stop-times") == ""
+    browsed.daemon.say(loop={**stopped, "run": 2, "step": 2}, stop={"run": 2, "stands_after_s": 0.2})
+    browsed.until("#stop-times", "standstill after 0.200 s")
+
+
 @pytest.mark.parametrize(
     ("reason", "waits"),
     [("gripped too recently: 4 more", True), (f"{FINGERS_MOVED}; no grip", True), ("another gel", False)],

@@ -191,6 +191,16 @@ def test_what_has_changed_since_the_question_is_asked_again(name, browsed):
     assert len(browsed.daemon.asked) == 1
 
 
+def test_an_unlock_names_the_stop_that_the_page_shows(browsed):
+    page = browsed.open(token=True)
+    for number in (3, 4):
+        browsed.daemon.say(loop={"phase": "stopped", "response": "stop and keep grip", "stop": number, "step": number})
+        browsed.until("#phase-name", f"step {number} of")
+        page.click("[data-command=unlock]:enabled")
+        browsed.until("#answer", "unlock: done")
+    assert browsed.daemon.asked == ["unlock 3", "unlock 4"]
+
+
 def test_an_unlock_that_drops_a_tool_needs_a_confirmation(browsed):
     page = browsed.open(token=True)
     stopped = {"phase": "stopped", "response": "stop and keep grip"}

@@ -177,7 +177,26 @@ async def test_an_unlock_is_sent_at_once_and_confirmed_by_the_digest_of_its_ques
         status, reply = await post(page, "/commands/unlock", **BEARER)
         assert (status, reply["question"], reply["digest"]) == (409, "Unlock? A tool in it drops.", "d")
         assert (await post(page, "/commands/unlock?digest=d", **BEARER))[0] == 200
-        assert requests == [{}, {"confirmed": True, "digest": "d"}]
+        assert (await post(page, "/commands/unlock?digest=d&stop=7", **BEARER))[0] == 200
+        assert requests == [{}, {"confirmed": True, "digest": "d"}, {"confirmed": True, "digest": "d", "stop": 7}]
+        for wrong in ("-1", "one", "1.0", "²", "1" * 20):
+            assert (await post(page, f"/commands/unlock?stop={wrong}", **BEARER))[0] == 400
+
+
+async def test_a_command_is_meant_for_the_daemon_that_answered_just_before(tmp_path):
+    requests: list[Mapping[str, Any]] = []
+
+    async def status(_request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"tasks": {}, "daemon": {"process": 22, "instance": "a1", "rig": "bench", "folder": "/"}}
+
+    async def hear(request: Mapping[str, Any]) -> dict[str, Any]:
+        requests.append(request)
+        return {}
+
+    async with served(tmp_path, status=status, **dict.fromkeys(NEEDS_TOKEN, hear)) as page:
+        for name in NEEDS_TOKEN:
+            await post(page, f"/commands/{name}", **BEARER)
+        assert [(one["command"], one["instance"]) for one in requests] == [(name, "a1") for name in NEEDS_TOKEN]
 
 
 async def test_a_page_that_shows_one_daemon_moves_no_other_one_and_says_which_it_stopped(tmp_path):

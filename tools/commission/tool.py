@@ -106,7 +106,7 @@ def _grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
     count = context.counts.starts
     context.operator.allow(
         f"the fingers open, and close onto the tool {count} times at {FINGERS_MM_PER_S:g} mm/s with at most "
-        f"{GRIP_N:g} N, and stay closed"
+        f"{GRIP_N:g} N, and stay closed; a gripper that lost its power, as in stage 4, opens and closes once before"
     )
     diameters_mm = []
     with context.rig.hand() as hand:

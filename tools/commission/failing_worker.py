@@ -45,9 +45,11 @@ def close_rtde() -> None:
 
 
 def _shut_down(fd: int) -> None:
-    """Close a connection to RTDE, for all who hold it."""
+    """Close a connection if it is one to RTDE, for all who hold it."""
     with socket.socket(fileno=fd) as connection:
-        if connection.getpeername()[1] == RTDE_PORT:
+        # The pipe to the daemon is a local socket, whose peer has no port.
+        is_network = connection.family in (socket.AF_INET, socket.AF_INET6)
+        if is_network and connection.getpeername()[1] == RTDE_PORT:
             connection.shutdown(socket.SHUT_RDWR)
 
 

@@ -156,7 +156,9 @@ def stops_by_hand(context: Context, passed_rad_per_s: Sequence[float]) -> tuple[
         )
         stops: list[HandStop] = []
         for number, speed in enumerate(speeds, 1):
-            stop = _stop(context, layer, speed, f"{number} of {len(speeds)}, at {speed:g} rad/s")
+            which = f"stop {number} of {len(speeds)}, at {speed:g} rad/s"
+            then = "the arm gets ready" + (" and turns again" if number < len(speeds) else "")
+            stop = _stop(context, layer, speed, which, f": after your word {then}")
             if stop is None:
                 break
             stops.append(stop)
@@ -166,18 +168,19 @@ def stops_by_hand(context: Context, passed_rad_per_s: Sequence[float]) -> tuple[
     return lines, largest_rad
 
 
-def _stop(context: Context, layer: Layer, speed: float, which: str) -> HandStop | None:
-    """Turn to and fro, have the operator stop that, and recover; return None where no stop is seen after some tries."""
+def _stop(context: Context, layer: Layer, speed: float, which: str, then: str) -> HandStop | None:
+    """Turn to and fro, have the operator stop that, and recover; return None where no stop is seen after some tries.
+
+    `which` and `then` tell the operator of this stop, and of what follows the last word that is typed for it.
+    """
     for _ in range(_TRIES):
         asked_ns = _swing(context, speed)
-        context.operator.act(
-            f"Now {layer.action} (stop {which}). After your word the arm gets ready, for the next turn", layer.played
-        )
+        context.operator.act(f"Now {layer.action} ({which}){'' if layer.after else then}", layer.played)
         found = layer.find(context, asked_ns)
         context.observer.listen(_MODE_AFTER_S)
         mode = context.observer.latest().outputs.safety_mode
         if layer.after and mode in SAFETY_EMERGENCY_STOPS:
-            context.operator.act(layer.after, layer.played_after or NOTHING_TO_DO)
+            context.operator.act(f"{layer.after}{then}", layer.played_after or NOTHING_TO_DO)
         if found is None:
             context.operator.say(f"{layer.unseen} The stop is asked for again.")
         elif not _turned(context.observer, asked_ns, found.before, speed):
@@ -218,7 +221,7 @@ def _hand_stop(speed: float, found: Found, mode: int, refusal: str) -> HandStop:
 
 def judge_hand_stops(what: str, stops: Sequence[HandStop], asked: int, longest_s: float, unseen: str = "") -> Line:
     """Return the line on all stops of a layer: time and angle to rest, mode and recovery; `unseen` is why some lack."""
-    limit = f"at most {longest_s:g} s, and the angle at the asked speed meanwhile; recovery {asked} of {asked}"
+    limit = f"at most {longest_s:g} s, and the angle of that time at the asked speed; recovery {asked} of {asked}"
     promise = "a person, or a lost connection, stops the wrist"
     if not stops:
         return judged(what, unseen, limit, promise, passed=False, count=0)
@@ -226,7 +229,7 @@ def judge_hand_stops(what: str, stops: Sequence[HandStop], asked: int, longest_s
     time = f"{min(times_s):.3f} to {max(times_s):.3f} s to rest" if times_s else "time to rest not seen"
     angle = f"up to {max(stop.rad for stop in stops):.4f} rad"
     speeds = [stop.rad_per_s for stop in stops]
-    modes = ", ".join(dict.fromkeys(_mode_name(stop.safety_mode) for stop in stops))
+    modes = ", ".join(dict.fromkeys(mode_name(stop.safety_mode) for stop in stops))
     failed = [stop.refusal for stop in stops if stop.refusal]
     recovery = f"recovery {len(stops) - len(failed)} of {asked}" + (f": {failed[0]}" if failed else "")
     parts = [time, angle, f"from {min(speeds):.2f} to {max(speeds):.2f} rad/s", f"then {modes}", recovery, unseen]
@@ -244,5 +247,6 @@ def _is_short(stop: HandStop, longest_s: float) -> bool:
     return (stop.time_s is None or stop.time_s <= longest_s) and stop.rad <= stop.asked_rad_per_s * longest_s
 
 
-def _mode_name(mode: int) -> str:
+def mode_name(mode: int) -> str:
+    """Return a safety mode in words."""
     return SAFETY_MODES.get(mode, f"unknown mode {mode}")

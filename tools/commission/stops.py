@@ -7,12 +7,12 @@ from typing import Final, Protocol
 
 from shearloop.daemon.commissioning import Line, Supplied
 from shearloop.drivers.ur.client import WORKER
-from shearloop.drivers.ur.messages import SAFETY_MODES, SAFETY_NORMAL, SAFETY_REDUCED, tool_axis
+from shearloop.drivers.ur.messages import SAFETY_NORMAL, SAFETY_REDUCED, tool_axis
 from shearloop.drivers.ur.settings import Six
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S, LARGEST_RAD
 from shearloop.tools.commission.context import STOPS_NEEDED, Context
-from shearloop.tools.commission.hand_stops import stops_by_hand
+from shearloop.tools.commission.hand_stops import mode_name, stops_by_hand
 from shearloop.tools.commission.mover import WATCHDOG_WORKER
 from shearloop.tools.commission.mover_process import CAUSES, WORKERS
 from shearloop.tools.commission.observer import Seen
@@ -235,7 +235,7 @@ def judge_stops(stops: Sequence[Stop], at: str, unit: str, longest_s: float) -> 
         ),
         judged(
             f"safety mode after stops {at}",
-            f"{SAFETY_MODES[abnormal[0].safety_mode]} ({abnormal[0].layer})" if abnormal else "normal",
+            f"{mode_name(abnormal[0].safety_mode)} ({abnormal[0].layer})" if abnormal else "normal",
             "normal",
             "a stop does not lock the robot",
             passed=not abnormal,

@@ -62,8 +62,12 @@ class SimulatedArm(ScriptedArm):
         self.forgets_deadlines = False
         self.look()
 
+    def _write(self, command: int, *values: float) -> bool:
+        """Write a command, which a pulled cable loses."""
+        return self._rig.is_silent or super()._write(command, *values)
+
     def _write_deadline(self, left_s: float) -> None:
-        if not self.forgets_deadlines:
+        if not (self.forgets_deadlines or self._rig.is_silent):
             super()._write_deadline(left_s)
 
     def step(self) -> None:

@@ -313,6 +313,26 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         assert FaultCode.COMMAND_REFUSED not in codes
 
 
+async def test_what_moves_is_told_until_it_stands():
+    """Meanwhile no file is read for a request: the loop that watches the motion must not be late."""
+    async with driven({**TWIST, "angles_rad": [3.0]}) as cell:
+        await cell.cycles(60)
+        assert cell.runner.motion() == "the experiment 'test' is running"
+        cell.runner.stop()
+        while cell.state.motion != "idle":
+            assert cell.runner.motion() is not None
+            await cell.cycles(1)
+        await cell.cycles(10)
+        assert cell.runner.motion() is None
+        cell.gripper.there.clear()
+        releasing = asyncio.create_task(cell.runner.actions.open_by_operator())
+        await cell.cycles(1)
+        assert cell.runner.motion() == "the gripper or the robot is being moved"
+        cell.gripper.there.set()
+        await releasing
+        assert cell.runner.motion() is None
+
+
 def stops(cell: Cell) -> list[LoopStop]:
     return [one for one in cell.published.messages if isinstance(one, LoopStop)]
 

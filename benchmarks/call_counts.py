@@ -112,10 +112,8 @@ async def trace_frame(rig: Path, folder: Path) -> Way:
         fingertips[SIDE]["device"] = {"path": str(folder / "board")}
         trace.install()
         try:
-            async with running(common.write_config(folder, fingertips=fingertips), "eit.estimate", "eit.frame") as (
-                _,
-                subscriber,
-            ):
+            config = common.write_config(folder, **common.PLAYED, fingertips=fingertips)
+            async with running(config, "eit.estimate", "eit.frame") as (_, subscriber):
                 await asyncio.to_thread(board.wait_for_start)
                 for number, line in enumerate(lines):
                     await asyncio.sleep(FRAME_PERIOD_S)

@@ -33,8 +33,6 @@ from shearloop.tools.recordings.frames import read_recording
 REPEATS = 5
 # Timed frames of a latency, at the board's rate.
 FRAMES = 80
-# The rig's calibrations are of emulated devices, which a rig of real ones refuses.
-EMULATED = {"emulated": True, "emulated_deadlines": "real"}
 FLOOD_HZ, FLOOD_FRAMES = 500.0, 2400
 RATED_S = 30.0
 # Before processor time counts: until everything is connected.
@@ -85,7 +83,7 @@ def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, 
             side: {**fingertip, "device": {"path": str(folder / side)}, "frame_period_s": period_s}
             for side, fingertip in config["fingertips"].items()
         }
-        path = common.write_config(folder, **{**config, **EMULATED, "fingertips": fingertips})
+        path = common.write_config(folder, **{**config, **common.PLAYED, "fingertips": fingertips})
         daemon, _ = opened.enter_context(common.running_daemon(path))
         estimates = opened.enter_context(common.subscription(folder, "eit.estimate"))
         for board in boards.values():

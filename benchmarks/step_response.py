@@ -1,6 +1,7 @@
 """A torque step on the emulated rig's physics, judged on the true torque over many seeds.
 
-    python -m benchmarks.step_response --out run/step_response.json [--seeds 200] [--bank run/demo.bank]
+    python -m benchmarks.step_response --out run/step_response.json [--seeds 200]
+        [--bank run/demo.bank [--calibration SEED]]
 
 For each seed the gel has another stiffness. The loop identifies it with the torque that drives, then steps to
 0.10 N·m. A fingertip errs by 0.012 N·m a frame. Then a screw is tightened to 0.12 N·m on the load cell. With `--bank`
@@ -270,10 +271,18 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--bank", type=Path, help="the emulated rig's bank, to close the loop with the estimator too")
+    parser.add_argument(
+        "--calibration",
+        type=int,
+        default=7,
+        metavar="SEED",
+        help="of the estimator's calibration (default: %(default)s)",
+    )
     args = parser.parse_args()
     numbers = measure(args.seeds)
     if args.bank is not None:
-        numbers["estimator"] = estimator_in_the_loop(args.bank, rig_calibration(args.bank, 7), range(20))
+        calibration = rig_calibration(args.bank, args.calibration)
+        numbers["estimator"] = estimator_in_the_loop(args.bank, calibration, range(20))
     print(write_figures(args.out, numbers))
 
 

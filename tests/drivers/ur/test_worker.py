@@ -55,7 +55,7 @@ class Arm(FakeArm):
 # As the client's threads may, this one keeps the interpreter from ending.
 threading.Thread(target=threading.Event().wait).start()
 worker.receive_settings = lambda pipe: SETTINGS
-worker.connect = lambda pipe, settings: Arm()
+worker.connect = lambda pipe, settings, receiver: Arm()
 worker.main()
 """
 

@@ -12,17 +12,12 @@ from typing import Final, Literal, TypeVar
 from pydantic import AwareDatetime
 
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.rig_identity import (
-    EMULATED_SERIAL_NUMBER,
-    Record,
-    RigIdentity,
-    identity_of,
-    judged_by,
-    judged_sha256s,
-)
+from shearloop.daemon.rig_identity import Record, RigIdentity, identity_of, judged_by, judged_sha256s, why_not_emulated
+from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.robotiq.models import ModelName
+from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import Bound, UrSettings
 from shearloop.errors import UserError
 from shearloop.yaml_files import load_model
@@ -232,8 +227,12 @@ class Commissioning:
     def on_controller(self, polyscope: str, serial_number: str) -> UrSettings:
         """Compare the connected controller with the report's, and return the settings for it.
 
-        The controller of a rehearsal is emulated, and never the report's.
+        The controller of a rehearsal is emulated, and never the report's. Raises RobotLostError for a real controller
+        in an emulated rig: it has neither the deadlines nor the cap of a real one.
         """
+        plays = self._emulated or self._rehearsed
+        if plays and (reason := why_not_emulated(self._given.host, serial_number)):
+            raise RobotLostError("not-emulated", reason)
         if self._report is not None and not self._rehearsed:
             seen = {"polyscope": polyscope, "robot_serial_number": serial_number}
             differs = list(self._report.rig.differences(self._report.rig.model_copy(update=seen)))

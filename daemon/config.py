@@ -282,7 +282,9 @@ class DaemonConfig(ConfigModel):
         None, description="report of `shearloop commission`; a real robot without one is slow and weak"
     )
     loop: LoopConfig = Field(LoopConfig(), description="settings of the closed loop")
-    emulated: bool = Field(False, description="every device is emulated on this computer; a real address is refused")
+    emulated: bool = Field(
+        False, description="every device is emulated on this computer; real addresses and controllers are refused"
+    )
     emulated_deadlines: Literal["patient", "real"] = Field(
         "patient", description="of an emulated rig: longer, for a busy computer, or those of a real rig"
     )

@@ -14,13 +14,12 @@ from typing import Any, Final
 from pydantic import BaseModel, ConfigDict
 
 from shearloop.daemon.config import DaemonConfig
+from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.script import own_script_hash
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 
-# In the place of the serial number of a robot: no real one has it.
-EMULATED_SERIAL_NUMBER: Final = "EMULATED"
 # The parts of a configuration that name devices.
 _DEVICE_KEYS: Final[Any] = {
     "fingertips": {"__all__": {"device", "frame_period_s"}},
@@ -89,6 +88,16 @@ def identity_of(config: DaemonConfig, polyscope: str, robot_serial_number: str) 
         ur_rtde=_installed("ur-rtde"),
         polyscope=polyscope,
         robot_serial_number=EMULATED_SERIAL_NUMBER if config.emulated else robot_serial_number,
+    )
+
+
+def why_not_emulated(host: str, robot_serial_number: str) -> str:
+    """Return that the controller at an address is no emulated one, by its serial number, or an empty string."""
+    if robot_serial_number == EMULATED_SERIAL_NUMBER:
+        return ""
+    return (
+        f"The configuration says `emulated: true`, and the controller at {host} is no emulated one: its serial number "
+        f"is {robot_serial_number or 'unknown'}, not {EMULATED_SERIAL_NUMBER}; take `emulated` out for a real robot."
     )
 
 

@@ -8,6 +8,10 @@ LOAD_CELL_RATE_HZ = 10.9
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # Its Primary Client Interface, which reports error codes.
 PRIMARY_PORT = 30001
+# What an emulated controller answers for its serial number: ur-rtde accepts digits alone, and no real one has so many.
+EMULATED_ANSWER = "0" * 16
+# The serial number that this stands for, in sentences and reports.
+EMULATED_SERIAL_NUMBER = "EMULATED"
 # The gripper behind the URCap.
 URCAP_PORT = 63352
 # The shear skin's current source. Twice two gauges of 25 Ω and their leads need 1 V; harmless for people and gauges.

@@ -257,7 +257,7 @@ class Controller:
             case "PolyscopeVersion":
                 return f"URSoftware {'.'.join(map(str, robot.spec.version))} (Jun 01 2024)"
             case "get serial number":
-                return "20235500001"
+                return robot.spec.serial_number
             case "is in remote control" if robot.is_e_series:
                 return "false" if "local-control" in self.faults else "true"
             case "robotmode":

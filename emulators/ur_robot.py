@@ -7,6 +7,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
+from shearloop.drivers.defaults import EMULATED_ANSWER
 from shearloop.emulators.ur_arm import Arm, PathError, WristPlant, frame_of_pose
 from shearloop.emulators.urscript import Interrupts, Program, ProgramEndedError, Registers
 
@@ -26,6 +27,7 @@ class ControllerSpec:
     unlock_wait_s: float = 5.0
     power_on_s: float = 1.0
     version: tuple[int, int, int, int] = (5, 17, 3, 0)
+    serial_number: str = EMULATED_ANSWER
     # A gripper's.
     payload_kg: float = 1.0
     payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.06)

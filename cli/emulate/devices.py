@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.emulate import console
 from shearloop.cli.options import PORT, add_option, number, positive
-from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ, URCAP_PORT
+from shearloop.drivers.defaults import EMULATED_ANSWER, LOAD_CELL_RATE_HZ, URCAP_PORT
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
 from shearloop.emulators.numbers import number_between
 from shearloop.errors import UserError
@@ -173,6 +173,8 @@ def add_robot(parser: argparse._ActionsContainer) -> None:
     """Add the arguments of every emulated controller."""
     add_option(parser, "--rate-hz", RATE_HZ, "HZ", "control cycles per second (default: %(default)s)", default=500.0)
     parser.add_argument("--cb3", action="store_true", help="play a CB3 with PolyScope 3.15, not an e-Series")
+    text = "serial number, in digits; an emulated rig takes the default alone (default: %(default)s)"
+    add_option(parser, "--serial-number", str, "TEXT", text, default=EMULATED_ANSWER)
     parser.add_argument("--unlock-wait-s", type=float, default=5.0, help="time in which a stop is not unlocked (5)")
     parser.add_argument("--power-on-s", type=float, default=1.0, help="time of each power-on step (default: 1)")
     text = "joints where the arm stands at first"
@@ -192,6 +194,7 @@ def robot_make(args: argparse.Namespace) -> "ControllerSpec":
 
     return ControllerSpec(
         version=CB3_VERSION if args.cb3 else ControllerSpec().version,
+        serial_number=args.serial_number,
         unlock_wait_s=args.unlock_wait_s,
         power_on_s=args.power_on_s,
         payload_kg=args.payload_kg,

@@ -31,6 +31,8 @@ EXIT_S = 3.0
 GRACE_S = 1.0
 # The module of the worker.
 WORKER = "shearloop.drivers.ur.worker"
+# Only an update of the controller changes its version, and only another configuration what it has to be.
+LASTING = ("version", "not-emulated")
 # The worker's activity once it sends states.
 CONTROLLING = "controlling"
 # The end of the worker's error output that a message quotes.
@@ -69,7 +71,7 @@ class UrRobot:
     ) -> None:
         """`settings_for` returns the settings for a controller of this version and serial number, else these.
 
-        `worker` is the module of the worker.
+        It raises RobotLostError for a controller that is not to be driven. `worker` is the module of the worker.
         """
         self._worker = worker
         self.settings = settings
@@ -165,8 +167,7 @@ class UrRobot:
             except RobotLostError as loss:
                 self.losses[loss.kind] += 1
                 pause_s = self.monitor.failed(loss, time.monotonic_ns())
-                # Only an update of the controller changes its version.
-                await asyncio.sleep(math.inf if loss.kind == "version" else pause_s)
+                await asyncio.sleep(math.inf if loss.kind in LASTING else pause_s)
 
     async def _run_worker(self) -> None:
         connection = WorkerConnection(self.settings, self)

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final
 
-from shearloop.drivers.defaults import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT
+from shearloop.drivers.defaults import DASHBOARD_PORT, EMULATED_ANSWER, EMULATED_SERIAL_NUMBER, RTDE_PORT, SCRIPT_PORT
 from shearloop.drivers.errors import DriverError, ProtocolError, system_reason
 from shearloop.drivers.ur.messages import RUNTIME_PLAYING, RobotLostError, RtdeOutputs, silent_sentence
 from shearloop.drivers.ur.script import LOWER, NO_MOTION_TICKS, UPPER, ScriptRegisters
@@ -174,7 +174,9 @@ def free_registers(host: str, timeout_s: float) -> ScriptRegisters | None:
 
 def serial_number_in(answer: str) -> str:
     """Return the serial number in an answer to `SERIAL_NUMBER`; empty where the request is unknown."""
-    return answer if answer.isalnum() else ""
+    if answer == EMULATED_ANSWER:
+        return EMULATED_SERIAL_NUMBER
+    return answer if answer.isdigit() else ""
 
 
 def ask_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) -> list[str]:

@@ -16,7 +16,7 @@ from shearloop.drivers.ur.settings import REST_RAD_PER_S, Six, Three, UrSettings
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal[
     "unreachable", "silent", "protocol", "version", "registers-in-use", "local-control", "script", "lost", "crashed",
-    "hung", "garbled", "other-limits",
+    "hung", "garbled", "other-limits", "not-emulated",
 ]  # fmt: skip
 
 # `RobotState.end_reason` of a motion that ended as commanded; any other reason is a sentence.

@@ -160,9 +160,21 @@ def test_a_report_of_emulated_or_of_real_devices_raises_a_rehearsal(tmp_path, em
     found = rehearsing(tmp_path, report)
     assert found.counts
     assert caps(found) == (0.5, CAPPED_M_PER_S, 0.4)
-    found.on_controller("5.11.0.0", "of the emulated controller")
+    found.on_controller("5.11.0.0", "EMULATED")
     assert found.counts, "the controller of a rehearsal is never the report's"
     assert ("of emulated devices covers no more" in found.sentence) == emulated
+
+
+@pytest.mark.parametrize("rehearsed", [True, False])
+@pytest.mark.parametrize("serial_number", [SERIAL, ""])
+def test_an_emulated_rig_takes_no_controller_but_an_emulated_one(tmp_path, rehearsed, serial_number):
+    robot_at("127.0.0.1", tmp_path)
+    played = load_daemon_config(write_rig(tmp_path)).model_copy(update={"emulated": True})
+    found = rehearsing(tmp_path, None) if rehearsed else commissioning_of(played, read_settings(played.robot), NOW)
+    assert found.on_controller(VERSION, "EMULATED") == found.settings
+    with pytest.raises(RobotLostError, match=rf"its serial number is {serial_number or 'unknown'}, not EMULATED") as no:
+        found.on_controller(VERSION, serial_number)
+    assert no.value.kind == "not-emulated"
 
 
 def test_a_rehearsal_of_another_rig_is_not_raised(tmp_path):

@@ -9,7 +9,7 @@ from typing import Final
 from shearloop.daemon.commissioning import Report, StageResult
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.rig import gripper_calibration, open_settings
-from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
+from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, why_not_emulated
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.errors import UserError
@@ -64,6 +64,8 @@ def commission(
         left = LeftRobot.acknowledged(config, files, operator)
         devices = rig or ConnectedRig(config, settings)
         controller = devices.controller()
+        if config.emulated and (reason := why_not_emulated(settings.host, controller.serial_number)):
+            raise UserError(reason)
         report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)
         report = _without_changed(report, config, operator)
         context = Context(config, settings, devices, controller, operator, report, counts, opened)

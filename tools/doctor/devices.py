@@ -14,6 +14,7 @@ from shearloop.daemon.config import DaemonConfig, GripperConfig, SerialDevice
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
+from shearloop.daemon.rig_identity import why_not_emulated
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.ur.control_box import REMOTE_CURE, check_ports, query_controller, untested_sentence
@@ -53,7 +54,7 @@ async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
     if config.gripper is not None:
         checks.append(_check_gripper(config.gripper))
     if config.robot is not None:
-        checks.append(asyncio.to_thread(lambda path: [*_check_robot(path)], config.robot))
+        checks.append(asyncio.to_thread(lambda path: [*_check_robot(path, emulated=config.emulated)], config.robot))
     return [finding for findings in await asyncio.gather(*checks) for finding in findings]
 
 
@@ -81,7 +82,7 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
     return [good("gripper", f"{client.name} answers and is activated")]
 
 
-def _check_robot(settings: Path) -> Iterator[Finding]:
+def _check_robot(settings: Path, *, emulated: bool) -> Iterator[Finding]:
     try:
         host = read_settings(settings).host
         try:
@@ -92,6 +93,9 @@ def _check_robot(settings: Path) -> Iterator[Finding]:
     except DriverError as error:
         cure = "look at the teach pendant, and check the cable and `host` in the robot's settings"
         yield from_error("robot", error, "the robot cannot be driven", cure)
+        return
+    if emulated and (reason := why_not_emulated(host, seen.serial_number)):
+        yield from_error("robot", reason, "the daemon does not drive it")
         return
     with contextlib.closing(PrimaryPort(host, ROBOT_TIMEOUT_S)) as primary:
         what, _, cure = primary.warning.rpartition("; ")

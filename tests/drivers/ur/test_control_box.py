@@ -20,6 +20,7 @@ from shearloop.drivers.ur.control_box import (
     probe_controller,
     probe_ports,
     query_controller,
+    serial_number_in,
 )
 from shearloop.drivers.ur.messages import ROBOT_MODES, RUNTIME_STATES, SAFETY_MODES, RobotLostError, Unlock
 from shearloop.drivers.ur.motion import why_unfit
@@ -171,3 +172,17 @@ def test_the_tables_are_complete_and_the_page_has_the_same_words():
         (table,) = re.findall(rf"const {name} = ({{.*?}});", text)
         shown = json.loads(re.sub(r"(?<=[{ ])(\d+):", r'"\1":', table))
         assert {int(mode): words for mode, words in shown.items()} == expected
+
+
+@pytest.mark.parametrize(
+    ("answer", "found"),
+    [
+        ("20195500123", "20195500123"),
+        ("0" * 16, "EMULATED"),
+        ("00000000000", "00000000000"),
+        ("EMULATED", ""),
+        ("could not understand: 'get serial number'", ""),
+    ],
+)
+def test_only_the_emulated_controllers_own_answer_makes_it_an_emulated_one(answer, found):
+    assert serial_number_in(answer) == found

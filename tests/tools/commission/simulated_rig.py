@@ -10,6 +10,7 @@ from typing import Any
 
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.sensing.sessions import fingertip_table
+from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration, LoadParser, LoadSample
@@ -303,6 +304,7 @@ class SimulatedRig:
             sketch=replace(PAPER_SKETCH, noise_counts=NOISE_NM),
         )
         self.robot = self.emulated.controller.robot
+        self.serial_number = EMULATED_SERIAL_NUMBER if config.emulated else "1"
         self.clock = SimulatedClock(self)
         # Until then nothing comes from the robot. The observer gets what is held back later.
         self._silent_until_s, self._holds_back = -math.inf, False
@@ -371,7 +373,8 @@ class SimulatedRig:
     def controller(self) -> ControllerInfo:
         in_use = "registers-in-use" in self.emulated.controller.faults
         version = ".".join(map(str, self.robot.spec.version))
-        return ControllerInfo(version, "1", "RUNNING", "NORMAL", remote=True, registers=None if in_use else UPPER)
+        registers = None if in_use else UPPER
+        return ControllerInfo(version, self.serial_number, "RUNNING", "NORMAL", remote=True, registers=registers)
 
     def outputs(self, registers: ScriptRegisters) -> RtdeOutputs:
         robot, arm = self.robot, self.robot.arm

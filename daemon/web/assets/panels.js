@@ -28,6 +28,14 @@ export function markAge(panel, link, message) {
   else put(badge, link.ageOf(message) > MARK_OLD_AFTER_S ? `${age(link.ageOf(message))} ago` : "");
 }
 
+// Shows a figure; one of an old message is struck out, also in a panel whose own message is not old.
+function figure(id, text, old = false) {
+  put(byId(id), text);
+  byId(id).classList.toggle("old", old && text !== "–");
+}
+
+const oldNote = (link, message) => `OLD, ${age(link.ageOf(message))}`;
+
 // The sources of estimates: first the one that drives the loop, then the combined one.
 export function estimatesFirst(link) {
   const driving = link.get("loop.state")?.content.torque_source;
@@ -82,11 +90,17 @@ export function torquePanel(link) {
   const against = (torque) => (torque && !torque.valid && !link.isOld(torque.message) ? `${torque.name}: ${torque.reason}` : "");
   const none = driving && !driving.valid ? `no torque from the ${driving.name}: ${driving.reason}` : "";
   warn(byId("torque-reason"), [none, against(other)].filter(Boolean).join("; "));
-  const wanted = loop && !link.isOld(loop) && ACTIVE.has(loop.content.phase) ? loop : undefined;
-  put(byId("wanted"), link.number(wanted, "ramp_nm", 4, SIGNED));
-  put(byId("set-point"), wanted?.content.set_point_nm == null ? "" : `final ${number(wanted.content.set_point_nm, 3, "", SIGNED)}`);
+  wantedFigure(link, loop);
   otherFigure(link, other);
   diameterFigure(link, estimate);
+}
+
+function wantedFigure(link, loop) {
+  const wanted = loop && ACTIVE.has(loop.content.phase) ? loop : undefined;
+  const old = wanted !== undefined && link.isOld(wanted);
+  figure("wanted", link.number(wanted, "ramp_nm", 4, SIGNED), old);
+  const final = wanted?.content.set_point_nm == null ? "" : `final ${number(wanted.content.set_point_nm, 3, "", SIGNED)}`;
+  put(byId("set-point"), old ? oldNote(link, wanted) : final);
 }
 
 function otherFigure(link, other) {
@@ -94,17 +108,19 @@ function otherFigure(link, other) {
   if (!other) return;
   const old = link.isOld(other.message);
   put(byId("other-source"), other.name);
-  put(byId("other-torque"), old || !other.valid ? "–" : link.number(other.message, "torque_nm", 4, SIGNED));
-  put(byId("other-note"), old ? `OLD, ${age(link.ageOf(other.message))}` : other.valid ? "" : "not valid");
+  figure("other-torque", other.valid ? link.number(other.message, "torque_nm", 4, SIGNED) : "–", old);
+  put(byId("other-note"), old ? oldNote(link, other.message) : other.valid ? "" : "not valid");
 }
 
 function diameterFigure(link, estimate) {
   const gripper = link.get("gripper.state");
-  const seen = estimate && !link.isOld(estimate) && estimate.content.valid ? estimate.content.diameter_mm : null;
+  const seen = estimate?.content.valid ? estimate.content.diameter_mm : null;
+  const old = seen != null && link.isOld(estimate);
   const held = gripper && !link.isOld(gripper) ? gripper.content.diameter_mm : null;
-  put(byId("diameter"), seen == null ? "–" : link.number(estimate, "diameter_mm", 1));
+  figure("diameter", seen == null ? "–" : link.number(estimate, "diameter_mm", 1), old);
   const { diameter_low_mm: low, diameter_high_mm: high } = estimate?.content ?? {};
-  const spread = seen == null || low == null ? "" : `${number(low, 1)} to ${number(high, 1)}`;
+  const between = seen == null || low == null ? "" : `${number(low, 1)} to ${number(high, 1)}`;
+  const spread = old ? oldNote(link, estimate) : between;
   put(byId("diameter-note"), [spread, held == null ? "" : `gripper ${link.number(gripper, "diameter_mm", 1)}`].filter(Boolean).join(", "));
 }
 
@@ -209,9 +225,9 @@ export function robotPanel(link) {
   const tcp = array(said.tcp_pose).values;
   put(byId("tcp"), `${[...tcp.slice(0, 3)].map((m) => number(1000 * m, 0)).join(" · ")} mm`);
   const loop = link.get("loop.state");
-  const current = loop && !link.isOld(loop) ? loop : undefined;
-  const sent = current?.content ?? {};
-  put(byId("speed-sent"), link.number(current, "speed_sent_rad_per_s", 3, SIGNED));
+  const old = loop !== undefined && link.isOld(loop);
+  const sent = old ? {} : loop?.content ?? {};
+  figure("speed-sent", link.number(loop, "speed_sent_rad_per_s", 3, SIGNED), old);
   const clipped = sent.speed_command_rad_per_s !== undefined && Math.abs(sent.speed_command_rad_per_s - sent.speed_sent_rad_per_s) > 0.0005;
   put(byId("speed-command"), clipped ? `requested ${number(sent.speed_command_rad_per_s, 3, "", SIGNED)}` : "");
 }

@@ -324,7 +324,11 @@ def test_silent_sources_are_marked_old(browsed):
     browsed.daemon.say(robot=None, load=None)
     browsed.until("#robot .age", "OLD")
     browsed.until("#other-note", "OLD")
-    browsed.until_shown({"#other-torque": "–", "#link-state": "● live", "#torque .age": "", "#gripper .age": ""})
+    last = f"{signed(MESSAGES['load']['torque_nm'], 4)} N·m"
+    browsed.until_shown({"#other-torque": last, "#link-state": "● live", "#torque .age": "", "#gripper .age": ""})
+    struck = "(id) => getComputedStyle(document.getElementById(id)).textDecorationLine"
+    found = {name: browsed.page.evaluate(struck, name) for name in ("other-torque", "torque-now")}
+    assert found == {"other-torque": "line-through", "torque-now": "none"}
     browsed.until_old(1)
 
 

@@ -355,6 +355,9 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     page = browsed.open()
     browsed.until("#link-state", "● live")
     silent = dict.fromkeys(name for name in MESSAGES if name != "end")
+    figures = ("torque-now", "wanted", "other-torque", "diameter", "speed-sent")
+    shown = {name: browsed.text(f"#{name}") for name in figures}
+    assert "–" not in shown.values()
     browsed.daemon.say(**silent, end={"summary": "What happened: 'hold 0.10 N·m' was done" + ", and more" * 20})
     browsed.until("#link-state", "✓ DONE")
     browsed.until("#summary-text", "What happened: 'hold 0.10 N·m' was done")
@@ -367,9 +370,14 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     assert page.evaluate("document.body.dataset.alarm") == "ended"
     assert page.title().startswith("ENDED · ")
     struck = "(id) => getComputedStyle(document.getElementById(id)).textDecorationLine"
-    assert page.evaluate(struck, "torque-now") == page.evaluate(struck, "phase") == "line-through"
+    assert page.evaluate(struck, "trouble") == page.evaluate(struck, "phase") == "line-through"
+    # The last values stay, and each of them is struck out.
+    assert {name: page.evaluate(struck, name) for name in figures} == dict.fromkeys(figures, "line-through")
+    assert {name: browsed.text(f"#{name}") for name in figures} == shown
+    alarm = "(id) => getComputedStyle(document.getElementById(id)).borderTopColor"
+    assert page.evaluate(alarm, "summary") == page.evaluate(alarm, "link-state"), "no green on a page that is red"
     browsed.viewer.kill()
-    browsed.until("#link-reason", "the daemon and the viewer have ended; the last values are shown")
+    browsed.until("#link-reason", "the daemon and the viewer have ended; its last values are struck out")
     assert browsed.text("#link-state") == "✓ DONE"
     browsed.daemon.say()
     browsed.daemon.start()

@@ -78,7 +78,7 @@ def _speed(text: str) -> float:
 async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Namespace) -> "ReplayComparison":
     import zmq.asyncio
 
-    from shearloop.cli.terminal import print_estimate
+    from shearloop.cli.terminal import print_estimate, shown_topics
     from shearloop.tools.outputs import progress_bar
     from shearloop.tools.recordings.replay import Replay, ReplayClock
 
@@ -88,7 +88,7 @@ async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Nam
         opened.callback(publisher.close)
         replay = Replay(run, config, publisher, clock)
         if args.show:
-            publisher.add_listener(partial(print_estimate, sys.stdout), raises=True)
+            publisher.add_listener(partial(print_estimate, sys.stdout, topics=shown_topics(config)), raises=True)
         while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - the publisher has no event
             await asyncio.sleep(0.05)
         progress = opened.enter_context(progress_bar(run.path.name, sum(run.counts.values()), "message"))

@@ -27,7 +27,7 @@ HEADING = f"{EMULATED}: every device was emulated on this computer."
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `run`."""
     add_option(parser, "config", Path, "CONFIG", "a YAML file such as config/demo.yaml")
-    text = "show the state (to a file: each estimate), and a summary"
+    text = "show the state (to a file: each estimate, or the load cell's readings), and a summary"
     parser.add_argument("--show", action="store_true", help=text)
     text = "log JSON lines (the default under systemd)"
     parser.add_argument("--json-log", action="store_true", default=None, help=text)
@@ -105,7 +105,7 @@ def _run_config(
     from shearloop.cli import EXIT_OK, EXIT_STOPPED, EXIT_UNFINISHED
     from shearloop.cli.emulator_processes import EmulatedDevices
     from shearloop.cli.other_daemon import refuse_second_daemon
-    from shearloop.cli.terminal import StatusLine, print_estimate
+    from shearloop.cli.terminal import StatusLine, print_estimate, shown_topics
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.messaging.refusals import Refusals
     from shearloop.daemon.messaging.stop_socket import StopSocket
@@ -129,8 +129,11 @@ def _run_config(
         emulated = stack.enter_context(EmulatedDevices(config.emulators, args.config.parent, args.play))
         listeners: list[Listener] = [emulated]
         if args.show:
+            topics = shown_topics(config)
             listeners.append(
-                stack.enter_context(StatusLine(out, label)) if terminal else partial(print_estimate, out, label=label)
+                stack.enter_context(StatusLine(out, label, topics))
+                if terminal
+                else partial(print_estimate, out, label=label, topics=topics)
             )
         shown = out if args.show or args.emulate or config.recording is not None else None
         # If the daemon ends with its experiment, the summary comes after all that it logs.

@@ -14,10 +14,13 @@ from shearloop.errors import UserError
 from shearloop.printable import printable
 
 if TYPE_CHECKING:
+    from shearloop.daemon.config import DaemonConfig
     from shearloop.daemon.logs import NonBlockingWriter
 
 STDIN = 0
 READ_BYTES = 4096
+# The topics of the sensors whose readings become estimates.
+ESTIMATES = ("eit.estimate", "skin.shear")
 
 
 def print_result(result: object, sentences: Iterable[str], *, as_json: bool) -> int:
@@ -29,11 +32,21 @@ def print_result(result: object, sentences: Iterable[str], *, as_json: bool) -> 
     return 0
 
 
+def shown_topics(config: "DaemonConfig") -> tuple[str, ...]:
+    """Return what is shown of a rig's sensors: estimates, or the readings of a load cell without another sensor."""
+    return ESTIMATES if config.fingertips or config.skin is not None else ("load.torque",)
+
+
 def print_estimate(
-    out: "TextIO | NonBlockingWriter", topic: str, content: Mapping[str, Any], *, label: str = ""
+    out: "TextIO | NonBlockingWriter",
+    topic: str,
+    content: Mapping[str, Any],
+    *,
+    label: str = "",
+    topics: tuple[str, ...] = ESTIMATES,
 ) -> None:
-    """Print a message that is an estimate, behind a label."""
-    if topic in ("eit.estimate", "skin.shear"):
+    """Print a message of one of the topics, behind a label."""
+    if topic in topics:
         out.write(printable(label + message_line(topic, content)) + "\n")
         out.flush()
 
@@ -41,9 +54,11 @@ def print_estimate(
 class StatusLine:
     """Shows a daemon's state on one line of a terminal, as a context that leaves an empty line."""
 
-    def __init__(self, out: "TextIO | NonBlockingWriter", label: str = "") -> None:
+    def __init__(self, out: "TextIO | NonBlockingWriter", label: str = "", topics: tuple[str, ...] = ESTIMATES) -> None:
+        """`topics` are shown of a daemon without a robot."""
         self._out = out
         self._label = label
+        self._topics = topics
         self._state = self._torque = ""
         # None until a control loop reports; a daemon without a robot has no loop.
         self._driving: str | None = None
@@ -65,7 +80,7 @@ class StatusLine:
         elif topic in ("eit.estimate", "load.torque", "skin.shear") and content["source"] == self._driving:
             torque = _shown(topic, content, "torque_nm", "+.3f") if content["valid"] else ""
             self._torque = torque and f"   {self._driving} {torque}"
-        elif topic in ("eit.estimate", "skin.shear") and self._driving is None:
+        elif topic in self._topics and self._driving is None:
             self._state = message_line(topic, content)
         else:
             return

@@ -530,6 +530,9 @@ def test_the_status_line_is_redrawn_in_place(monkeypatch):
     line = StatusLine(narrow)
     line("eit.estimate", {"source": "right", "timestamp": 0.0, "valid": False, "reason": "no grip"})
     assert "eit.estimate  right     no estimat…" in narrow.getvalue(), "without a robot there is no state of the loop"
+    line = StatusLine(narrow, topics=("load.torque",))
+    line("load.torque", {"source": "load_cell", "timestamp": 0.0, "valid": False, "reason": "spike", "raw": 1.0})
+    assert "load.torque   load_cell no torque:" in narrow.getvalue(), "a load cell alone is shown as well"
     stopped = {**state, "phase": "stopped", "activity": "the operator stopped it"}
     assert loop_line(stopped) == "stopped: the operator stopped it  step 2 of 3 grip"
     held = {**state, "phase": "held", "activity": "closing", "reasons": "no estimate"}

@@ -138,6 +138,22 @@ def test_a_calibrated_load_cell_gets_the_counts_of_its_own_calibration(real_rig,
     assert calibration.torque_nm(float(line)) == pytest.approx(0.25)
 
 
+@pytest.mark.real_time
+async def test_a_load_cell_alone_shows_its_readings_in_a_file(real_rig, tmp_path):
+    """A file's buffer holds what is not flushed until the program ends."""
+    path = real_rig("load_cell")
+    with (tmp_path / "shown.txt").open("w") as file:
+        async with shearloop("run", str(path), "--emulate", "--show", stdout=file.fileno()):
+            while not (lines := readings(tmp_path / "shown.txt")):  # noqa: ASYNC110 - a file has no event
+                await asyncio.sleep(0.05)
+    assert all("load_cell" in line and "N·m" in line for line in lines)
+
+
+def readings(path: Path) -> list[str]:
+    """Return the readings of the load cell among the whole lines of a file."""
+    return [line for line in path.read_text().splitlines(True) if "load.torque" in line and line.endswith("\n")]
+
+
 @pytest.mark.usefixtures("ur_rtde")
 @pytest.mark.parametrize("generation", ["cb3", "e-series"])
 def test_the_emulated_controller_is_of_the_generation_of_the_robots_settings(real_rig, generation):

@@ -142,6 +142,13 @@ def test_a_page_installs_in_a_clone_and_not_from_an_index_where_shearloop_is_not
     assert not re.search(r"pip install (?:-e )?'?\.", text) or "clone of " in text
 
 
+def test_readme_and_index_lead_to_every_page():
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    readme = re.findall(r"\]\(docs/([\w-]+\.md)", (ROOT / "README.md").read_text())
+    index = re.findall(r"\]\(([\w-]+\.md)", (ROOT / "docs/index.md").read_text())
+    assert set(readme) == set(index) == pages
+
+
 def test_the_readmes_recordings_are_ignored_by_git():
     folders = {Path(one).parts[0] for one in re.findall(r"--record (\S+)", (ROOT / "README.md").read_text())}
     assert folders

@@ -252,7 +252,7 @@ def _joined(reasons: Sequence[str]) -> str:
 
 
 def _baselines(frames: FloatArray) -> Figures:
-    """Return the stopwatch's error on the same frames (5, n), and the estimate's over that or that of always 0."""
+    """Return `baseline_profile_rmse_nm` and `baseline_ratio` of frames (5, n), None for fewer than two estimates."""
     truth, value, _, _, profile = frames[:, np.isfinite(frames[1])]
     if len(truth) < 2:
         return dict.fromkeys(("baseline_profile_rmse_nm", "baseline_ratio"))

@@ -25,8 +25,10 @@ HOME_RAD = np.array([0.0, -1.0, 1.0, -1.0, -1.0, 0.0]) * (math.pi / 2)
 # Data sheet of the UR5e: 180 degrees per second. A straight move that needs more, near a singularity, ends in a
 # protective stop.
 JOINT_SPEED_LIMIT_RAD_PER_S = math.pi
-# UR's forum: a CB3 estimates forces to ± 10 N and ± 5 N·m; the components, so that their norm is within that.
+# UR's forum: a CB3 estimates forces to ± 10 N and ± 5 N·m. Data sheet of the UR5e: its sensor's precision is 3.5 N and
+# 0.2 N·m. The components, so that their norm is within that.
 CURRENTS_ERROR = np.array([10.0, 10.0, 10.0, 5.0, 5.0, 5.0]) / math.sqrt(3)
+SENSOR_ERROR = np.array([3.5, 3.5, 3.5, 0.2, 0.2, 0.2]) / math.sqrt(3)
 
 
 def link_frames(q_rad: Vector) -> list[Matrix]:
@@ -293,12 +295,12 @@ class Arm:
                 self.q_rad = q_rad
             self.motion = None if finished else self.motion
 
-    def feel(self, dt_s: float, *, noisy: bool = False) -> None:
+    def feel(self, dt_s: float, error: Vector) -> None:
         """Let the wrist turn its plant for one cycle, and feel its torque about the tool's axis.
 
-        `noisy`: with the errors of forces that are estimated from the joints' currents.
+        `error`: the largest errors (6,) of the measured force and torque.
         """
-        self._noise = self._random.uniform(-1.0, 1.0, 6) * CURRENTS_ERROR if noisy else np.zeros(6)
+        self._noise = self._random.uniform(-1.0, 1.0, 6) * error
         if self._plant is not None:
             torque_nm = self._plant.step(dt_s, float(self.q_rad[5]))
             flange_axis = self._frame[:3, :3] @ self._tool[2, :3]

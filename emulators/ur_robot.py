@@ -7,8 +7,10 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
+import numpy as np
+
 from shearloop.drivers.defaults import EMULATED_ANSWER
-from shearloop.emulators.ur_arm import Arm, PathError, WristPlant, frame_of_pose
+from shearloop.emulators.ur_arm import CURRENTS_ERROR, SENSOR_ERROR, Arm, PathError, WristPlant, frame_of_pose
 from shearloop.emulators.urscript import Interrupts, Program, ProgramEndedError, Registers
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4
@@ -68,6 +70,8 @@ class Robot:
         self.protects_abrupt_ends = False
         # Whether any program that ends by itself does.
         self.protects_ends = False
+        # Whether the measured force and torque have no error.
+        self.exact_wrench = False
         # Where the threads of the next program are interrupted.
         self.interrupts: Interrupts | None = None
 
@@ -87,7 +91,8 @@ class Robot:
                 if self.protects_ends or (self.protects_abrupt_ends and self.arm.moving):
                     self.protective_stop(f"the program ended: {ended}")
         self._move(dt_s)
-        self.arm.feel(dt_s, noisy=not self.is_e_series)
+        error = SENSOR_ERROR if self.is_e_series else CURRENTS_ERROR
+        self.arm.feel(dt_s, np.zeros(6) if self.exact_wrench else error)
 
     def stand_still(self, seconds: float) -> None:
         """Let only the clock go on."""

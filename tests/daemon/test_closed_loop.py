@@ -177,8 +177,10 @@ async def test_a_tool_is_gripped_twisted_released_and_left(rig_config, tiny_bank
     assert held[-1] == pytest.approx(20.0, abs=1.0)
     valid = [message["torque_nm"] for message in watcher.seen["eit.estimate"] if message["valid"]]
     assert max(valid) == pytest.approx(max(torques), abs=0.03)
-    wrench = max(abs(message["wrist_torque_nm"]) for message in watcher.seen["robot.state"])
-    assert wrench == pytest.approx(max(torques), rel=0.1)
+    # One sample has errors of up to 0.2 N·m.
+    wrench = [message["wrist_torque_nm"] for message in watcher.seen["robot.state"]]
+    means = np.convolve(wrench, np.full(10, 0.1), "valid")
+    assert max(np.abs(means)) == pytest.approx(max(torques), abs=0.05)
     heights_m = [np.frombuffer(message["tcp_pose"], "<f4")[2] for message in watcher.seen["robot.state"]]
     assert max(heights_m) - heights_m[0] == pytest.approx(0.03, abs=0.005)
 

@@ -12,6 +12,9 @@ from shearloop.bank.arrays import FloatArray
 Curve = Sequence[tuple[int, float]]
 # A step this many standard deviations of its own statistic above noise is no accident.
 _SIGMAS = 10.0
+# A rise is sought among ramps: their middles in steps of this time, their lengths in parts of the longest one.
+_RESOLUTION_S = 0.002
+_PARTS_OF_RISE = (1 / 30, 1 / 12, 1 / 6, 1 / 3, 2 / 3, 1.0)
 
 
 def middle_s(curve: Curve, before: float, after: float) -> float:
@@ -45,22 +48,31 @@ def step_index(values: FloatArray) -> int | None:
     return None if is_noise else best + 1
 
 
-def step_s(curve: Curve, window_s: float) -> float | None:
-    """Return when a curve rose or fell from one level to another; None where noise explains all.
+def step_s(curve: Curve, longest_rise_s: float) -> float | None:
+    """Return the middle in s of a curve's rise or fall from one level to another; None where noise explains all.
 
-    `window_s` is the time before and after the step that a rise takes at most.
+    The ramp that explains most of the curve's variance is the rise. It takes at most `longest_rise_s`, and so long is
+    each level seen at least.
     """
-    split = step_index(np.array([[value] for _, value in curve]))
+    values = np.array([value for _, value in curve])
+    split = step_index(values[:, None])
     if split is None:
         return None
-    at_ns = curve[split][0]
-    window_ns = round(1e9 * window_s)
-    before = [value for t_ns, value in curve if t_ns < at_ns - window_ns]
-    after = [value for t_ns, value in curve if t_ns > at_ns + window_ns]
-    rise = [(t_ns, value) for t_ns, value in curve if abs(t_ns - at_ns) <= window_ns]
-    if not before or not after or len(rise) < 2:
+    times_s = np.array([t_ns / 1e9 for t_ns, _ in curve])
+    about_s = times_s[split]
+    if about_s - times_s[0] <= longest_rise_s or times_s[-1] - about_s <= longest_rise_s:
         return None
-    return middle_s(rise, float(np.mean(before)), float(np.mean(after)))
+    middles_s = np.arange(about_s - longest_rise_s, about_s + longest_rise_s, _RESOLUTION_S)
+    centred = values - values.mean()
+    best_s, most = about_s, 0.0
+    for part in _PARTS_OF_RISE:
+        rises = np.clip((times_s - middles_s[:, None]) / (part * longest_rise_s) + 0.5, 0.0, 1.0)
+        rises -= rises.mean(axis=1, keepdims=True)
+        explained = (rises @ centred) ** 2 / (rises**2).sum(axis=1)
+        found = int(np.argmax(explained))
+        if explained[found] > most:
+            best_s, most = middles_s[found], explained[found]
+    return float(best_s)
 
 
 def scanned_step_s(times_s: FloatArray, rows: FloatArray) -> float | None:

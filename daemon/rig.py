@@ -15,9 +15,10 @@ from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment_schema import first_motion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.loop_runner import ControlLoopRunner, wrench_source
+from shearloop.daemon.control.loop_runner import ControlLoopRunner
 from shearloop.daemon.control.plan import plan_of, speeds_of
 from shearloop.daemon.control.state_publisher import loop_state
+from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment, check_experiment
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
@@ -157,7 +158,7 @@ def make_loop(
     `sources` are all torques but the robot's; `dead_tasks` has the error of each task that is dead at present;
     `supplied` is of the rig's report.
     """
-    sources = {**sources, WRENCH: wrench_source(robot.rate_hz, robot.facts.estimated_nm)}
+    sources = {**sources, WRENCH: wrench_source(robot.rate_hz, robot.facts.mean_noise_nm)}
     # Controller, identification and commands plan with what the worker lets through.
     limited = {
         name: min(getattr(config.loop, name), getattr(robot.limits, name).inner)

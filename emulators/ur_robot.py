@@ -10,7 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from shearloop.drivers.defaults import EMULATED_ANSWER
-from shearloop.emulators.ur_arm import CURRENTS_ERROR, SENSOR_ERROR, Arm, PathError, WristPlant, frame_of_pose
+from shearloop.emulators.ur_arm import (
+    CURRENTS_ERROR,
+    SENSOR_ERROR,
+    Arm,
+    PathError,
+    Vector,
+    WristPlant,
+    frame_of_pose,
+)
 from shearloop.emulators.urscript import Interrupts, Program, ProgramEndedError, Registers
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4
@@ -91,8 +99,7 @@ class Robot:
                 if self.protects_ends or (self.protects_abrupt_ends and self.arm.moving):
                     self.protective_stop(f"the program ended: {ended}")
         self._move(dt_s)
-        error = SENSOR_ERROR if self.is_e_series else CURRENTS_ERROR
-        self.arm.feel(dt_s, np.zeros(6) if self.exact_wrench else error)
+        self.arm.feel(dt_s, self.wrench_error)
 
     def stand_still(self, seconds: float) -> None:
         """Let only the clock go on."""
@@ -111,6 +118,13 @@ class Robot:
             self.protective_stop(str(error))
         if moving != self.arm.moving:
             self._note("motion-stopped" if moving else "motion-started")
+
+    @property
+    def wrench_error(self) -> Vector:
+        """The largest errors (6,) of the measured force and torque."""
+        if self.exact_wrench:
+            return np.zeros(6)
+        return SENSOR_ERROR if self.is_e_series else CURRENTS_ERROR
 
     @property
     def is_e_series(self) -> bool:

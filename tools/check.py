@@ -123,7 +123,7 @@ def _check_experiment(
         if warm_up_s:
             text += f"; after a grip it waits up to {warm_up_s:.0f} s for the first torques"
         if robot is not None and experiment.torque_source != WRENCH:
-            noise_nm = robot.settings.facts.estimated_nm
+            noise_nm = robot.settings.facts.mean_noise_nm
             if noise_nm:
                 text += f"; the wrench supervises it to {noise_nm:g} N·m beyond its limits only"
         parts.texts["experiment"] = text

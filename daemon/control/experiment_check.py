@@ -340,7 +340,7 @@ def experiment_mistakes(
     if file.torque_source and file.steps:
         mistakes += _undriven(file.torque_source, driving, config)
         if file.torque_source == WRENCH and robot is not None:
-            noise_nm, limit_nm = robot.settings.facts.estimated_nm, file.tightest_nm
+            noise_nm, limit_nm = robot.settings.facts.mean_noise_nm, file.tightest_nm
             if noise_nm >= limit_nm:
                 mistakes.append((("torque_source",), too_noisy(WRENCH, noise_nm, limit_nm)))
     if file.torque_source in sources:

@@ -16,11 +16,12 @@ from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.inputs import ArmStatus
 from shearloop.daemon.control.safety import Fault, FaultCode
-from shearloop.daemon.control.state_publisher import PUBLISH_EVERY, StatePublisher
+from shearloop.daemon.control.state_publisher import StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
+from shearloop.daemon.control.wrench import WrenchMean
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import error_text
-from shearloop.daemon.torques import WRENCH, Tareable, TorqueSample, TorqueSource
+from shearloop.daemon.torques import WRENCH, Tareable, TorqueSample
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
@@ -36,13 +37,6 @@ BRAKE_S = 0.5
 ENABLED_WITHIN_S = 0.5
 ENDING = "the daemon ends; start it again"
 STOPPED_AT_START = "it was stopped during its start"
-
-
-def wrench_source(rate_hz: float, noise_nm: float = 0.0) -> TorqueSource:
-    """Return the torque source of a robot's wrench, from the robot's rate of states and the noise of the wrench."""
-    return TorqueSource(
-        name=WRENCH, period_s=PUBLISH_EVERY / rate_hz, from_robot=True, needs_zero=True, noise_nm=noise_nm
-    )
 
 
 class ControlLoopRunner:
@@ -65,6 +59,7 @@ class ControlLoopRunner:
         self._sender = CommandSender(robot, control_loop, self._timeline, clock)
         self.actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop)
         self.states = StatePublisher(publisher, control_loop)
+        self._wrench = WrenchMean(robot.settings.rate_hz)
         self._running = False
         self._stopped = True
         # The latest experiment whose stop has a timeline.
@@ -311,9 +306,11 @@ class ControlLoopRunner:
                 enabled_by_start=state.awaits_enable,
             )
         )
-        if self.states.publish_robot(state):
+        wrench = self._wrench
+        wrench.add(state)
+        if self.states.publish_robot(state, wrench.torque_nm) and wrench.known:
             # The torque on the tool is opposite to the wrench on the wrist.
-            torque = TorqueSample(WRENCH, -state.wrist_torque_nm, "", t_ns, self._clock.now_ns())
+            torque = TorqueSample(WRENCH, -wrench.torque_nm, "", wrench.t_mid_ns, self._clock.now_ns())
             self._control_loop.on_torque(torque)
 
     def _decide(self) -> None:

@@ -13,11 +13,11 @@ from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateM
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.ur.messages import RobotState
 
-# Every fifth state is published, and its wrench is a torque sample: 25 a second.
+# Every fifth state is published, 25 a second, and is a torque sample of the wrench.
 PUBLISH_EVERY = 5
 LOOP_STATE_PERIOD_S = 1.0
 # The columns of `robot.state` that the robot's state has under the same name.
-_SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s"}
+_SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s", "wrist_torque_nm"}
 
 
 @dataclass(slots=True)
@@ -34,14 +34,17 @@ class StatePublisher:
     _logged: "_LogKey | None" = None
     _published_ns: int = 0
 
-    def publish_robot(self, state: RobotState) -> bool:
-        """Publish every fifth state; return whether it was this one."""
+    def publish_robot(self, state: RobotState, wrist_torque_nm: float) -> bool:
+        """Publish every fifth state, with the mean torque of the latest ones; return whether it was this one."""
         if (block := state.cycle // PUBLISH_EVERY) == self._block:
             return False
         self._block = block
         same: dict[str, Any] = {name: getattr(state, name) for name in _SAME}
         age_s = state.age_ns / 1e9
-        self.publisher.publish(RobotStateMessage(source="robot", joints_rad=state.q_rad, age_s=age_s, **same))
+        message = RobotStateMessage(
+            source="robot", joints_rad=state.q_rad, age_s=age_s, wrist_torque_nm=wrist_torque_nm, **same
+        )
+        self.publisher.publish(message)
         return True
 
     def publish_loop(self, sent_rad_per_s: float, now_ns: int) -> None:

@@ -170,7 +170,9 @@ class RobotStateMessage(Message):
     wrench: tuple[float, ...] = column("N, N·m", "force and torque at the tool centre")
     wrist_rad: float = column("rad", "angle of wrist 3, about which the tool twists")
     wrist_speed_rad_per_s: float = column("rad/s", "its speed")
-    wrist_torque_nm: float = column("N·m", "wrench about the tool's axis; the torque on the tool is its negative")
+    wrist_torque_nm: float = column(
+        "N·m", "wrench about the tool's axis, mean over 0.2 s; the torque on the tool is its negative"
+    )
     robot_mode: int = column("", "the controller's robot mode, 7 when running")
     safety_mode: int = column("", "the controller's safety mode, 1 when normal")
     speed_scaling: float = column("", "fraction of commanded speeds that is carried out: slider times own scaling")

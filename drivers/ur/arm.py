@@ -76,9 +76,12 @@ class UrArm:
         self._age = SampleAge()
         # In the base's frame: of a controller that cannot zero its wrench, or that has zeroed it with a load.
         self.wrench_zero: Six = (0.0,) * 6
+        # Of the latest samples at rest, as the controller measures them: one is known to its noise only.
         self._recent_wrenches: deque[Six] = deque(maxlen=max(1, round(_ZERO_OVER_S * settings.rate_hz)))
-        # The wrench before a program was first sent, where something was held, until that program answers.
+        # The wrench before a program was first sent, where something was held, until that program has its zero.
         self._held: Six | None = None
+        # Whether the program that was sent last has answered.
+        self._answered = False
         self.script_readiness = ScriptReadiness(self._receiver, settings.command_timeout_s)
 
     def read(self) -> RtdeSample:
@@ -158,13 +161,12 @@ class UrArm:
         In this process it is the mean of the last samples at rest.
         """
         if not self._settings.facts.zeroes_wrench:
-            recent = self._recent_wrenches or [self._receiver.latest().wrench]
-            fx, fy, fz, mx, my, mz = (fmean(one) for one in zip(*recent, strict=True))
-            self.wrench_zero = fx, fy, fz, mx, my, mz
+            self.wrench_zero = self._mean_wrench()
             return True
         if not self._send_once(self._control.zeroFtSensor):
             return False
         self.wrench_zero = (0.0,) * 6
+        self._recent_wrenches.clear()
         return True
 
     def upload(self, *, held: bool = False) -> None:
@@ -179,7 +181,9 @@ class UrArm:
         if not (held and self._settings.facts.zeroes_at_start):
             self._held = None
         elif self._held is None:
-            self._held = self._wrench()
+            self._held = _difference(self._mean_wrench(), self.wrench_zero)
+        self._answered = False
+        self._recent_wrenches.clear()
         # ur-rtde's own script connection is never read, so that the controller soon stops listening to it.
         self._script_port.send(control_program(self._settings, self._registers, self._held))
         self.script_readiness.command_sent()
@@ -189,13 +193,24 @@ class UrArm:
         self._held = None
 
     def arm_watchdog(self) -> bool:
-        """Return whether the uploaded program answers; its watchdog is armed then."""
+        """Return whether the uploaded program answers, and the wrench has its zero; its watchdog is armed then.
+
+        With something held the zero is known once the wrench has been measured for half a second of the program.
+        """
         armed = self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)
-        if armed and self._settings.facts.zeroes_at_start:
-            now: Six = self._receiver.latest().wrench
-            self.wrench_zero = _difference(now, self._held) if self._held is not None else (0.0,) * 6
-            self._held = None
-        return armed
+        if not (armed and self._settings.facts.zeroes_at_start):
+            return armed
+        if not self._answered:
+            self._answered = True
+            self._recent_wrenches.clear()
+        if self._held is None:
+            self.wrench_zero = (0.0,) * 6
+            return True
+        if len(self._recent_wrenches) < (self._recent_wrenches.maxlen or 1):
+            return False
+        self.wrench_zero = _difference(self._mean_wrench(), self._held)
+        self._held = None
+        return True
 
     def end_program(self) -> None:
         """End the control script; one that is not ready is left to its watchdog."""
@@ -206,8 +221,11 @@ class UrArm:
         """Let no motion go on, also not when a program that is paused now is resumed."""
         self._receiver.write_deadline(NO_MOTION_TICKS)
 
-    def _wrench(self) -> Six:
-        return _difference(self._receiver.latest().wrench, self.wrench_zero)
+    def _mean_wrench(self) -> Six:
+        """Return the mean of the latest samples at rest as the controller measures them, of one where none is."""
+        recent = self._recent_wrenches or [self._receiver.latest().wrench]
+        fx, fy, fz, mx, my, mz = (fmean(one) for one in zip(*recent, strict=True))
+        return fx, fy, fz, mx, my, mz
 
     def _write_deadline(self, left_s: float) -> None:
         # The latest sample is older than now, so that the deadline is never late.

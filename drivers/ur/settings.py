@@ -4,6 +4,7 @@ All limits are magnitudes. A measured value beyond a `hard` limit stops the moti
 limit, so that no command reaches the hard one.
 """
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal
@@ -52,6 +53,10 @@ REST_RAD_PER_S = 0.01
 Generation = Literal["e-series", "cb3"]
 
 
+# A torque of the wrench is the mean of at least so many states.
+WRENCH_STATES: Final = 16
+
+
 @dataclass(frozen=True, slots=True)
 class GenerationFacts:
     """What differs between UR's generations of controllers."""
@@ -70,6 +75,11 @@ class GenerationFacts:
     # The noise of the wrench: a CB3 estimates it from the joints' currents.
     noise_n: float
     noise_nm: float
+
+    @property
+    def mean_noise_nm(self) -> float:
+        """How well the mean torque of `WRENCH_STATES` states is known, N·m: an estimate's error stays in a mean."""
+        return self.noise_nm / math.sqrt(WRENCH_STATES) if self.zeroes_wrench else self.noise_nm
 
     @property
     def estimated_nm(self) -> float:

@@ -236,7 +236,7 @@ async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_
 
 async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig_config, tiny_bank):
     """The stop that opens the gripper ends the experiment, and that the daemon, within the same millisecond."""
-    twist = {"do": "twist", "angles_rad": [0.3], "speed_rad_per_s": 0.1, "limits": {"torque_nm": 0.02}}
+    twist = {"do": "twist", "angles_rad": [0.3], "speed_rad_per_s": 0.1, "limits": {"torque_nm": 0.1}}
     grip = {"do": "grip", "width_mm": 5, "force_n": 60}
     path = ending_with(rig_config, {"do": "release"}, {"do": "tare"}, grip, twist)
     async with running_rig(path, tiny_bank) as (daemon, watcher, _cause, _command):

@@ -159,6 +159,7 @@ def test_wrench_is_the_plants_torque_about_the_tool_axis():
     error = np.abs(robot.arm.wrench - robot.arm.load)
     assert 0.0 < np.linalg.norm(error[:3]) <= 3.5
     assert 0.0 < np.linalg.norm(error[3:]) <= 0.2
+    robot.exact_wrench = True
     robot.registers.write("input_int_register_0", 0, robot.time_s)
     do(robot, robots.SPEED_STOP, 10.0)
     do(robot, robots.ZERO_FT)

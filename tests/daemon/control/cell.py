@@ -15,11 +15,14 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.gripper_task import OPENING
 from shearloop.daemon.control.inputs import GripperStatus
-from shearloop.daemon.control.loop_runner import ControlLoopRunner, wrench_source
+from shearloop.daemon.control.loop_runner import ControlLoopRunner
+from shearloop.daemon.control.state_publisher import PUBLISH_EVERY
+from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import WRENCH, TorqueSample
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, MoveLinear, RobotState, WristSpeed
+from shearloop.drivers.ur.settings import WRENCH_STATES
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS, FakeArm, HandlerBench
 
 SPEED_M_PER_S = 0.1
@@ -285,7 +288,8 @@ async def driven(*steps: Mapping[str, Any], cycles: int = 0, cell: Cell | None =
     """Yield a cell that has begun an experiment of these steps, if any, so many cycles ago."""
     cell = cell or Cell()
     cell.drive()
-    await cell.cycles(10)
+    # Until the wrench is known.
+    await cell.cycles(WRENCH_STATES + PUBLISH_EVERY)
     try:
         if steps:
             await cell.start(*steps)

@@ -6,9 +6,9 @@ import pytest
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, Grasp, Watched, compared_for_s, detect_faults
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
-from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.safety import TABLE, Fault, FaultCode, Response
 from shearloop.daemon.control.state_publisher import PUBLISH_EVERY
+from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample, TorqueSource
 from shearloop.drivers.ur.control_box import SampleAge

@@ -15,8 +15,8 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import FOLLOWED_MM, SAME_WIDTH_MM, Grip
-from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
+from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memory, write_memory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell

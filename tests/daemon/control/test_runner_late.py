@@ -5,10 +5,14 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.control import fault_detection
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.safety import Fault, FaultCode
-from tests.daemon.control.cell import TWIST, driven
-from tests.drivers.ur.handler_bench import CYCLE_NS
+from shearloop.daemon.control.wrench import wrench_source
+from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.torques import WRENCH
+from tests.daemon.control.cell import TWIST, Cell, driven
+from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 
 
 async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch):
@@ -31,7 +35,10 @@ async def test_a_speed_that_comes_while_the_arm_still_brakes_after_a_late_one_sa
 ):
     # This arm turns for longer without a decision than the delivered one.
     monkeypatch.setattr(fault_detection, "LONGEST_HANG_S", 1.0)
-    async with driven(TWIST, cycles=50) as cell:
+    # So do its torques.
+    sources = {WRENCH: wrench_source(SETTINGS.rate_hz)}
+    patient = Cell(ControlLoop(LoopConfig(stale_after_s=1.0), sources, ("robot",)))
+    async with driven(TWIST, cycles=50, cell=patient) as cell:
         while cell.state.motion != "stopping":
             cell.robot.cycle(read=False)
         await cell.cycles(3)

@@ -8,8 +8,8 @@ from structlog.testing import capture_logs
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.inputs import GripperStatus
-from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import wire_map
 from shearloop.daemon.run_summary import RunSummary

@@ -8,8 +8,8 @@ import pytest
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import MoveToAngle, TrackTorque
 from shearloop.daemon.control.identification import ToolModel
-from shearloop.daemon.control.loop_runner import wrench_source
 from shearloop.daemon.control.margins import JudgedGain
+from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import WRENCH, TorqueSample, TorqueSource

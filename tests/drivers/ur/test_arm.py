@@ -212,6 +212,39 @@ def test_the_zero_of_a_cb3_is_the_mean_of_its_noisy_samples(arm):
     assert one.wrench_zero[5] == pytest.approx(0.4)
 
 
+def rest(one, at_s: float, wrench: ur.Six, noise_nm: float = 0.0) -> None:
+    """Let an arm be read for half a second at rest, from a time of its controller on."""
+    random = np.random.default_rng(round(at_s))
+    for number in range(round(0.5 * SETTINGS.rate_hz)):
+        *rest_of_it, torque_nm = wrench
+        torque_nm += random.uniform(-noise_nm, noise_nm)
+        Receiver.made.sample = dataclasses.replace(received(at_s + number / 125), wrench=(*rest_of_it, torque_nm))
+        one.read()
+
+
+def start_program(one, at_s: float, wrench: ur.Six, noise_nm: float = 0.0) -> None:
+    """Let the program that was sent answer, and be read for half a second."""
+    Receiver.made.sample = dataclasses.replace(received(at_s), wrench=wrench)
+    one.script_readiness.waiting = False
+    one.arm_watchdog()
+    rest(one, at_s, wrench, noise_nm)
+    one.script_readiness.waiting = False
+    assert one.arm_watchdog()
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_the_kept_zero_is_known_to_less_than_the_noise_of_one_sample(arm, monkeypatch, held):
+    """One sample before the program's start and one after it put it off by up to twice the noise."""
+    monkeypatch.setattr(arm.ScriptPort, "send", lambda *_: None)
+    one = arm.UrArm(SETTINGS)
+    rest(one, 1.0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.3), noise_nm=0.2)
+    one.upload(held=held)
+    Receiver.made.sample = received(2.0)
+    assert one.arm_watchdog() is not held, "with a load it waits for half a second of samples"
+    start_program(one, 2.1, SIX, noise_nm=0.2)
+    assert -one.wrench_zero[5] == pytest.approx(0.3 if held else 0.0, abs=0.05)
+
+
 @pytest.mark.parametrize("held", [True, False])
 def test_wrench_of_what_is_held_outlives_the_zero_of_a_new_program(arm, monkeypatch, held):
     """An e-Series zeroes its wrench as a program starts."""
@@ -222,8 +255,7 @@ def test_wrench_of_what_is_held_outlives_the_zero_of_a_new_program(arm, monkeypa
     Receiver.made.sample = dataclasses.replace(received(1.0), wrench=load)
     one.upload(held=held)
     assert ("global keeps_load = True\n  global load_before = [1.000000, 0.000000, 3.000000, " in sent[0]) == held
-    Receiver.made.sample = dataclasses.replace(received(2.0), wrench=SIX)
-    assert one.arm_watchdog()
+    start_program(one, 2.0, SIX)
     assert one.read().wrench == (load if held else SIX)
     # The next worker goes on with this zero, and a new one ends it.
     another = arm.UrArm(SETTINGS)
@@ -245,8 +277,7 @@ def test_a_program_that_is_sent_again_keeps_the_wrench_from_before_the_first(arm
     # It has started, and has zeroed the wrench.
     Receiver.made.sample = dataclasses.replace(received(3.0), wrench=SIX)
     one.upload(held=True)
-    one.script_readiness.waiting = False
-    assert one.arm_watchdog()
+    start_program(one, 3.1, SIX)
     assert one.read().wrench == load
     # A program that never answers, and another tool: the load of before is over.
     Receiver.made.sample = dataclasses.replace(received(5.0), wrench=SIX)
@@ -255,17 +286,13 @@ def test_a_program_that_is_sent_again_keeps_the_wrench_from_before_the_first(arm
     Receiver.made.sample = dataclasses.replace(received(6.0), wrench=(0.0, 0.0, 0.0, 0.0, 0.0, 0.5))
     before = one.read().wrench
     one.upload(held=True)
-    Receiver.made.sample = dataclasses.replace(received(7.0), wrench=SIX)
-    one.script_readiness.waiting = False
-    assert one.arm_watchdog()
+    start_program(one, 7.0, SIX)
     assert one.read().wrench == before
     one.wrench_zero = (-1.0, 0.0, -3.0, 0.0, 0.0, -1.5)
     # Another program, later, begins with the load of its own time.
-    Receiver.made.sample = dataclasses.replace(received(9.0), wrench=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    rest(one, 9.0, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     one.upload(held=True)
-    Receiver.made.sample = dataclasses.replace(received(9.1), wrench=SIX)
-    one.script_readiness.waiting = False
-    assert one.arm_watchdog()
+    start_program(one, 10.0, SIX)
     assert one.read().wrench == (2.0, 0.0, 3.0, 0.0, 0.0, 1.5)
 
 

@@ -197,6 +197,8 @@ class Arm:
         self.motion: Speed | LinearMove | None = None
         # The pendant's speed slider, a factor on commanded speeds.
         self.speed_slider = 1.0
+        # How much the controller slows every motion by itself.
+        self.limiter_scaling = 1.0
         # Faults: how fast each joint brakes, the noise of its measured speeds, and a force (3,) that nothing exerts.
         self.braking_rad_per_s2 = np.full(6, math.inf)
         self.noise_rad_per_s = 0.0
@@ -260,19 +262,22 @@ class Arm:
 
     def mend(self) -> None:
         """End every fault."""
-        self.speed_slider, self.noise_rad_per_s = 1.0, 0.0
+        self.speed_slider = self.limiter_scaling = 1.0
+        self.noise_rad_per_s = 0.0
         self.braking_rad_per_s2 = np.full(6, math.inf)
         self.bias_n, self.hung_kg = np.zeros(3), 0.0
 
+    @property
+    def _scaling(self) -> float:
+        return self.speed_slider * self.limiter_scaling
+
     def turn(self, target_rad_per_s: Vector, acceleration: float) -> None:
         """Turn towards these joint speeds from now on."""
-        self.motion = Speed(
-            self.speed_slider * target_rad_per_s, acceleration, braking_rad_per_s2=self.braking_rad_per_s2
-        )
+        self.motion = Speed(self._scaling * target_rad_per_s, acceleration, braking_rad_per_s2=self.braking_rad_per_s2)
 
     def move_to(self, pose: Vector, speed: float, acceleration: float) -> None:
         """Begin a straight move."""
-        speed *= self.speed_slider
+        speed *= self._scaling
         self.motion = LinearMove(self._frame, frame_of_pose(pose), speed, acceleration, self._tool)
 
     def halt(self, deceleration: float) -> None:

@@ -42,7 +42,7 @@ _VARIABLES: dict[str, tuple[str, Callable[[Robot], Value]]] = {
     "runtime_state": ("UINT32", lambda robot: robot.runtime_state),
     "robot_status_bits": ("UINT32", lambda robot: int(robot.robot_mode == MODE_RUNNING) | robot.program_running << 1),
     "target_speed_fraction": ("DOUBLE", lambda robot: robot.arm.speed_slider),
-    "speed_scaling": ("DOUBLE", lambda _: 1.0),
+    "speed_scaling": ("DOUBLE", lambda robot: robot.arm.limiter_scaling),
     "external_force_torque": ("VECTOR6D", lambda _: (0.0,) * 6),
     "payload": ("DOUBLE", lambda robot: robot.spec.payload_kg),
     "payload_cog": ("VECTOR3D", lambda robot: robot.spec.payload_cog_m),

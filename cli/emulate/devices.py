@@ -51,6 +51,7 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   bias N                  report a force that nothing exerts
   hang KG                 hang a mass on the tool
   slider FRACTION         move the pendant's speed slider, 1 at its right end
+  scaling FRACTION        let the controller slow every motion by itself, to this fraction
   error-code CODE         report an error code, as the pendant's log has it
   version A.B.C.D         report this version of PolyScope to later connections
   payload KG              have another payload set at the pendant

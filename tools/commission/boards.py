@@ -59,7 +59,13 @@ def measure(context: Context) -> Measured:
             )
         if load is not None and config.load_cell is not None:
             lines += _weigh(context, load, config.load_cell.rate_hz)
-        return Measured([*lines, *_clocks(context, fingertips, load), *unmeasured(config)])
+        if not config.fingertips and not context.settings.facts.zeroes_wrench:
+            # Forces that are estimated from the joints' currents are too noisy, and nothing else sees the press.
+            why = f"the wrench of {context.settings.facts.name} is too noisy, and there is no fingertip"
+            lines.append(Line(what="lag of the load cell", value=f"not measured: {why}"))
+        else:
+            lines += _clocks(context, fingertips, load)
+        return Measured([*lines, *unmeasured(config)])
 
 
 def unmeasured(config: DaemonConfig) -> list[Line]:
@@ -130,8 +136,7 @@ def _press(
     }
     load_s = load_step_s(load.since(begun_ns)) if load is not None else None
     reference = "the robot's wrench", robot_step_s(context.observer.since(begun_ns))
-    if not context.settings.facts.zeroes_wrench and found:
-        # Forces that are estimated from the joints' currents are too noisy.
+    if not context.settings.facts.zeroes_wrench:
         name = next(iter(found))
         reference = name, found.pop(name)
     rate_hz = config.load_cell.rate_hz if config.load_cell is not None else 0.0

@@ -300,15 +300,20 @@ async def test_another_payload_than_the_configured_one_refuses_motion(controller
         assert (await robot.send(Enable())).accepted
 
 
-async def test_speed_slider_that_is_moved_stops_the_wrist_and_is_named(controller):
+@pytest.mark.parametrize(
+    ("fault", "named"),
+    [("slider", "speed slider is at 50 %"), ("scaling", "controller slows every motion to 50 % by itself")],
+)
+async def test_what_slows_the_wrist_stops_it_and_is_named(controller, fault, named):
+    """The pendant's slider, and the controller's own limits: the motion has the product of both."""
     async with turning(controller) as robot:
-        moved_ns = await controller.fault("slider 0.5")
-        await stops(controller, moved_ns)
+        slowed_ns = await controller.fault(f"{fault} 0.5")
+        await stops(controller, slowed_ns)
         state = await until(robot, lambda state: state.motion == "idle")
-        assert (state.speed_slider, state.speed_scaling) == (0.5, 0.5)
-        assert "speed slider is at 50 %" in (await robot.send(Enable())).refusal
-        await controller.fault("slider 1")
-        await until(robot, lambda state: state.speed_slider == 1.0)
+        assert state.speed_scaling == 0.5
+        assert named in (await robot.send(Enable())).refusal
+        await controller.fault(f"{fault} 1")
+        await until(robot, lambda state: state.speed_scaling == 1.0)
         assert (await robot.send(Enable())).accepted
 
 

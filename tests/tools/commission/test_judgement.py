@@ -1,8 +1,10 @@
 """What the stages make of their measurements: each fault fails its own line, and no other."""
 
+import contextlib
 import dataclasses
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -383,6 +385,25 @@ def test_a_press_that_the_reference_does_not_see_fails_every_clock():
     lines = judge_clocks(("the robot's wrench", None), {"right": 5.0}, 5.0, 10.0)
     assert failed(lines) == ["clock of right", "lag of the load cell"]
     assert "the press is not seen by the robot's wrench" in lines[0].value
+
+
+@pytest.mark.parametrize(("settings", "seen"), [(CB3, False), (DELIVERED, True)], ids=["cb3", "e-series"])
+def test_a_load_cell_alone_beside_a_cb3_has_no_lag_to_judge(monkeypatch, settings, seen):
+    """Nothing sees the press: its wrench is too noisy, and there is no fingertip."""
+    asked: list[str] = []
+    cell = SimpleNamespace(take=lambda count, _: loads(0.1 if len(asked) > 1 else 0.0)[:count])
+    context: Any = SimpleNamespace(
+        config=SimpleNamespace(fingertips={}, load_cell=SimpleNamespace(rate_hz=10.9), gripper=None, skin=None),
+        settings=settings,
+        limits=REAL,
+        operator=SimpleNamespace(
+            act=lambda text, *_: asked.append(text), number=lambda text, *_: asked.append(text) or 0.1
+        ),
+        rig=SimpleNamespace(load_cell=lambda: contextlib.nullcontext(cell)),
+    )
+    monkeypatch.setattr(boards, "_clocks", lambda *_: judge_clocks(("the robot's wrench", 5.0), {}, 5.2, 10.9))
+    (lag,) = (line for line in boards.measure(context).lines if line.what == "lag of the load cell")
+    assert (lag.verdict, "not measured" in lag.value) == (("passed", False) if seen else ("noted", True))
 
 
 def test_five_gauges_make_a_table_of_widths():

@@ -10,15 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shearloop.drivers.defaults import EMULATED_ANSWER
-from shearloop.emulators.ur_arm import (
-    CURRENTS_ERROR,
-    SENSOR_ERROR,
-    Arm,
-    PathError,
-    Vector,
-    WristPlant,
-    frame_of_pose,
-)
+from shearloop.emulators.ur_arm import CURRENTS_ERROR, SENSOR_ERROR, Arm, PathError, Vector, WristPlant, frame_of_pose
 from shearloop.emulators.urscript import Interrupts, Program, ProgramEndedError, Registers
 
 STOPPED, PLAYING, PAUSED = 1, 2, 4

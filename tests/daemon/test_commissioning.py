@@ -31,6 +31,7 @@ from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 from shearloop.tools.commission.report import save_report
 from shearloop.tools.doctor import check_cap
+from shearloop.tools.doctor.devices import check_identity
 from tests.fixtures.daemons import ask, collector, robot_at, running_daemon
 from tests.fixtures.robots import filled_in
 
@@ -263,6 +264,21 @@ def test_check_and_doctor_say_that_the_cap_holds(tmp_path, capsys):
     assert "capped at 0.2 rad/s, 0.05 m/s and 0.3 N·m" in capsys.readouterr().out
     (finding,) = check_cap(load_daemon_config(path))
     assert (finding.state, "capped" in finding.found, "commission" in finding.next_step) == ("note", True, True)
+
+
+def test_doctor_compares_the_controller_with_settings_and_report(tmp_path):
+    report = report_of(write_rig(tmp_path), "013457", SUPPLIED)
+    dated = [stage.model_copy(update={"date": datetime.now(UTC)}) for stage in report.stages]
+    save_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
+    config = load_daemon_config(write_rig(tmp_path, commissioned="report.yaml"))
+    settings = read_settings(config.robot)
+    assert list(check_identity(config, settings, VERSION, SERIAL)) == []
+    (other,) = check_identity(config, settings, VERSION, "20235500002")
+    assert (other.subject, other.state) == ("commissioned robot", "note")
+    assert "the robot's serial number changed since its report" in other.found
+    (generation, _) = check_identity(config, settings, "3.15.8.0", SERIAL)
+    assert (generation.subject, generation.state) == ("robot's generation", "trouble")
+    assert "write `generation: cb3` into them" in generation.found
 
 
 def test_a_missing_report_is_a_mistake_of_the_configuration(tmp_path):

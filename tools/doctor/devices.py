@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from shearloop.daemon.commissioning import commissioning_of
 from shearloop.daemon.config import DaemonConfig, GripperConfig, SerialDevice
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
@@ -17,11 +18,17 @@ from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.rig_identity import why_not_emulated
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
-from shearloop.drivers.ur.control_box import REMOTE_CURE, check_ports, query_controller, untested_sentence
+from shearloop.drivers.ur.control_box import (
+    REMOTE_CURE,
+    check_generation,
+    check_ports,
+    query_controller,
+    untested_sentence,
+)
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.primary_port import PrimaryPort
 from shearloop.drivers.ur.script import UPPER
-from shearloop.drivers.ur.settings import read_settings
+from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
 from shearloop.tools.doctor.boards import (
     check_adc,
@@ -54,7 +61,7 @@ async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
     if config.gripper is not None:
         checks.append(_check_gripper(config.gripper))
     if config.robot is not None:
-        checks.append(asyncio.to_thread(lambda path: [*_check_robot(path, emulated=config.emulated)], config.robot))
+        checks.append(asyncio.to_thread(lambda path: [*_check_robot(config, path)], config.robot))
     return [finding for findings in await asyncio.gather(*checks) for finding in findings]
 
 
@@ -82,9 +89,10 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
     return [good("gripper", f"{client.name} answers and is activated")]
 
 
-def _check_robot(settings: Path, *, emulated: bool) -> Iterator[Finding]:
+def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
     try:
-        host = read_settings(settings).host
+        settings = read_settings(path)
+        host = settings.host
         try:
             check_ports(host, ROBOT_TIMEOUT_S)
         except RobotLostError as error:
@@ -94,7 +102,7 @@ def _check_robot(settings: Path, *, emulated: bool) -> Iterator[Finding]:
         cure = "look at the teach pendant, and check the cable and `host` in the robot's settings"
         yield from_error("robot", error, "the robot cannot be driven", cure)
         return
-    if emulated and (reason := why_not_emulated(host, seen.serial_number)):
+    if config.emulated and (reason := why_not_emulated(host, seen.serial_number)):
         yield from_error("robot", reason, "the daemon does not drive it")
         return
     with contextlib.closing(PrimaryPort(host, ROBOT_TIMEOUT_S)) as primary:
@@ -107,6 +115,7 @@ def _check_robot(settings: Path, *, emulated: bool) -> Iterator[Finding]:
         yield note("robot", answers, what, cure.rstrip("."))
     else:
         yield good("robot", answers)
+    yield from check_identity(config, settings, seen.version, seen.serial_number)
     if seen.remote is False:
         means = "it accepts no motion from the network"
         yield trouble("remote control", "the robot is in local control", means, REMOTE_CURE)
@@ -125,6 +134,25 @@ def _check_robot(settings: Path, *, emulated: bool) -> Iterator[Finding]:
         means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
         cure = "close the other program, or disable the adapter under Installation → Fieldbus"
         yield trouble("robot's registers", "in use", means, cure)
+
+
+def check_identity(config: DaemonConfig, settings: UrSettings, version: str, serial_number: str) -> Iterator[Finding]:
+    """Compare a controller with the generation in the settings, and with the one of the commissioning's report."""
+    try:
+        check_generation(settings, version)
+    except RobotLostError as error:
+        yield from_error("robot's generation", error, "the daemon does not drive it")
+    try:
+        commissioning = commissioning_of(config, settings)
+    except UserError:
+        # The mistake is among the findings on files.
+        return
+    if not commissioning.counts:
+        return
+    commissioning.on_controller(version, serial_number)
+    if not commissioning.counts:
+        what, cure = split_cure(commissioning.sentence)
+        yield note("commissioned robot", what, "an experiment that asks for more is refused", cure)
 
 
 def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:

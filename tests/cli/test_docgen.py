@@ -12,14 +12,23 @@ import zmq
 from shearloop.cli.config_schema import MODELS, schema_of
 from shearloop.cli.docgen import DOCS, pages
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.safety import TABLE
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sensing.sessions import COMBINED
+from shearloop.daemon.sensing.skin_task import SKIN
+from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from tests.fixtures.daemons import DEADLINE_S
 from tests.sample_messages import sample
 
 PAGES = pages()
+
+
+def test_the_torque_source_of_an_experiment_names_every_source_that_is_no_fingertip():
+    text = ExperimentFile.model_fields["torque_source"].description or ""
+    assert all(f"`{source}`" in text for source in (COMBINED, SKIN, LOAD_CELL, WRENCH))
 
 
 @pytest.fixture(scope="module")

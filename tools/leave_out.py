@@ -35,6 +35,7 @@ _ENOUGH_GRIPS = 3
 _ENOUGH_TOOLS = 4
 MEAN_TWIST = "a stopwatch with the mean twist"
 NO_ESTIMATE = "No loaded frame has an estimate: see why with `shearloop evaluate CAL REC`."
+ON_ANOTHER = "Judge it on another recording: `shearloop evaluate CAL REC`."
 # Below this coverage of the 95 % intervals, the advice is more data.
 _LEAST_COVERAGE = 0.9
 
@@ -287,7 +288,7 @@ def sentences_on_fitted(figures: Figures, clock: str) -> list[str]:
 
 def advice_unjudged(kind: str, recordings: Sequence[FrameSeries]) -> str:
     """Return one sentence: what to do first where no block of a kind can be left out."""
-    return _few_tools(kind, recordings) or "Judge it on another recording: `shearloop evaluate CAL REC`."
+    return _few_tools(kind, recordings) or ON_ANOTHER
 
 
 def _few_tools(kind: str, recordings: Sequence[FrameSeries]) -> str:

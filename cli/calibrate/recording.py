@@ -73,7 +73,8 @@ def _calibrate_recordings(args: argparse.Namespace, physics: "Physics") -> tuple
     result.calibration.save(args.out)
     figures, sentences = result.figures(), sentences_of(result)
     if result.calibration.torque is None:
-        return {**figures, "left_out": None}, sentences
+        judged, said = _unjudged_diameters()
+        return {**figures, **judged}, sentences + said
     kind = usual_kind(result.parts)
     recipe = Recipe(args.estimator, args.bank, args.mesh, result.timing.uncertainty_s)
     names = [path.name for path in args.recordings]
@@ -102,7 +103,8 @@ def _calibrate_slices(args: argparse.Namespace, physics: "Physics") -> tuple[dic
     result.calibration.save(args.out)
     figures, sentences = result.figures(), result.sentences()
     if result.calibration.torque is None:
-        return {**figures, "left_out": None}, sentences
+        judged, said = _unjudged_diameters()
+        return {**figures, **judged}, sentences + said
     recipe = SliceRecipe(args.estimator, args.bank, args.mesh, args.assume_full_range)
     trial = _Trial(
         LEVELS,
@@ -136,6 +138,14 @@ class _Trial:
         return {"on_fitted": figures}, sentences_on_fitted(figures, self.clock)
 
 
+def _unjudged_diameters() -> tuple[dict[str, object], list[str]]:
+    """Return why no block is left out of a calibration without a torque, and the advice."""
+    from shearloop.tools.leave_out import ON_ANOTHER
+
+    why = "blocks are left out for torques, and this calibration has diameters only"
+    return {"left_out": None, "left_out_refused": why, "advice": ON_ANOTHER}, [f"Not judged: {why}.", ON_ANOTHER]
+
+
 def _judge_left_out(args: argparse.Namespace, trial: _Trial, fit_s: float) -> tuple[dict[str, object], list[str]]:
     """Return the figures of the blocks left out, and the advice for the user.
 
@@ -154,7 +164,8 @@ def _judge_left_out(args: argparse.Namespace, trial: _Trial, fit_s: float) -> tu
             figures, sentences = trial.on_fitted()
             why = f"Not judged yet: {len(plan.blocks)} fits take about {takes_s:.0f} s."
             advice = f"Judge it by {trial.kind} left out: {command}"
-            return {"left_out": None, "left_out_command": command, **figures}, [why, *sentences, advice]
+            later = {"left_out": None, "left_out_command": command, "advice": advice}
+            return {**later, **figures}, [why, *sentences, advice]
         found = plan.judge(SerialExecutor())
     except (UserError, CalibrationError) as error:
         figures, sentences = trial.on_fitted()

@@ -86,6 +86,20 @@ def test_calibrate_ends_with_figures_and_advice_where_nothing_can_be_left_out(
     assert all(figures["on_fitted"].values())
 
 
+def test_calibrate_on_diameters_ends_with_advice(slices_folder, tmp_path, ran, result_of):
+    arguments = [
+        "calibrate",
+        slices_folder / "diameter_slices",
+        "--estimator",
+        "regression",
+        "--out",
+        tmp_path / "a.cal",
+    ]
+    *_, why, advice, _written = ran(*arguments).out.splitlines()
+    assert why == "Not judged: blocks are left out for torques, and this calibration has diameters only."
+    assert result_of(*arguments)["advice"] == advice == "Judge it on another recording: `shearloop evaluate CAL REC`."
+
+
 def test_an_interrupted_trial_says_that_the_calibration_is_written(shared, tmp_path, capsys, monkeypatch):
     recording = tmp_path / "30mm.mcap"
     import_mat(sorted((shared / "recordings/streams/cylinders").glob("30mm_1_*.mat")), recording)

@@ -23,7 +23,6 @@ from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
-from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sd_notify import notify
 from shearloop.daemon.sensing.sessions import COMBINED
@@ -33,8 +32,9 @@ from shearloop.daemon.torques import LatestTorques
 from shearloop.printable import printable
 
 if TYPE_CHECKING:
-    # Only a rig with a robot loads them.
+    # Only a rig with a robot, or one that records, loads them.
     from shearloop.daemon.configured_experiment import ConfiguredExperiment
+    from shearloop.daemon.recorder.recorder import Recorder
     from shearloop.daemon.rig import Rig
     from shearloop.daemon.robot_files import RobotFiles
     from shearloop.drivers.ur.settings import UrSettings
@@ -47,7 +47,7 @@ REPORTED_WITHIN_S = 0.2
 class RecordingTask:
     """Writes the recording, and hands its errors to the control loop."""
 
-    recorder: Recorder
+    recorder: "Recorder"
     rig: "Rig | None"
 
     async def run(self) -> None:
@@ -80,9 +80,8 @@ class Daemon:
             robot = _take_robot(config, opened)
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
             self.publisher.add_listener(self._summary)
-            self.recorder: Recorder | None = None
-            if config.recording is not None:
-                self.recorder = Recorder(config.recording.folder, daemon_identity(config), clock)
+            self.recorder = _recorder_of(config, clock)
+            if self.recorder is not None:
                 self.publisher.add_listener(self.recorder.record_message)
                 opened.callback(self.recorder.close)
             self.health = HealthReporter(self.publisher, self.supervisor, clock, config.emulated, config.name)
@@ -210,6 +209,15 @@ class Daemon:
     def finished(self) -> bool:
         """Whether the experiment that ends the daemon is done; True without one."""
         return self._experiment is None or self._experiment.finished
+
+
+def _recorder_of(config: DaemonConfig, clock: Clock) -> "Recorder | None":
+    """Return the recorder of a configuration that records."""
+    if config.recording is None:
+        return None
+    from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
+
+    return Recorder(config.recording.folder, daemon_identity(config), clock)
 
 
 def _take_robot(config: DaemonConfig, opened: contextlib.ExitStack) -> "tuple[UrSettings, RobotFiles] | None":

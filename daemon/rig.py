@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, commissioning_of, measured_widths
@@ -24,7 +24,6 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
 from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
-from shearloop.daemon.recorder.recorder import AttachedFile, Recorder
 from shearloop.daemon.rig_memory import RigMemory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.sensing.sessions import COMBINED, torque_sources
@@ -40,6 +39,10 @@ from shearloop.drivers.robotiq.socket_client import REPLY_DEADLINE_S, SocketClie
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
+
+if TYPE_CHECKING:
+    # Only a rig that records loads it.
+    from shearloop.daemon.recorder.recorder import Recorder
 
 # What `status` shows of `loop.state`.
 LOOP_KEYS = (
@@ -211,7 +214,7 @@ class Rig:
     runner: ControlLoopRunner
     tasks: Mapping[str, Task]
     experiments: ExperimentFiles
-    recorder: Recorder | None
+    recorder: "Recorder | None"
     # None where the emulated devices end with the daemon.
     memory: RigMemory | None = None
     commissioning: Commissioning | None = None
@@ -273,8 +276,7 @@ class Rig:
             if self.memory is not None:
                 self.memory.starting = ""
         if reason is None and self.recorder is not None:
-            attached = (AttachedFile.of(path, experiment.data),)
-            self.recorder.record_experiment(experiment.file.name, attached, experiment.file.tool_mm)
+            self.recorder.record_experiment(experiment.file.name, path, experiment.data, experiment.file.tool_mm)
         return reason
 
     async def start_question(self, path: Path) -> Question:
@@ -320,7 +322,7 @@ def build_rig(
     sessions: Sessions,
     publisher: Publisher,
     clock: Clock,
-    recorder: Recorder | None,
+    recorder: "Recorder | None",
     supervisor: Supervisor,
 ) -> tuple[Sensors, Rig]:
     """Return robot, gripper and control loop, and all sensors, which drive it.

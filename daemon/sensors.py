@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import structlog
 
@@ -10,7 +11,6 @@ from shearloop.daemon.config import DaemonConfig, FingertipConfig, LoadCellConfi
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import patience_of
-from shearloop.daemon.recorder.recorder import Recorder
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask
 from shearloop.daemon.sensing.fingertip_task import ToolHolder
 from shearloop.daemon.sensing.frame_pairing import FramePairing
@@ -24,6 +24,10 @@ from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.estimation import Session
+
+if TYPE_CHECKING:
+    # Only a rig that records loads it.
+    from shearloop.daemon.recorder.recorder import Recorder
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -74,7 +78,7 @@ def build_sensors(
     config: DaemonConfig,
     publisher: Publisher,
     clock: Clock,
-    recorder: Recorder | None,
+    recorder: "Recorder | None",
     sessions: Sessions,
     loop: SensorListener | None = None,
     gripper: ToolHolder | None = None,

@@ -230,9 +230,13 @@ class Recorder:
             self._carried.missing.discard(source)
 
     def record_experiment(
-        self, name: str, attached: tuple[AttachedFile, ...] = (), tool_mm: float | None = None
+        self, name: str, path: Path | None = None, content: bytes = b"", tool_mm: float | None = None
     ) -> None:
-        """Record the start of an experiment: a new file begins, unless the current one has no experiment yet."""
+        """Record the start of an experiment: a new file begins, unless the current one has no experiment yet.
+
+        `path` and `content` are of the experiment's own file, which is attached.
+        """
+        attached = () if path is None else (AttachedFile.of(path, content),)
         notes = {} if tool_mm is None else {schema.DIAMETER_NOTE: f"{tool_mm:g}"}
         add = partial(self._add_experiment, name, attached, notes, self._clock.now_ns())
         if self._carried.experiment_began:

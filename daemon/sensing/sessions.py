@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
-from shearloop.bank.bank_file import Bank
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
@@ -18,6 +17,8 @@ from shearloop.estimation import Calibration, Session
 from shearloop.estimation.defaults import MAX_GAP_S
 
 if TYPE_CHECKING:
+    # Only a fingertip with a bank loads them.
+    from shearloop.bank.bank_file import Bank
     from shearloop.estimation.bank_match import BankSearch
 
 # Source of the estimate from several fingertips together.
@@ -45,7 +46,7 @@ def channel_table(config: DaemonConfig) -> ChannelTable:
 def fingertip_table(config: FingertipConfig) -> ChannelTable:
     """Return a fingertip's channels, by its bank or its calibration, else the paper's."""
     if config.bank is not None:
-        return Bank.open(config.bank).table
+        return _open_bank(config.bank).table
     if config.calibration is not None and os.path.exists(config.calibration):
         return Calibration.load(config.calibration).table
     return PAPER_TABLE
@@ -84,7 +85,7 @@ def open_session(config: FingertipConfig, name: str) -> Session:
     if config.calibration is not None:
         # The file is missing, and the error says how to make it.
         return _open(config.calibration, Calibration.load(config.calibration), config)
-    bank = Bank.open(config.bank)
+    bank = _open_bank(config.bank)
     return _session(Calibration.uncalibrated(bank.identity, bank.table), config)
 
 
@@ -159,7 +160,7 @@ def _open(path: Path, calibration: Calibration, config: FingertipConfig) -> Sess
 
 def _session(calibration: Calibration, config: FingertipConfig) -> Session:
     """Return a session; raises CalibrationError for a bank that is missing or another one."""
-    bank = Bank.open(config.bank) if config.bank is not None else None
+    bank = _open_bank(config.bank) if config.bank is not None else None
     search = _shared_search(bank, config.matching) if bank is not None else None
     period_s, baseline_frames = config.frame_period_s, config.baseline_frames
     if calibration.sides:
@@ -181,7 +182,13 @@ def _session(calibration: Calibration, config: FingertipConfig) -> Session:
     )
 
 
-def _shared_search(bank: Bank, matching: str) -> "BankSearch":
+def _open_bank(path: Path) -> "Bank":
+    from shearloop.bank.bank_file import Bank
+
+    return Bank.open(path)
+
+
+def _shared_search(bank: "Bank", matching: str) -> "BankSearch":
     """Return the search of a bank, the one that another fingertip uses already where there is one."""
     # Only a rig with a bank loads what searches it.
     from shearloop.bank.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher

@@ -121,7 +121,7 @@ def test_a_repeated_frame_is_read_once(tmp_path):
 def test_each_experiment_has_a_file_with_its_name(tmp_path):
     recorder = Recorder(tmp_path, IDENTITY, Clock())
     recorder.record_message("load.torque", torque(0))
-    recorder.record_experiment("Hold 0.10 N·m", (AttachedFile("hold.yaml", "application/yaml", b"name: hold"),))
+    recorder.record_experiment("Hold 0.10 N·m", Path("hold.yaml"), b"name: hold")
     recorder.record_message("load.torque", torque(1))
     recorder.write()
     recorder.record_experiment("again")

@@ -198,9 +198,9 @@ def make_gripper(
     client, calibration = make_gripper_client(config, patience), gripper_calibration(config)
     measured = measured_widths(supplied, config.model) if config.calibration is None else None
     calibration = measured or calibration
-    hand = RobotiqGripper(client, calibration, monitor=LinkMonitor(LinkReporter("gripper", loop)))
+    gripper = RobotiqGripper(client, calibration, monitor=LinkMonitor(LinkReporter("gripper", loop)))
     measures = config.calibration is not None or measured is not None
-    return GripperTask(hand, publisher, loop, FingertipDiameters(COMBINED), clock, measures)
+    return GripperTask(gripper, publisher, loop, FingertipDiameters(COMBINED), clock, measures)
 
 
 @dataclass

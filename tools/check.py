@@ -183,11 +183,13 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
             load_cell_calibration(cell)
             own = f"calibration {cell.calibration}" if cell.calibration else "torques in N·m from the board"
             parts.texts["load_cell"] = own
-    if (hand := config.gripper) is not None:
+    if (gripper := config.gripper) is not None:
         with parts.of("gripper"):
-            gripper_calibration(hand)
-            own = f"calibration {hand.calibration}" if hand.calibration else "widths by the manufacturer's figures"
-            parts.texts["gripper"] = f"{hand.model}, {own}"
+            gripper_calibration(gripper)
+            own = (
+                f"calibration {gripper.calibration}" if gripper.calibration else "widths by the manufacturer's figures"
+            )
+            parts.texts["gripper"] = f"{gripper.model}, {own}"
     with parts.of("robot"):
         if (settings := configured_settings(config)) is not None:
             if lines := why_not_driven(config, settings):

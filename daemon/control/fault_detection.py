@@ -14,7 +14,7 @@ from shearloop.daemon.torques import TorqueSample, TorqueSource
 
 # 2.5 periods of their topics.
 ARM_STALE_S = stale_after_s("robot.state")
-HAND_STALE_S = stale_after_s("gripper.state")
+GRIPPER_STALE_S = stale_after_s("gripper.state")
 # The loop decides on each of the robot's states; a longer interval is late.
 LONGEST_TICK_S = 0.02
 # A loop later than this turned the wrist on a stale state.
@@ -231,7 +231,7 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
 
 def _gripper_faults(gripper: GripperStatus, watched: Watched, t_ns: int) -> list[Fault]:
     age_s = (t_ns - gripper.t_ns) / 1e9
-    if age_s > watched.patience * HAND_STALE_S:
+    if age_s > watched.patience * GRIPPER_STALE_S:
         silent = f"the gripper last reported its state {age_s:.1f} s ago"
         return [Fault(FaultCode.STATE_STALE, silent, t_ns=gripper.t_ns)]
     if gripper.fault:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import GripStep, Opening, opening
-from shearloop.daemon.control.fault_detection import HAND_STALE_S
+from shearloop.daemon.control.fault_detection import GRIPPER_STALE_S
 from shearloop.daemon.control.finger_motion import FingerMotion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.inputs import GripperStatus
@@ -150,7 +150,7 @@ class GripperTask:
     def held_tool(self, t_ns: int) -> Measured | None:
         """Return the diameter in mm of the held tool at t_ns, or None."""
         state = self.gripper.latest
-        if state is None or not self.measures_diameters or t_ns - state.t_ns > HAND_STALE_S * 1e9:
+        if state is None or not self.measures_diameters or t_ns - state.t_ns > GRIPPER_STALE_S * 1e9:
             return None
         return gripped_diameter(state)
 

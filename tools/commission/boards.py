@@ -16,7 +16,7 @@ from shearloop.drivers.load_cell import LoadSample
 from shearloop.errors import UserError
 from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.context import Context
-from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GRIP_N, close_fingers, open_fingers
+from shearloop.tools.commission.fingers import FINGERS_MM_PER_S, GRIP_N, close_fingers, open_fingers
 from shearloop.tools.commission.limits import REAL
 from shearloop.tools.commission.listening import SILENT_S
 from shearloop.tools.commission.operator import Played
@@ -98,18 +98,18 @@ def _clocks(
     """Return the lines on the clocks, with a tool in the grip that the operator presses."""
     context.operator.act("Put the tool on the load cell's lever, between the open fingers", put_between(context))
     with ExitStack() as opened:
-        hand = opened.enter_context(context.rig.hand()) if context.config.gripper is not None else None
-        if hand is not None:
+        gripper = opened.enter_context(context.rig.gripper()) if context.config.gripper is not None else None
+        if gripper is not None:
             context.operator.allow(
                 f"the fingers close onto the tool at {FINGERS_MM_PER_S:g} mm/s with at most {GRIP_N:g} N, and open "
                 "after the press"
             )
-            hand.activate()
-            if close_fingers(hand, GRIP_N).diameter_mm is None:
+            gripper.activate()
+            if close_fingers(gripper, GRIP_N).diameter_mm is None:
                 raise UserError("the gripper holds nothing: put the tool between its fingers, and run the stage again")
         lines = _press(context, fingertips, load)
-        if hand is not None:
-            open_fingers(hand, GRIP_N)
+        if gripper is not None:
+            open_fingers(gripper, GRIP_N)
     return lines
 
 

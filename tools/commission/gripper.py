@@ -10,7 +10,7 @@ from shearloop.drivers.robotiq.gripper import ACTIVATION_DEADLINE_NS, PAUSE_NS, 
 from shearloop.drivers.robotiq.messages import GripperState
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.tools.commission.context import Context
-from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GENTLE_N, Hand, close_fingers, open_fingers
+from shearloop.tools.commission.fingers import FINGERS_MM_PER_S, GENTLE_N, Gripper, close_fingers, open_fingers
 from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged, percentile_99
 
@@ -33,16 +33,16 @@ def measure(context: Context) -> Measured:
         f"stroke of {model.stroke_mm:g} mm, at a speed of their own of up to {model.speed_mm_s[1]:g} mm/s; nothing is "
         "between them"
     )
-    with context.rig.hand() as hand:
-        lines = [_activation(context, hand), _exchanges(context, hand)]
-        width_line, supplies = judge_widths(_gauges(context, hand), config)
-        return Measured([*lines, width_line, *_objects(context, hand)], supplies)
+    with context.rig.gripper() as gripper:
+        lines = [_activation(context, gripper), _exchanges(context, gripper)]
+        width_line, supplies = judge_widths(_gauges(context, gripper), config)
+        return Measured([*lines, width_line, *_objects(context, gripper)], supplies)
 
 
-def _activation(context: Context, hand: Hand) -> Line:
+def _activation(context: Context, gripper: Gripper) -> Line:
     """Activate the gripper, and return the line on the time that it took."""
     begun_ns = context.clock.now_ns()
-    hand.activate(operator_confirmed=True)
+    gripper.activate(operator_confirmed=True)
     time_s = (context.clock.now_ns() - begun_ns) / 1e9
     return judged(
         "activation",
@@ -53,12 +53,12 @@ def _activation(context: Context, hand: Hand) -> Line:
     )
 
 
-def _exchanges(context: Context, hand: Hand) -> Line:
+def _exchanges(context: Context, gripper: Gripper) -> Line:
     """Return the line on the time of an exchange, as the daemon has it ten times a second."""
     times_s = []
     for _ in range(context.counts.exchanges):
         begun_ns = context.clock.now_ns()
-        hand.poll()
+        gripper.poll()
         times_s.append((context.clock.now_ns() - begun_ns) / 1e9)
     return judge_exchanges(times_s, context.limits.longest_exchange_s)
 
@@ -76,28 +76,28 @@ def judge_exchanges(times_s: Sequence[float], longest_s: float) -> Line:
     )
 
 
-def _gauges(context: Context, hand: Hand) -> list[tuple[float, float]]:
+def _gauges(context: Context, gripper: Gripper) -> list[tuple[float, float]]:
     """Return (counts, mm) of gauges that the gripper held."""
     gauges = []
     for number in range(1, context.counts.gauges + 1):
         question = f"Hold gauge {number} of {context.counts.gauges} between the fingers; its width in mm"
-        for_instance_mm = hand.model.stroke_mm * (number - 0.5) / context.counts.gauges
+        for_instance_mm = gripper.model.stroke_mm * (number - 0.5) / context.counts.gauges
         played = Played(
             f"a gauge as wide as you type is held for you, for instance {for_instance_mm:g}", ("object {}",)
         )
-        width_mm = context.operator.number(question, 0.5, hand.model.stroke_mm, played)
-        state = _close_and_open(context, hand, f"gauge {number}")
+        width_mm = context.operator.number(question, 0.5, gripper.model.stroke_mm, played)
+        state = _close_and_open(context, gripper, f"gauge {number}")
         gauges.append((float(state.position_counts), width_mm))
     return gauges
 
 
-def _close_and_open(context: Context, hand: Hand, what: str) -> GripperState:
+def _close_and_open(context: Context, gripper: Gripper, what: str) -> GripperState:
     """Close onto something, open again, and return the closed gripper's state."""
     context.operator.allow(
         f"the fingers close at {FINGERS_MM_PER_S:g} mm/s with at most {GENTLE_N:g} N onto {what}, then open"
     )
-    closed = close_fingers(hand)
-    open_fingers(hand)
+    closed = close_fingers(gripper)
+    open_fingers(gripper)
     return closed
 
 
@@ -114,18 +114,18 @@ def judge_widths(gauges: Sequence[tuple[float, float]], config: GripperConfig) -
     return line, Supplied(widths=tuple(gauges)) if passed else Supplied()
 
 
-def _objects(context: Context, hand: Hand) -> list[Line]:
+def _objects(context: Context, gripper: Gripper) -> list[Line]:
     """Return the lines on objects that are held, and on nothing that is held."""
     count, seen = context.counts.objects, 0
     for number in range(1, count + 1):
-        width_mm = hand.model.stroke_mm * _OBJECTS[(number - 1) % len(_OBJECTS)]
+        width_mm = gripper.model.stroke_mm * _OBJECTS[(number - 1) % len(_OBJECTS)]
         context.operator.act(
             f"Hold object {number} of {count} between the fingers: a thin, a thick, a soft, a hard one",
             Played(f"a hard object of {width_mm:g} mm is held for you", (f"object {width_mm:g}",)),
         )
-        seen += _close_and_open(context, hand, f"object {number}").diameter_mm is not None
+        seen += _close_and_open(context, gripper, f"object {number}").diameter_mm is not None
     context.operator.act("Take everything out of the gripper", Played("it is taken out for you", ("object none",)))
-    empty = _close_and_open(context, hand, "nothing").diameter_mm is None
+    empty = _close_and_open(context, gripper, "nothing").diameter_mm is None
     return [
         judged(
             "objects that are detected",

@@ -24,7 +24,7 @@ from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.tools.commission.arrivals import REAL_CLOCK, Arrivals, Clock
-from shearloop.tools.commission.hand import ConnectedHand, Hand
+from shearloop.tools.commission.fingers import ConnectedGripper, Gripper
 from shearloop.tools.commission.listening import BoardListener
 from shearloop.tools.commission.mover import Mover, MoverProcess
 from shearloop.tools.commission.observer import Observer
@@ -54,7 +54,7 @@ class Rig(Protocol):
     def mover(self, settings: UrSettings) -> AbstractContextManager[Mover]:
         """Return what drives the robot within the limits of these settings."""
 
-    def hand(self) -> AbstractContextManager[Hand]:
+    def gripper(self) -> AbstractContextManager[Gripper]:
         """Return the configured gripper."""
 
     def load_cell(self) -> AbstractContextManager[Arrivals[LoadSample]]:
@@ -102,13 +102,13 @@ class ConnectedRig:
         """Return the process that drives the robot."""
         return MoverProcess(settings)
 
-    def hand(self) -> ConnectedHand:
+    def gripper(self) -> ConnectedGripper:
         """Return the configured gripper."""
         config = self._config.gripper
         if config is None:
             raise ValueError("the configuration has no gripper")
         client = make_gripper_client(config, patience_of(self._config))
-        return ConnectedHand(RobotiqGripper(client, gripper_calibration(config)))
+        return ConnectedGripper(RobotiqGripper(client, gripper_calibration(config)))
 
     def load_cell(self) -> BoardListener[LoadSample]:
         """Return the trusted samples of the configured load cell."""

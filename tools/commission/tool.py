@@ -15,7 +15,7 @@ from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.boards import put_between
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.curves import Curve, middle_s
-from shearloop.tools.commission.hand import FINGERS_MM_PER_S, GRIP_N, close_fingers, open_fingers
+from shearloop.tools.commission.fingers import FINGERS_MM_PER_S, GRIP_N, close_fingers, open_fingers
 from shearloop.tools.commission.listening import SILENT_S
 from shearloop.tools.commission.motion import TURN_RAD
 from shearloop.tools.commission.operator import Played
@@ -109,14 +109,14 @@ def _grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
         f"{GRIP_N:g} N, and stay closed; a gripper that lost its power, as in stage 4, opens and closes once before"
     )
     diameters_mm = []
-    with context.rig.hand() as hand:
-        hand.activate()
-        open_fingers(hand, GRIP_N)
+    with context.rig.gripper() as gripper:
+        gripper.activate()
+        open_fingers(gripper, GRIP_N)
         for sensor in tactile:
             sensor.tare(context.clock.now_ns())
         for _ in range(count):
-            open_fingers(hand, GRIP_N)
-            closed = close_fingers(hand, GRIP_N)
+            open_fingers(gripper, GRIP_N)
+            closed = close_fingers(gripper, GRIP_N)
             if closed.diameter_mm is None:
                 raise UserError("the gripper holds nothing: put the tool between its fingers, and run the stage again")
             diameters_mm.append(closed.diameter_mm)

@@ -12,7 +12,7 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control import gripper_task
 from shearloop.daemon.control.experiment_schema import GripStep, opening
-from shearloop.daemon.control.fault_detection import HAND_STALE_S
+from shearloop.daemon.control.fault_detection import GRIPPER_STALE_S
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.inputs import GripperStatus
@@ -245,7 +245,7 @@ async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path):
         tool = task.held_tool(state.t_ns)
         assert tool.half_width == pytest.approx(TWO_SIDED_95 * state.width_std_mm)
         assert abs(tool.value - 40.0) < tool.half_width
-        assert task.held_tool(state.t_ns + round(HAND_STALE_S * 1e9) + 1) is None
+        assert task.held_tool(state.t_ns + round(GRIPPER_STALE_S * 1e9) + 1) is None
         assert task_of(rig, measures_diameters=False).held_tool(state.t_ns) is None, "the maker's widths are no gauge"
         await task.release()
         assert task.held_tool((await rig.driver.read()).t_ns) is None

@@ -214,7 +214,7 @@ class SimulatedMover(Mover):
             self._daemon_runs = False
 
 
-class SimulatedHand:
+class SimulatedGripper:
     """The gripper's registers, written and read."""
 
     def __init__(self, rig: "SimulatedRig") -> None:
@@ -420,8 +420,8 @@ class SimulatedRig:
             self._mover.kill()
 
     @contextlib.contextmanager
-    def hand(self) -> Iterator[SimulatedHand]:
-        yield SimulatedHand(self)
+    def gripper(self) -> Iterator[SimulatedGripper]:
+        yield SimulatedGripper(self)
 
     @contextlib.contextmanager
     def load_cell(self) -> Iterator[Arrivals[LoadSample]]:

@@ -14,7 +14,7 @@ GENTLE_N: Final = 20.0
 GRIP_N: Final = 60.0
 
 
-class Hand(Protocol):
+class Gripper(Protocol):
     """A connected gripper."""
 
     @property
@@ -31,7 +31,7 @@ class Hand(Protocol):
         """Move the fingers, and return the state at their target or on an object."""
 
 
-class ConnectedHand(Opened):
+class ConnectedGripper(Opened):
     """The gripper through its driver; a context, which opens and closes the connection. A grip stays."""
 
     def __init__(self, gripper: RobotiqGripper) -> None:
@@ -69,11 +69,11 @@ class ConnectedHand(Opened):
         return await self._gripper.finish(await self._gripper.move(command))
 
 
-def open_fingers(hand: Hand, force_n: float = GENTLE_N) -> None:
+def open_fingers(gripper: Gripper, force_n: float = GENTLE_N) -> None:
     """Open the fingers over the whole stroke."""
-    hand.move(GripperCommand(hand.model.stroke_mm, FINGERS_MM_PER_S, force_n))
+    gripper.move(GripperCommand(gripper.model.stroke_mm, FINGERS_MM_PER_S, force_n))
 
 
-def close_fingers(hand: Hand, force_n: float = GENTLE_N) -> GripperState:
+def close_fingers(gripper: Gripper, force_n: float = GENTLE_N) -> GripperState:
     """Close the fingers, onto something if it is there, and return the state."""
-    return hand.move(GripperCommand(0.0, FINGERS_MM_PER_S, force_n))
+    return gripper.move(GripperCommand(0.0, FINGERS_MM_PER_S, force_n))

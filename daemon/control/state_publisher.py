@@ -8,7 +8,9 @@ import structlog
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import Experiment
+from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.safety import FaultCode, Response
+from shearloop.daemon.control.torque_controller import TorqueController
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage, cause_of
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.ur.messages import RobotState
@@ -118,38 +120,19 @@ def _log(message: LoopState, now: _LogKey, before: _LogKey | None) -> None:
 
 def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) -> LoopState:
     """Return the `loop.state` message at now_ns."""
-    status, experiment = control_loop.status, control_loop.experiment
+    status, experiment, wrist = control_loop.status, control_loop.experiment, control_loop.wrist
     driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
-    if latest is not None and now_ns - latest.t_ns > 1e9 * control_loop.wrist.source.fresh_s(control_loop.config):
+    if latest is not None and now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s(control_loop.config):
         latest = None
-    controller = control_loop.wrist.controller
-    tool = control_loop.wrist.tool
     return LoopState(
         source="loop",
         t_mono_ns=now_ns,
         phase=status.phase,
         run=control_loop.runs,
-        experiment=experiment.file.name if experiment is not None else "",
-        step=experiment.step_number if experiment is not None else 0,
-        steps=len(experiment.file.steps) if experiment is not None else 0,
-        step_name=experiment.step.do if experiment is not None else "",
-        slices=experiment.file.slices or "" if experiment is not None else "",
-        hold=experiment.command.hold_number if experiment is not None else 0,
         activity=status.activity,
-        progress=experiment.progress if experiment is not None else 0.0,
-        remaining_s=experiment.remaining_s if experiment is not None else 0.0,
-        tool_mm=experiment.file.tool_mm if experiment is not None else None,
         torque_source=driving,
         torque_nm=latest.torque_nm if latest is not None else None,
-        torque_limit_nm=experiment.limits.torque_nm if experiment is not None else None,
-        set_point_nm=controller.set_point_nm if controller is not None else None,
-        ramp_nm=controller.ramp_nm if controller is not None else None,
-        filtered_torque_nm=controller.torque_nm if controller is not None else None,
-        filtered_torque_std_nm=controller.torque_std_nm if controller is not None else None,
-        stiffness_nm_per_rad=tool.stiffness_nm_per_rad if tool is not None else None,
-        delay_s=tool.age_s + tool.significant_lag_s if tool is not None else None,
-        noise_nm=tool.noise_nm if tool is not None else None,
         speed_command_rad_per_s=status.velocity.speed_rad_per_s,
         speed_sent_rad_per_s=sent_rad_per_s,
         response=status.decision.response.name.lower().replace("_", " "),
@@ -157,4 +140,50 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         cause=next(iter(status.decision.reasons), ""),
         faults=status.decision.codes,
         reasons=" ".join((*status.decision.reasons, *status.velocity.reasons)),
+        **_of_experiment(experiment),
+        **_of_controller(wrist.controller),
+        **_of_tool(wrist.tool),
     )
+
+
+def _of_experiment(experiment: Experiment | None) -> dict[str, Any]:
+    """Return the keys of `loop.state` that an experiment has."""
+    if experiment is None:
+        nowhere = {"step": 0, "steps": 0, "step_name": "", "hold": 0, "progress": 0.0, "remaining_s": 0.0}
+        return {"experiment": "", "slices": "", "tool_mm": None, "torque_limit_nm": None, **nowhere}
+    file = experiment.file
+    return {
+        "experiment": file.name,
+        "slices": file.slices or "",
+        "tool_mm": file.tool_mm,
+        "torque_limit_nm": experiment.limits.torque_nm,
+        "step": experiment.step_number,
+        "steps": len(file.steps),
+        "step_name": experiment.step.do,
+        "hold": experiment.command.hold_number,
+        "progress": experiment.progress,
+        "remaining_s": experiment.remaining_s,
+    }
+
+
+def _of_controller(controller: TorqueController | None) -> dict[str, Any]:
+    """Return the keys of `loop.state` that a closed loop has."""
+    if controller is None:
+        return dict.fromkeys(("set_point_nm", "ramp_nm", "filtered_torque_nm", "filtered_torque_std_nm"))
+    return {
+        "set_point_nm": controller.set_point_nm,
+        "ramp_nm": controller.ramp_nm,
+        "filtered_torque_nm": controller.torque_nm,
+        "filtered_torque_std_nm": controller.torque_std_nm,
+    }
+
+
+def _of_tool(tool: ToolModel | None) -> dict[str, Any]:
+    """Return the keys of `loop.state` that an identified tool has."""
+    if tool is None:
+        return dict.fromkeys(("stiffness_nm_per_rad", "delay_s", "noise_nm"))
+    return {
+        "stiffness_nm_per_rad": tool.stiffness_nm_per_rad,
+        "delay_s": tool.age_s + tool.significant_lag_s,
+        "noise_nm": tool.noise_nm,
+    }

@@ -1,10 +1,10 @@
 """The frames, torques and tools of a recording as arrays, for whoever fits or judges an estimator."""
 
-from collections import Counter
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,74 +75,99 @@ def _detail(error: Exception) -> str:
     return f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
 
 
+@dataclass(slots=True)
+class _Messages:
+    """What the messages of a recording give, in the order of their times (Unix ns)."""
+
+    n_line_values: int
+    frames: dict[str, list[_Row]] = field(default_factory=dict)
+    # By side, the numbers of the frames during which the fingers moved.
+    moved: defaultdict[str, set[int]] = field(default_factory=lambda: defaultdict(set))
+    torques: list[tuple[int, float]] = field(default_factory=list)
+    tools: list[tuple[int, Measured | None]] = field(default_factory=list)
+    # By side, the frames that the board has sent again.
+    repeated: Counter[str] = field(default_factory=Counter)
+    # The readings of the load cell that are not valid, and why the last one is not.
+    distrusted: int = 0
+    why: str = ""
+
+    def add_load(self, t_ns: int, content: Mapping[str, Any]) -> None:
+        """Take a reading of the load cell."""
+        if "torque_nm" in content and content.get("valid", True):
+            self.torques.append((t_ns, float(content["torque_nm"])))
+        else:
+            self.distrusted += 1
+            self.why = str(content.get("reason") or self.why)
+
+    def add_frame(self, side: str, t_ns: int, content: Mapping[str, Any]) -> None:
+        """Take a frame of a side; raises ValueError for one of another size."""
+        line = content["line"]
+        if len(line) != self.n_line_values:
+            raise ValueError(f"a line of {len(line)} values")
+        rows = self.frames.setdefault(side, [])
+        if rows and rows[-1].line == line:
+            self.repeated[side] += 1
+        else:
+            rows.append(_Row(t_ns, line, content.get("frame")))
+
+    def add_input(self, side: str, t_ns: int, content: Mapping[str, Any]) -> None:
+        """Take what a side's estimator got besides frames."""
+        if content["kind"] == InputKind.TOOL.value:
+            self.tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
+        elif content["kind"] == InputKind.MOVED.value:
+            self.moved[side].add(moved_from_bytes(schema.input_event(content).data))
+
+    def left_out(self) -> Iterator[str]:
+        """Yield how many readings of the load cell, and frames of each side, were not read, and why."""
+        if self.distrusted:
+            example = f", e.g. {self.why}" if self.why else ""
+            readings = counted(len(self.torques) + self.distrusted, "reading")
+            yield f"{self.distrusted} of {readings} of the load cell, not valid{example}"
+        for side, number in self.repeated.items():
+            yield f"{counted(number, 'frame')} of the {side} side, repeated by the board"
+
+
 def read_recording(path: str | Path) -> Recording:
     """Read the frames, torques and tools of a recording; raises UserError for a file that cannot be used."""
     path = Path(path)
-    frames: dict[str, list[_Row]] = {}
-    moved: dict[str, set[int]] = {}
-    torques: list[tuple[int, float]] = []
-    tools: list[tuple[int, Measured | None]] = []
-    repeated, distrusted, why = Counter[str](), 0, ""
     with open_recording(path) as recording:
         identity, table, metadata = recording.identity, recording.table, recording.metadata
         prefix = f"{schema.FRAME_TOPIC}."
         sides = {topic: topic.removeprefix(prefix) for topic in recording.counts if topic.startswith(prefix)}
-        inputs = [schema.input_topic(side) for side in sides.values()]
-        live = bool(inputs) and recording.counts.keys() >= {*inputs}
+        inputs = {schema.input_topic(side): side for side in sides.values()}
+        live = bool(inputs) and recording.counts.keys() >= inputs.keys()
+        found = _Messages(table.n_line_values)
         for channel, message in recording.messages([schema.LOAD_TOPIC, *sides, *inputs]):
             topic, t_ns = channel.topic, message.log_time
             try:
                 content = dict(from_json(message.data))
                 if topic == schema.LOAD_TOPIC:
-                    if "torque_nm" in content and content.get("valid", True):
-                        torques.append((t_ns, float(content["torque_nm"])))
-                    else:
-                        distrusted, why = distrusted + 1, str(content.get("reason") or why)
+                    found.add_load(t_ns, content)
                 elif topic in sides:
-                    line = content["line"]
-                    if len(line) != table.n_line_values:
-                        raise ValueError(f"a line of {len(line)} values")
-                    rows = frames.setdefault(sides[topic], [])
-                    # The board repeated an old frame.
-                    if not rows or rows[-1].line != line:
-                        rows.append(_Row(t_ns, line, content.get("frame")))
-                    else:
-                        repeated[sides[topic]] += 1
-                elif content["kind"] == InputKind.TOOL.value:
-                    tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
-                elif content["kind"] == InputKind.MOVED.value:
-                    side = topic.removeprefix(schema.input_topic(""))
-                    moved.setdefault(side, set()).add(moved_from_bytes(schema.input_event(content).data))
+                    found.add_frame(sides[topic], t_ns, content)
+                else:
+                    found.add_input(inputs[topic], t_ns, content)
             except (KeyError, TypeError, ValueError) as error:
                 raise unusable(path, f"a message on {topic} does not match its schema ({_detail(error)})") from error
     with reading(path):
-        side_frames = {side: _side_frames(rows, moved.get(side, set())) for side, rows in frames.items()}
+        side_frames = {side: _side_frames(rows, found.moved[side]) for side, rows in found.frames.items()}
     notes = {key: value for key, value in identity.items() if key not in _IDENTITY_KEYS}
     experiment = metadata.get(schema.EXPERIMENT_METADATA, {})
     if schema.DIAMETER_NOTE in experiment:
         notes[schema.DIAMETER_NOTE] = experiment[schema.DIAMETER_NOTE]
     return Recording(
-        path,
-        notes.pop("source", ""),
-        notes,
-        side_frames,
-        np.array([t for t, _ in torques], dtype=np.int64),
-        np.array([torque for _, torque in torques], dtype=np.float64),
-        tuple(tools),
-        table,
-        live,
-        tuple(_left_out(distrusted, len(torques) + distrusted, why, repeated)),
-        schema.EMULATED in identity,
+        path=path,
+        source=notes.pop("source", ""),
+        notes=notes,
+        sides=side_frames,
+        torque_t_ns=np.array([t_ns for t_ns, _ in found.torques], dtype=np.int64),
+        torque_nm=np.array([torque_nm for _, torque_nm in found.torques], dtype=np.float64),
+        tools=tuple(found.tools),
+        table=table,
+        live=live,
+        left_out=tuple(found.left_out()),
+        emulated=schema.EMULATED in identity,
     )
-
-
-def _left_out(distrusted: int, torques: int, why: str, repeated: Counter[str]) -> Iterator[str]:
-    """Yield how many readings of the load cell, and frames of each side, were not read, and why."""
-    if distrusted:
-        example = f", e.g. {why}" if why else ""
-        yield f"{distrusted} of {counted(torques, 'reading')} of the load cell, not valid{example}"
-    for side, number in repeated.items():
-        yield f"{counted(number, 'frame')} of the {side} side, repeated by the board"
 
 
 def _side_frames(rows: list[_Row], moved: Collection[int]) -> SideFrames:

@@ -21,7 +21,8 @@ from shearloop.estimation import Calibration, FrameSeries, adapt, measure_timing
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import DEFAULT
 from shearloop.estimation.gain import GainSpread
-from shearloop.tools.evaluate import EstimateTrack, Figures, estimate_series, figures_by_load
+from shearloop.tools.estimate_tracks import EstimateTrack, estimate_series
+from shearloop.tools.figures import Figures, figures_by_load
 from shearloop.tools.frame_series import series_of
 from shearloop.tools.leave_out import Plan, Recipe, fit_without, plan_left_out
 from shearloop.tools.left_out_blocks import Block, Kind

@@ -27,7 +27,8 @@ from shearloop.studies.emulated_calibration import calibrate, record
 from shearloop.studies.slices.evaluate import estimate_slices
 from shearloop.studies.slices.fitting import fit_slices
 from shearloop.studies.slices.series import SliceSeries, read_slices
-from shearloop.tools.evaluate import EstimateTrack, Figures, estimate_series, figures_by_load, figures_of
+from shearloop.tools.estimate_tracks import EstimateTrack, estimate_series
+from shearloop.tools.figures import Figures, figures_by_load, figures_of
 from shearloop.tools.frame_series import part_of, series_of
 from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import import_mat

@@ -24,7 +24,7 @@ from shearloop.estimation import Calibration, FrameSeries, Session, fit, measure
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import DEFAULT
 from shearloop.estimation.load_delay import TRUSTED
-from shearloop.tools.evaluate import EstimateTrack, estimate_series, values_of
+from shearloop.tools.estimate_tracks import EstimateTrack, estimate_series, values_of
 from shearloop.tools.frame_series import series_of
 from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import import_mat

@@ -24,7 +24,9 @@ from shearloop.tools.outputs import writing
 from shearloop.words import counted
 
 if TYPE_CHECKING:
-    from shearloop.tools.evaluate import EstimateTrack, Evaluation, Figures
+    from shearloop.tools.estimate_tracks import EstimateTrack
+    from shearloop.tools.evaluate import Evaluation
+    from shearloop.tools.figures import Figures
     from shearloop.tools.leave_out import Plan
 
 _FIGURES = (".png", ".svg", ".pdf")
@@ -84,7 +86,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and draw on request."""
     from shearloop.cli.options import judges_slices, read_judged
-    from shearloop.tools.evaluate import evaluate_recordings, figures_by_load, figures_of, write_estimates
+    from shearloop.tools.evaluate import evaluate_recordings, write_estimates
+    from shearloop.tools.figures import figures_by_load, figures_of
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
 
@@ -131,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _status(tracks: "Sequence[EstimateTrack]") -> int:
     """Return the exit status; 1, with the reason, where no frame was judged."""
-    from shearloop.tools.evaluate import judged_frames
+    from shearloop.tools.figures import judged_frames
 
     if any(judged_frames(track).any() for track in tracks):
         return 0
@@ -161,7 +164,8 @@ def _refuse_recipe(args: argparse.Namespace) -> None:
 
 def _leave_out(args: argparse.Namespace) -> int:
     """Judge a recipe on the blocks left out of each fit, and print the figures."""
-    from shearloop.tools.evaluate import figures_by_load, figures_of, write_estimates
+    from shearloop.tools.evaluate import write_estimates
+    from shearloop.tools.figures import figures_by_load, figures_of
     from shearloop.tools.leave_out import sentences_of
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
@@ -255,7 +259,7 @@ def _invalid_lines(tracks: "Sequence[EstimateTrack]") -> list[str]:
 
 
 def _draw(found: "Evaluation", out: Path) -> None:
-    from shearloop.tools.evaluate import draw_tracks
+    from shearloop.tools.evaluation_figure import draw_tracks
 
     tracks = found.tracks
     names = [f"{path.name}, {' and '.join(one.series.sides)}" for path, one in zip(found.paths, tracks, strict=True)]

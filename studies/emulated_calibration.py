@@ -27,7 +27,8 @@ from shearloop.emulators.synthetic_frames import RigFrames
 from shearloop.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.tools.bank_config import load_bank_plan
 from shearloop.tools.banks import is_built
-from shearloop.tools.evaluate import estimate_series, figures_of
+from shearloop.tools.estimate_tracks import estimate_series
+from shearloop.tools.figures import figures_of
 from shearloop.tools.frame_series import series_of
 from shearloop.tools.outputs import progress_bar, writing
 from shearloop.tools.parallel import processors

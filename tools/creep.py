@@ -8,7 +8,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.creep import Creep
 from shearloop.errors import UserError
-from shearloop.tools.evaluate import EstimateTrack, values_of
+from shearloop.tools.estimate_tracks import EstimateTrack, values_of
 
 # A longer time without a torque ends a grip; single invalid frames do not.
 LONGEST_GAP_S = 5.0

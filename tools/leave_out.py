@@ -16,14 +16,8 @@ from shearloop.bank.mesh import load_mesh
 from shearloop.estimation import Calibration, FrameSeries, LoadTiming, Physics, adapt, fit
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.tools.evaluate import (
-    EstimateTrack,
-    Figures,
-    estimate_series,
-    figures_by_load,
-    figures_of,
-    no_better_than_clock,
-)
+from shearloop.tools.estimate_tracks import EstimateTrack, estimate_series
+from shearloop.tools.figures import Figures, figures_by_load, figures_of, no_better_than_clock
 from shearloop.tools.frame_series import Series
 from shearloop.tools.left_out_blocks import Block, Kind, after_twists, find_blocks, kept, number_of_grips, tools_of
 from shearloop.tools.parallel import Executor

@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     """Estimate every frame, fit, and print the line for the configuration."""
     from shearloop.bank.bank_file import Bank
     from shearloop.tools.creep import fit_creep, grips_of
-    from shearloop.tools.evaluate import estimate_series
+    from shearloop.tools.estimate_tracks import estimate_series
     from shearloop.tools.frame_series import check_no_copies
 
     judges_slices(args.calibration, args.recordings)

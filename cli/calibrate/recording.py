@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from shearloop.estimation import Calibration, Physics
     from shearloop.estimation.interval_regressor import IntervalRegressor
     from shearloop.tools.calibrate import CalibrationResult
-    from shearloop.tools.evaluate import EstimateTrack
+    from shearloop.tools.estimate_tracks import EstimateTrack
     from shearloop.tools.leave_out import Plan
 
 # The refits without each block may take about this long, estimated from the time of one fit.
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 def _calibrate_recordings(args: argparse.Namespace, physics: "Physics") -> tuple[dict[str, object], list[str]]:
     """Write a calibration on recordings; return its figures, and what the user should know of it."""
     from shearloop.tools.calibrate import calibrate
-    from shearloop.tools.evaluate import estimate_series
+    from shearloop.tools.estimate_tracks import estimate_series
     from shearloop.tools.leave_out import MEAN_TWIST, Recipe, advice_unjudged, plan_left_out
     from shearloop.tools.left_out_blocks import usual_kind
 

@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from shearloop.daemon.messaging.keys import ClientKeys
     from shearloop.estimation import Calibration, Estimate, FrameSeries, Physics, Session, TactileFrame, fit
     from shearloop.studies.emulated_calibration import emulate_recordings
-    from shearloop.tools.evaluate import estimate_series, figures_by_load
+    from shearloop.tools.estimate_tracks import estimate_series
+    from shearloop.tools.figures import figures_by_load
     from shearloop.tools.frame_series import read_series
     from shearloop.tools.recordings.tables import read
 
@@ -76,8 +77,8 @@ _HOMES = {
     "Subscriber": "shearloop.daemon.messaging.client:Subscriber",
     "TactileFrame": "shearloop.estimation:TactileFrame",
     "emulate_recordings": "shearloop.studies.emulated_calibration:emulate_recordings",
-    "estimate_series": "shearloop.tools.evaluate:estimate_series",
-    "figures_by_load": "shearloop.tools.evaluate:figures_by_load",
+    "estimate_series": "shearloop.tools.estimate_tracks:estimate_series",
+    "figures_by_load": "shearloop.tools.figures:figures_by_load",
     "fit": "shearloop.estimation:fit",
     "read": "shearloop.tools.recordings.tables:read",
     "read_series": "shearloop.tools.frame_series:read_series",

@@ -23,7 +23,7 @@ from shearloop.studies.slices.reader import SliceReader
 from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.bank_design import residual_noise
 from shearloop.tools.drawing import figure, look
-from shearloop.tools.evaluate import values_of
+from shearloop.tools.estimate_tracks import values_of
 from shearloop.tools.parallel import Executor
 
 

@@ -33,7 +33,7 @@ from shearloop.studies.slices.evaluate import estimate_slices
 from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools import drawing
 from shearloop.tools.drawing import LINES, MARKS, SHADES
-from shearloop.tools.evaluate import estimate_series, values_of
+from shearloop.tools.estimate_tracks import estimate_series, values_of
 
 _ESTIMATORS: tuple[EstimatorName, ...] = ("bank", "regression", "reconstruction", "motion_regression")
 RANKS = (4, 8, 16, 32, 64, 128)

@@ -42,7 +42,7 @@ from shearloop.studies.slices.reader import SliceReader
 from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.banks import Grid
 from shearloop.tools.drawing import figure, look, save, slug
-from shearloop.tools.evaluate import values_of
+from shearloop.tools.estimate_tracks import values_of
 from shearloop.tools.parallel import Executor
 
 AnyCalibration: TypeAlias = Calibration | SliceCalibration

@@ -13,7 +13,10 @@ from shearloop.estimation.defaults import LOADED_NM
 from shearloop.studies.slices.calibration import SliceCalibration
 from shearloop.studies.slices.reader import SliceReader
 from shearloop.studies.slices.series import SliceSeries, read_parts
-from shearloop.tools.evaluate import EstimateTrack, Evaluation, beats_clock, frames_of, known_data, loaded_text
+from shearloop.tools.estimate_tracks import EstimateTrack
+from shearloop.tools.evaluate import Evaluation, known_data
+from shearloop.tools.evaluation_figure import loaded_text
+from shearloop.tools.figures import Frames, beats_clock
 from shearloop.tools.parallel import Executor
 
 if TYPE_CHECKING:
@@ -72,12 +75,13 @@ def draw_slices(axes: "Axes", track: EstimateTrack, name: str) -> None:
     from matplotlib.ticker import MaxNLocator
 
     is_torque = not np.isfinite(track.series.diameter_mm).any()
-    truth, value, low, high, _ = frames_of(track, "torque" if is_torque else "diameter")
+    frames = Frames.of(track, "torque" if is_torque else "diameter")
     t_s = track.series.t_s
     known = "load cell" if is_torque else "known diameter"
-    axes.plot(t_s, truth, "ko", linewidth=1.0, markersize=5, label=known)
+    axes.plot(t_s, frames.truth, "ko", linewidth=1.0, markersize=5, label=known)
     shown = "estimate with its 95 % interval"
-    axes.errorbar(t_s, value, [value - low, high - value], fmt="s", markersize=4, label=shown)
+    ends = [frames.value - frames.low, frames.high - frames.value]
+    axes.errorbar(t_s, frames.value, ends, fmt="s", markersize=4, label=shown)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_title(name + (loaded_text(track) if is_torque else ""), loc="left", fontsize="medium")
     axes.set_xlabel("slice")

@@ -18,7 +18,8 @@ from shearloop.studies.slices.fitting import fit_slices
 from shearloop.studies.slices.levels import NEAR_LEVEL, later_levels
 from shearloop.studies.slices.profile import SliceProfile
 from shearloop.studies.slices.series import SliceSeries, torques_of
-from shearloop.tools.evaluate import EstimateTrack, figures_by_load
+from shearloop.tools.estimate_tracks import EstimateTrack
+from shearloop.tools.figures import figures_by_load
 from shearloop.tools.leave_out import NO_ESTIMATE, Judged, Plan, advice_of_coverage, fit_without
 from shearloop.tools.left_out_blocks import Block, Span, kept
 from shearloop.words import counted

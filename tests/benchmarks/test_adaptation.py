@@ -4,7 +4,7 @@ import pytest
 
 from benchmarks.adaptation import DRIFT, MARK, VARIANTS, Material, rows_of, shown, variants
 from shearloop.estimation import fit
-from shearloop.tools.evaluate import figures_by_load
+from shearloop.tools.figures import figures_by_load
 from shearloop.tools.leave_out import Recipe, plan_left_out
 from shearloop.tools.parallel import SerialExecutor
 from tests.estimation.conftest import twisting

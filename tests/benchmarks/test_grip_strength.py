@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.grip_strength import shown, strengths, without_check
 from shearloop.estimation import FrameSeries, fit
-from shearloop.tools.evaluate import estimate_series, values_of
+from shearloop.tools.estimate_tracks import estimate_series, values_of
 from tests.estimation.conftest import elastic, tip
 
 

@@ -5,7 +5,8 @@ import pytest
 
 from shearloop.estimation import TRUSTED, fit
 from shearloop.estimation.torque_profile import TorqueProfile
-from shearloop.tools.evaluate import estimate_series, figures_by_load
+from shearloop.tools.estimate_tracks import estimate_series
+from shearloop.tools.figures import figures_by_load
 from tests.estimation.conftest import twisting
 
 

@@ -11,7 +11,7 @@ from shearloop.emulators.scene import Twin, TwinSettings
 from shearloop.errors import UserError
 from shearloop.estimation import Estimate, FrameSeries
 from shearloop.tools.creep import Stretch, fit_creep, grips_of
-from shearloop.tools.evaluate import EstimateTrack
+from shearloop.tools.estimate_tracks import EstimateTrack
 
 PERIOD_S = 0.5412
 
@@ -119,7 +119,7 @@ def played(monkeypatch: pytest.MonkeyPatch, found: EstimateTrack) -> None:
     monkeypatch.setattr("shearloop.cli.calibrate.creep.judges_slices", lambda *_: False)
     monkeypatch.setattr("shearloop.estimation.Calibration.load", lambda _: loaded)
     monkeypatch.setattr("shearloop.tools.frame_series.read_series", lambda *_: [found.series])
-    monkeypatch.setattr("shearloop.tools.evaluate.estimate_series", lambda *_: found)
+    monkeypatch.setattr("shearloop.tools.estimate_tracks.estimate_series", lambda *_: found)
 
 
 def test_it_prints_the_line_of_the_configuration(monkeypatch, ran, tmp_path, result_of):

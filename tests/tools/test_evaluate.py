@@ -10,14 +10,9 @@ from hypothesis import strategies as st
 
 from shearloop.estimation import TRUSTED, Estimate, FrameSeries, fit
 from shearloop.estimation.session import FINGERS_MOVED
-from shearloop.tools.evaluate import (
-    EstimateTrack,
-    estimate_series,
-    evaluate_recordings,
-    figures_by_load,
-    figures_of,
-    write_estimates,
-)
+from shearloop.tools.estimate_tracks import EstimateTrack, estimate_series
+from shearloop.tools.evaluate import evaluate_recordings, write_estimates
+from shearloop.tools.figures import figures_by_load, figures_of
 from shearloop.tools.parallel import SerialExecutor
 from tests.estimation.conftest import twisting
 

@@ -13,7 +13,8 @@ from shearloop.estimation.values import Estimate, FrameSeries
 from shearloop.studies.slices.evaluate import no_better_than_place
 from shearloop.studies.slices.leave_out import SliceRecipe, find_levels, plan_levels
 from shearloop.studies.slices.series import SliceSeries
-from shearloop.tools.evaluate import EstimateTrack, estimate_series, figures_by_load, figures_of, no_better_than_clock
+from shearloop.tools.estimate_tracks import EstimateTrack, estimate_series
+from shearloop.tools.figures import figures_by_load, figures_of, no_better_than_clock
 from shearloop.tools.leave_out import LeftOut, Recipe, advice_on, fit_without, plan_left_out, sentences_of
 from shearloop.tools.left_out_blocks import KINDS, Span, after_twists, find_blocks, usual_kind
 from shearloop.tools.parallel import SerialExecutor

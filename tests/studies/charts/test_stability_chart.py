@@ -12,7 +12,7 @@ from shearloop.studies.charts import fault_sweeps, stability
 from shearloop.studies.charts.chart_data import Split, fitted
 from shearloop.studies.slices.evaluate import estimate_slices
 from shearloop.studies.slices.fitting import fit_slices
-from shearloop.tools.evaluate import figures_of
+from shearloop.tools.figures import figures_of
 from shearloop.tools.parallel import SerialExecutor
 
 

@@ -22,7 +22,10 @@ from shearloop.studies.slices.evaluate import draw_slices
 from shearloop.studies.slices.fitting import fit_slices
 from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.calibrate import CalibrationResult
-from shearloop.tools.evaluate import EstimateTrack, InvalidReason, draw_stream, draw_tracks, figures_of, invalid_reasons
+from shearloop.tools.estimate_tracks import EstimateTrack
+from shearloop.tools.evaluate import InvalidReason, invalid_reasons
+from shearloop.tools.evaluation_figure import draw_stream, draw_tracks
+from shearloop.tools.figures import figures_of
 
 pytestmark = pytest.mark.usefixtures("unjudged")
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}

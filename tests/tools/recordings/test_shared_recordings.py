@@ -28,7 +28,9 @@ from shearloop.studies.slices.evaluate import estimate_slices
 from shearloop.studies.slices.fitting import fit_slices
 from shearloop.studies.slices.novelty import NoveltyDetector
 from shearloop.studies.slices.series import SliceSeries, read_slices
-from shearloop.tools.evaluate import estimate_series, figures_by_load, figures_of, invalid_reasons
+from shearloop.tools.estimate_tracks import estimate_series
+from shearloop.tools.evaluate import invalid_reasons
+from shearloop.tools.figures import figures_by_load, figures_of
 from shearloop.tools.frame_series import part_of, read_series, series_of
 from shearloop.tools.leave_out import Recipe, plan_left_out
 from shearloop.tools.parallel import SerialExecutor

@@ -148,7 +148,7 @@ class MotionExecutor:
             self._keep_turning(self._motion, sample, now_ns)
         else:
             self._end_speed_thread()
-            sent, self.clipped = clip_linear(asked, self._settings.limits)
+            sent, self.clipped = clip_linear(asked, sample.tcp_pose, self._settings.limits)
             self.sent = sent
             slack_s = max(MOVE_SLACK_S, MOVE_SILENCES * self._settings.silence_timeout_s)
             deadline_ns = _deadline_ns(now_ns, _nominal_move_s(sent, sample), slack_s, sample)
@@ -381,14 +381,39 @@ def clip_stop(asked: float, sample: RtdeSample, settings: UrSettings) -> float:
     return min(_safe_ramp(brisk, 0.0, sample, settings), bound.hard)
 
 
-def clip_linear(asked: MoveLinear, limits: UrLimits) -> tuple[MoveLinear, tuple[str, ...]]:
-    """Return the straight move within the inner speed and acceleration, and each reason for a change."""
+def clip_linear(asked: MoveLinear, here: Six, limits: UrLimits) -> tuple[MoveLinear, tuple[str, ...]]:
+    """Return the straight move within the inner speeds and accelerations, and each reason for a change.
+
+    The tool turns evenly on its way: a short one with a large turn is slowed to the wrist's limits.
+    """
     reasons: list[str] = []
     speed = _at_most(asked.speed_m_per_s, limits.linear_speed_m_per_s, "linear speed", reasons)
     acceleration = _at_most(
         asked.acceleration_m_per_s2, limits.linear_acceleration_m_per_s2, "linear acceleration", reasons
     )
+    way_m, turn_rad = math.dist(here[:3], asked.pose[:3]), turn_between(here, asked.pose)
+    if way_m > 0 and turn_rad > 0:
+        m_per_rad = way_m / turn_rad
+        turning_m_per_s = m_per_rad * limits.wrist_speed_rad_per_s.inner
+        if speed > turning_m_per_s:
+            reasons.append(f"linear speed is limited to {turning_m_per_s:.2g}: the tool turns by {turn_rad:.2g} rad")
+            speed = turning_m_per_s
+        acceleration = min(acceleration, m_per_rad * limits.wrist_acceleration_rad_per_s2.inner)
     return MoveLinear(asked.pose, speed, acceleration), tuple(reasons)
+
+
+def turn_between(pose: Six, other: Six) -> float:
+    """Return the angle between the orientations of two poses, 0 to pi."""
+    dot = sum(one * another for one, another in zip(_quaternion(pose), _quaternion(other), strict=True))
+    return 2.0 * math.acos(min(1.0, abs(dot)))
+
+
+def _quaternion(pose: Six) -> tuple[float, float, float, float]:
+    x, y, z = pose[3:]
+    half_rad = 0.5 * math.hypot(x, y, z)
+    # sin(a)/(2 a) is 1/2 at 0.
+    part = math.sin(half_rad) / (2.0 * half_rad) if half_rad else 0.5
+    return math.cos(half_rad), part * x, part * y, part * z
 
 
 def is_recent(sample: RtdeSample, settings: UrSettings) -> bool:

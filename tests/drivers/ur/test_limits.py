@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
-from shearloop.drivers.ur.motion import clip_linear, clip_stop, clip_wrist, is_close, line_violation, violation
+from shearloop.drivers.ur.motion import (
+    clip_linear,
+    clip_stop,
+    clip_wrist,
+    is_close,
+    line_violation,
+    turn_between,
+    violation,
+)
 from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.handler_bench import AT_REST, LIMITS, POSE, SETTINGS, enabled
 
@@ -82,7 +90,7 @@ poses = st.tuples(*[anything] * 3, *[st.floats(-math.pi, math.pi)] * 3)
 
 @given(st.builds(MoveLinear, poses, above_0, above_0))
 def test_a_linear_move_keeps_its_end_and_reports_a_slower_speed(asked):
-    sent, reasons = clip_linear(asked, LIMITS)
+    sent, reasons = clip_linear(asked, asked.pose, LIMITS)
     assert sent.pose == asked.pose
     assert sent.speed_m_per_s <= LIMITS.linear_speed_m_per_s.inner
     assert sent.acceleration_m_per_s2 <= LIMITS.linear_acceleration_m_per_s2.inner
@@ -251,3 +259,25 @@ def test_closeness_agrees_with_scipy(direction, angle, turned):
     apart_rad = math.hypot(*turned)
     assert close or apart_rad > 2e-3 / 1.6
     assert not close or apart_rad < 2.001e-3
+
+
+rotation_vectors = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
+
+
+@given(rotation_vectors, rotation_vectors)
+def test_the_turn_between_two_poses(one, other):
+    turn = Rotation.from_rotvec(one).inv() * Rotation.from_rotvec(other)
+    assert turn_between((0.0, 0.0, 0.0, *one), (1.0, 2.0, 3.0, *other)) == pytest.approx(turn.magnitude(), abs=1e-6)
+
+
+@pytest.mark.parametrize(("way_m", "turn_rad"), [(0.001, 1.5), (0.01, 1.5), (0.1, 0.1), (0.1, 0.0), (0.0, 1.0)])
+def test_a_straight_move_turns_the_tool_no_faster_than_the_wrist_may(way_m, turn_rad):
+    here = (0.4, 0.1, 0.3, math.pi, 0.0, 0.0)
+    turned = (Rotation.from_rotvec(here[3:]) * Rotation.from_rotvec((0.0, 0.0, turn_rad))).as_rotvec()
+    asked = MoveLinear((0.4, 0.1, 0.3 + way_m, *map(float, turned)), 0.05, 0.3)
+    sent, reasons = clip_linear(asked, here, LIMITS)
+    if way_m > 0:
+        assert turn_rad / way_m * sent.speed_m_per_s <= LIMITS.wrist_speed_rad_per_s.inner + 1e-9
+        assert turn_rad / way_m * sent.acceleration_m_per_s2 <= LIMITS.wrist_acceleration_rad_per_s2.inner + 1e-9
+    assert any("the tool turns" in reason for reason in reasons) is (sent.speed_m_per_s < 0.05)
+    assert (sent.speed_m_per_s < 0.05) is (turn_rad == 1.5)

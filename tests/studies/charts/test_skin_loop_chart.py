@@ -85,5 +85,5 @@ def test_the_demo_holds_the_force_that_it_says():
     (hold,) = [step for step in file.steps if isinstance(step, HoldTorqueStep)]
     assert file.torque_source == "skin"
     assert hold.torque_nm / config.skin.tool_radius_mm * 1e3 == pytest.approx(1.0)
-    assert [step.do for step in file.steps] == ["tare", "identify", "hold_torque"]
+    assert [step.do for step in file.steps] == ["tare", "identify", "hold_torque", "twist"]
     assert all(step.timeout_s for step in file.steps), "none may last for ever"

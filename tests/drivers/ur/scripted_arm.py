@@ -50,6 +50,7 @@ class ScriptedArm(FakeArm):
             timestamp_s=self.robot.clock_s,
             q_rad=tuple(arm.q_rad),
             qd_rad_per_s=tuple(arm.qd_rad_per_s),
+            tcp_pose=tuple(map(float, arm.pose)),
             wrench=tuple(arm.wrench),
             runtime_state=self.robot.runtime_state,
             moving_linearly=robots.moving_asynchronously(self.robot),

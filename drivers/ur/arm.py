@@ -35,6 +35,9 @@ _LONGEST_POLL_SLACK_NS, _SLACKS_PER_WATCHDOG = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
 # A CB3 estimates its wrench from motor currents: one sample is off by up to 10 N and 5 N·m, their mean by far less.
 _ZERO_OVER_S = 0.5
+# Each start of a program with a held tool changes the kept zero by the errors of two means over this time: on a UR5e by
+# 0.01 N·m. A longer one would take more of what the gel relaxes meanwhile.
+_HELD_OVER_S = 1.0
 # The longest time for sending the script.
 _UPLOAD_S = 1.0
 
@@ -77,7 +80,7 @@ class UrArm:
         # In the base's frame: of a controller that cannot zero its wrench, or that has zeroed it with a load.
         self.wrench_zero: Six = (0.0,) * 6
         # Of the latest samples at rest, as the controller measures them: one is known to its noise only.
-        self._recent_wrenches: deque[Six] = deque(maxlen=max(1, round(_ZERO_OVER_S * settings.rate_hz)))
+        self._recent_wrenches: deque[Six] = deque(maxlen=round(_HELD_OVER_S * settings.rate_hz))
         # The wrench before a program was first sent, where something was held, until that program has its zero.
         self._held: Six | None = None
         # Whether the program that was sent last has answered.
@@ -161,7 +164,7 @@ class UrArm:
         In this process it is the mean of the last samples at rest.
         """
         if not self._settings.facts.zeroes_wrench:
-            self.wrench_zero = self._mean_wrench()
+            self.wrench_zero = self._mean_wrench(_ZERO_OVER_S)
             return True
         if not self._send_once(self._control.zeroFtSensor):
             return False
@@ -181,7 +184,7 @@ class UrArm:
         if not (held and self._settings.facts.zeroes_at_start):
             self._held = None
         elif self._held is None:
-            self._held = _difference(self._mean_wrench(), self.wrench_zero)
+            self._held = _difference(self._mean_wrench(_HELD_OVER_S), self.wrench_zero)
         self._answered = False
         self._recent_wrenches.clear()
         # ur-rtde's own script connection is never read, so that the controller soon stops listening to it.
@@ -195,7 +198,7 @@ class UrArm:
     def arm_watchdog(self) -> bool:
         """Return whether the uploaded program answers, and the wrench has its zero; its watchdog is armed then.
 
-        With something held the zero is known once the wrench has been measured for half a second of the program.
+        With something held the zero is known once the wrench has been measured for a second of the program.
         """
         armed = self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)
         if not (armed and self._settings.facts.zeroes_at_start):
@@ -206,9 +209,9 @@ class UrArm:
         if self._held is None:
             self.wrench_zero = (0.0,) * 6
             return True
-        if len(self._recent_wrenches) < (self._recent_wrenches.maxlen or 1):
+        if not self._is_measured:
             return False
-        self.wrench_zero = _difference(self._mean_wrench(), self._held)
+        self.wrench_zero = _difference(self._mean_wrench(_HELD_OVER_S), self._held)
         self._held = None
         return True
 
@@ -221,9 +224,18 @@ class UrArm:
         """Let no motion go on, also not when a program that is paused now is resumed."""
         self._receiver.write_deadline(NO_MOTION_TICKS)
 
-    def _mean_wrench(self) -> Six:
+    def knows_load(self, *, held: bool) -> bool:
+        """Return whether the wrench was measured for long enough at rest that a new program can keep its zero."""
+        return not (held and self._settings.facts.zeroes_at_start) or self._held is not None or self._is_measured
+
+    @property
+    def _is_measured(self) -> bool:
+        return len(self._recent_wrenches) == self._recent_wrenches.maxlen
+
+    def _mean_wrench(self, seconds: float) -> Six:
         """Return the mean of the latest samples at rest as the controller measures them, of one where none is."""
-        recent = self._recent_wrenches or [self._receiver.latest().wrench]
+        last = round(seconds * self._settings.rate_hz)
+        recent = [*self._recent_wrenches][-last:] or [self._receiver.latest().wrench]
         fx, fy, fz, mx, my, mz = (fmean(one) for one in zip(*recent, strict=True))
         return fx, fy, fz, mx, my, mz
 

@@ -41,6 +41,8 @@ _RETRY_S = 1.0
 ENDS_ITSELF_S = 2.0
 # A program that does not play within this time after its first upload does not start with this worker.
 STARTS_WITHIN_S = 2.0
+# An arm that does not come to rest has no load that could be measured for longer than this.
+LOAD_WITHIN_S = 5.0
 
 NOT_ENABLED = "Motion has not been enabled since the robot's worker was started: enable it when the arm may move."
 BEING_MADE_READY = "The robot is being made ready (safety, power, control program); this takes some seconds."
@@ -64,6 +66,7 @@ class Recovery:
         self._arm = arm
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
         self._timeout_s = timeout_s
+        self._load_by_ns = now_ns + int(LOAD_WITHIN_S * 1e9)
         self._asked_ns: dict[str, int] = {}
         self._cleared = False
         # When the control program was first sent.
@@ -125,6 +128,8 @@ class Recovery:
             # Registers outlive the program: a new one would first execute the last command.
             self._cleared = self._arm.clear_command()
         else:
+            if self._uploaded_ns is None and not self._arm.knows_load(held=self.held) and now_ns < self._load_by_ns:
+                return
             if self._uploaded_ns is None:
                 self._uploaded_ns = now_ns
             elif now_ns >= self._uploaded_ns + int(STARTS_WITHIN_S * 1e9):

@@ -165,6 +165,9 @@ class FakeArm:
         self.stale_command = False
         return True
 
+    def knows_load(self, *, held: bool) -> bool:  # noqa: ARG002 - nothing is measured here
+        return True
+
     def zero_wrench(self) -> bool:
         self.note("zero_wrench")
         return True

@@ -3,6 +3,7 @@
 import pytest
 
 from shearloop.drivers.ur import worker
+from shearloop.drivers.ur.command_handler import LOAD_WITHIN_S
 from shearloop.drivers.ur.messages import Disconnect, Held, Unlock
 from tests.drivers.ur.handler_bench import SETTINGS, HandlerBench
 from tests.drivers.ur.process import CyclingArm
@@ -17,6 +18,26 @@ def test_the_first_program_of_a_worker_knows_what_the_gripper_holds(held):
     bench.run(5)
     assert ("upload, held" in bench.arm.calls) == held
     assert bench.state.wrench_zero == ZERO
+
+
+def test_a_program_waits_until_the_load_has_been_measured(monkeypatch):
+    """A new worker has read a few noisy samples: each restart would move the kept zero by their error."""
+    bench, measured = HandlerBench(), [False]
+    monkeypatch.setattr(bench.arm, "knows_load", lambda *, held: not held or measured[0])
+    bench.handler.take_held(Held(True, ZERO))
+    bench.run(50)
+    assert bench.arm.calls == ["clear_command"]
+    measured[0] = True
+    bench.run(1)
+    assert bench.arm.calls[-1] == "upload, held"
+
+
+def test_an_arm_that_does_not_come_to_rest_keeps_no_program_waiting(monkeypatch):
+    bench = HandlerBench()
+    monkeypatch.setattr(bench.arm, "knows_load", lambda *, held: not held)
+    bench.handler.take_held(Held(True, ZERO))
+    bench.run(round(LOAD_WITHIN_S * 125) + 2)
+    assert bench.arm.calls[:2] == ["clear_command", "upload, held"]
 
 
 @pytest.mark.parametrize("held", [True, False])

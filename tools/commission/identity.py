@@ -77,7 +77,7 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
         judged(
             "speed slider", f"{slider:.0%}", "100%", "the loop's gain", passed=math.isclose(slider, 1.0, abs_tol=1e-6)
         ),
-        _payload(identity, tool.payload_kg),
+        _payload(identity, tool.payload_kg, emulated=config.emulated),
         judged(
             "safety checksum",
             identity.safety_checksum or "not given",
@@ -102,12 +102,15 @@ def _polyscope(version: str) -> Line:
     return judged("PolyScope", version, "a version that ur-rtde is tested on", "known versions", passed=True)
 
 
-def _payload(identity: Identity, wanted_kg: float | None) -> Line:
+def _payload(identity: Identity, wanted_kg: float | None, *, emulated: bool) -> Line:
     """Return the line on the payload: within the daemon's own tolerance, else the daemon refuses every motion."""
     set_kg, promise = identity.outputs.payload_kg, "forces and protective stops fit the load"
     if math.isnan(set_kg):
         return _unreported_payload(identity.typed_kg, wanted_kg, promise)
     value = f"{set_kg:.3f} kg"
+    if wanted_kg is None and emulated:
+        # A real robot does not run before it is filled in.
+        return Line(what="payload", value=f"{value}, not compared: `tool` is not in the robot's settings")
     if wanted_kg is None:
         limit = "`tool.payload_kg` of the robot's settings, which is absent"
         return judged("payload", value, limit, promise, passed=False)

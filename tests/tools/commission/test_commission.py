@@ -128,6 +128,15 @@ def test_a_payload_that_the_controller_does_not_report_is_typed(tmp_path, mounte
     assert "typed" in lines["payload"].limit
 
 
+@pytest.mark.parametrize(("emulated", "verdict"), [(True, "noted"), (False, "failed")])
+def test_a_rehearsal_goes_on_without_the_tool_that_a_real_robot_needs(tmp_path, emulated, verdict):
+    config = load_daemon_config(write_rig(tmp_path))
+    settings = replace(read_settings(config.robot), tool=InstalledTool())
+    lines = judge_identity(GOOD, settings, config.model_copy(update={"emulated": emulated}))
+    (payload,) = (line for line in lines if line.what == "payload")
+    assert payload.verdict == verdict
+
+
 def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
     begun = Report(rig=RIG)
     assert not begun.passed, "nothing measured is nothing passed"

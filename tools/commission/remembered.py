@@ -76,7 +76,11 @@ class LeftRobot:
         if stage == identity.STAGE or not self.keeps:
             yield operator
             return
-        self._keep(replace(self.state, running=f"commissioning, stage {stage}"))
+        # Each program that a stage starts lets the controller zero its wrench, under the load of a held tool.
+        wrench_zero = None if self.state.wrench_zero is None else (0.0,) * 6
+        self._keep(
+            replace(self.state, running=f"commissioning, stage {stage}", wrench_zero=wrench_zero, wrench_tared=False)
+        )
         try:
             yield operator
         finally:

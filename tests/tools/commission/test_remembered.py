@@ -89,6 +89,22 @@ def test_a_commissioning_that_is_killed_in_a_stage_leaves_a_stop(fails):
     assert read_memories(files) == Remembered()
 
 
+def test_a_commissioning_leaves_no_zero_of_the_wrench_under_a_held_tool():
+    """Its programs have let the controller zero it with the load."""
+    files, zero = RobotFiles.of(HOST), (0.0, 0.0, 0.0, 0.0, 0.0, 0.4)
+    tared = replace(GRIP, wrench_zero=zero, wrench_tared=True, load_zero=8321.0, load_nm_per_count=0.001)
+    left = LeftRobot(files, Operator(pytest.fail, pytest.fail), opens=True, keeps=True, state=tared)
+    with left.during("0 identity"):
+        assert left.state == tared, "nothing is started"
+    with left.during("1 no motion"):
+        assert not read_memories(files).wrench_tared
+    after = read_memories(files)
+    assert after.wrench_zero == (0.0,) * 6
+    assert not after.wrench_tared
+    assert after.load_zero == 8321.0, "the load cell's is its own"
+    assert after.held == tared.held
+
+
 def test_an_acknowledgement_that_cannot_be_kept_is_none(lab):
     memory_path(HOST).mkdir(parents=True)
     with pytest.raises(UserError, match="the robot's state cannot be kept in"):

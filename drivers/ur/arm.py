@@ -206,8 +206,9 @@ class UrArm:
         if not self._answered:
             self._answered = True
             self._recent_wrenches.clear()
+            # Until it is known better.
+            self.wrench_zero = _difference(self._receiver.latest().wrench, self._held) if self._held else (0.0,) * 6
         if self._held is None:
-            self.wrench_zero = (0.0,) * 6
             return True
         if not self._is_measured:
             return False

@@ -249,6 +249,7 @@ def test_the_kept_zero_is_known_to_less_than_the_noise_of_one_sample(arm, monkey
     one.upload(held=held)
     Receiver.made.sample = received(2.0)
     assert one.arm_watchdog() is not held, "with a load it waits for a second of samples"
+    assert one.read().wrench[5] == pytest.approx(0.3 if held else 0.0, abs=0.05), "no state is without the load"
     start_program(one, 2.1, SIX, noise_nm=0.2)
     assert -one.wrench_zero[5] == pytest.approx(0.3 if held else 0.0, abs=0.03)
 

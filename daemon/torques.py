@@ -87,7 +87,10 @@ class SensorListener(Protocol):
         """Take that a source's zero is known from now on, or is not."""
 
     def torques_of(self, source: str) -> tuple[Sequence[int], Sequence[float]]:
-        """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m."""
+        """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m.
+
+        Torques within the source's noise are as in `beyond_noise`.
+        """
 
 
 class LatestTorques:
@@ -121,6 +124,24 @@ class LatestTorques:
         if confirmed or not loaded:
             return None
         return f"{loaded}, which would become the zero; {CONFIRM_TARE}"
+
+
+def beyond_noise(times_ns: Sequence[int], torques_nm: Sequence[float], noise_nm: float) -> list[float]:
+    """Return torques beyond a source's noise, 0 between loads, and NaN where a load may begin or end.
+
+    Noise about 0 would look like small loads. A stretch within the noise is 0 in its middle half.
+    """
+    found = list(torques_nm)
+    begin = 0
+    while noise_nm > 0 and begin < len(found):
+        end = begin
+        while end < len(found) and abs(torques_nm[end]) <= noise_nm:
+            end += 1
+        for place in range(begin, end):
+            from_begin = (times_ns[place] - times_ns[begin]) / max(1, times_ns[end - 1] - times_ns[begin])
+            found[place] = 0.0 if 0.25 <= from_begin <= 0.75 else math.nan
+        begin = max(end, begin + 1)
+    return found
 
 
 def loaded_sentence(torques_nm: Mapping[str, float | None]) -> str:

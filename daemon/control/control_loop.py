@@ -26,7 +26,7 @@ from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDe
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import Compute, WristController, at_once
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.torques import TorqueSample, TorqueSource
+from shearloop.daemon.torques import TorqueSample, TorqueSource, beyond_noise
 
 # An `adapt` step compares the fingertip with the torques of this time.
 ADAPTED_OVER_S = 600.0
@@ -143,8 +143,13 @@ class ControlLoop:
         self._zero_known.setdefault(source, True)
 
     def torques_of(self, source: str) -> tuple[Sequence[int], Sequence[float]]:
-        """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m."""
-        return self.inputs.history.get(source, ([], []))
+        """Return the valid torques of a source that are kept: times of measurement in ns, ascending, and N·m.
+
+        Torques within the source's noise are as in `beyond_noise`.
+        """
+        times_ns, torques_nm = self.inputs.history.get(source, ([], []))
+        noise_nm = self._sources[source].noise_nm if source in self._sources else 0.0
+        return times_ns, beyond_noise(times_ns, torques_nm, noise_nm)
 
     def on_arm(self, arm: ArmStatus) -> None:
         """Take a state of the robot."""

@@ -257,19 +257,26 @@ async def test_a_configured_experiment_waits_for_the_operator(waiting_config, lo
     content = {**yaml.safe_load(waiting_config.read_text()), "autostart": False}
     waiting_config.write_text(yaml.safe_dump(content))
     begun: list[Path] = []
+    answered = asyncio.Event()
 
     async def start(path: Path, _digest: str | None = None) -> str | None:
         begun.append(path)
         return None
 
+    async def ended() -> SimpleNamespace:
+        # The daemon ends with its experiment, and has to answer before.
+        await answered.wait()
+        return await done_experiment()
+
     async with running_daemon(waiting_config) as daemon:
         daemon.rig.start = start
-        daemon.rig.runner.experiment_ended = done_experiment
+        daemon.rig.runner.experiment_ended = ended
         await log.says(LEFT_TO_OPERATOR)
         health = collector(daemon, "health")
         assert (await health.get())["tasks"]["experiment"]["alive"]
         assert begun == []
         assert (await ask(daemon, "start"))["ok"]
+        answered.set()
         await daemon.ending.wait()
     assert [path.name for path in begun] == ["experiment.yaml"]
     assert daemon.finished

@@ -140,6 +140,8 @@ class RigMemory:
     _wrench_tared: bool = False
     # Whether the gripper has shown since if it still has that grip: until then the restored zeros are kept.
     _judged: bool = False
+    # Whether the controller may have zeroed its wrench with the load: a program was to start, and has not answered yet.
+    _wrench_changes: bool = False
     _writing: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
@@ -219,6 +221,7 @@ class RigMemory:
 
     async def save_present(self) -> None:
         """Write the present state, unless the file has it already."""
+        self._watch_wrench()
         state = Remembered.of(self.loop)
         state = replace(state, running=state.running or self.starting)
         if self.load_cell is not None and self.loop.tool.may_hold() and self._knows_load_zero:
@@ -237,8 +240,20 @@ class RigMemory:
 
     @property
     def _knows_wrench_zero(self) -> bool:
-        """Whether the wrench's zero was taken."""
+        """Whether the wrench's zero was taken, and is the one of the program that runs."""
+        if self._wrench_changes:
+            return False
         return self.loop.has_zero(WRENCH) or (self._wrench_tared and not self._judged)
+
+    def _watch_wrench(self) -> None:
+        """Note whether a program is about to start: a daemon killed meanwhile must not leave the zero from before."""
+        robot_state = self.robot.state if self.robot is not None else None
+        if robot_state is None:
+            return
+        if robot_state.recovering:
+            self._wrench_changes = True
+        elif robot_state.program_running:
+            self._wrench_changes = False
 
     async def save(self, state: Remembered) -> None:
         """Write a state, unless the file has it already; a failure is logged once, and tried again."""

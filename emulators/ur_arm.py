@@ -199,6 +199,8 @@ class Arm:
         self.speed_slider = 1.0
         # How much the controller slows every motion by itself.
         self.limiter_scaling = 1.0
+        # How much of its errors the wrench has.
+        self.wrench_error_factor = 1.0
         # Faults: how fast each joint brakes, the noise of its measured speeds, and a force (3,) that nothing exerts.
         self.braking_rad_per_s2 = np.full(6, math.inf)
         self.noise_rad_per_s = 0.0
@@ -266,6 +268,7 @@ class Arm:
         self.noise_rad_per_s = 0.0
         self.braking_rad_per_s2 = np.full(6, math.inf)
         self.bias_n, self.hung_kg = np.zeros(3), 0.0
+        self.wrench_error_factor = 1.0
 
     @property
     def _scaling(self) -> float:
@@ -305,7 +308,7 @@ class Arm:
 
         `error`: the largest errors (6,) of the measured force and torque.
         """
-        self._noise = self._random.uniform(-1.0, 1.0, 6) * error
+        self._noise = self.wrench_error_factor * self._random.uniform(-1.0, 1.0, 6) * error
         if self._plant is not None:
             torque_nm = self._plant.step(dt_s, float(self.q_rad[5]))
             flange_axis = self._frame[:3, :3] @ self._tool[2, :3]

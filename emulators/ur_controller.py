@@ -303,6 +303,12 @@ _WITH_NUMBER: dict[str, tuple[float, float, str, Callable[[Controller, float], N
     "hold-back": (0.0, 60.0, "not a time in seconds from 0 to 60", Controller.hold_back),
     "payload": (0.0, 100.0, "not a mass in kg from 0 to 100", Controller.weigh),
     "slider": (0.01, 1.0, "not a fraction from 0.01 to 1", lambda one, x: setattr(one.robot.arm, "speed_slider", x)),
+    "wrench-error": (
+        0.0,
+        10.0,
+        "not a factor from 0 to 10",
+        lambda one, x: setattr(one.robot.arm, "wrench_error_factor", x),
+    ),
     "scaling": (
         0.01,
         1.0,

@@ -7,8 +7,6 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
 from shearloop.drivers.defaults import EMULATED_ANSWER
 from shearloop.emulators.ur_arm import CURRENTS_ERROR, SENSOR_ERROR, Arm, PathError, Vector, WristPlant, frame_of_pose
 from shearloop.emulators.urscript import Interrupts, Program, ProgramEndedError, Registers
@@ -70,8 +68,6 @@ class Robot:
         self.protects_abrupt_ends = False
         # Whether any program that ends by itself does.
         self.protects_ends = False
-        # Whether the measured force and torque have no error.
-        self.exact_wrench = False
         # Where the threads of the next program are interrupted.
         self.interrupts: Interrupts | None = None
 
@@ -114,8 +110,6 @@ class Robot:
     @property
     def wrench_error(self) -> Vector:
         """The largest errors (6,) of the measured force and torque."""
-        if self.exact_wrench:
-            return np.zeros(6)
         return SENSOR_ERROR if self.is_e_series else CURRENTS_ERROR
 
     @property

@@ -49,6 +49,7 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   slow-arm RAD/S²         brake no joint but the wrist faster than this
   watchdog-waits          let the watchdog not look while the arm moves straight
   bias N                  report a force that nothing exerts
+  wrench-error FACTOR     multiply the errors of force and torque, 1 as on UR's data sheet
   hang KG                 hang a mass on the tool
   slider FRACTION         move the pendant's speed slider, 1 at its right end
   scaling FRACTION        let the controller slow every motion by itself, to this fraction

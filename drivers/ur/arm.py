@@ -206,8 +206,10 @@ class UrArm:
         if not self._answered:
             self._answered = True
             self._recent_wrenches.clear()
-            # Until it is known better.
-            self.wrench_zero = _difference(self._receiver.latest().wrench, self._held) if self._held else (0.0,) * 6
+            self.wrench_zero = (0.0,) * 6
+            if self._held is not None:
+                # Until it is known better.
+                self.wrench_zero = _difference(self._receiver.latest().wrench, self._held)
         if self._held is None:
             return True
         if not self._is_measured:
@@ -224,6 +226,10 @@ class UrArm:
     def withdraw_deadline(self) -> None:
         """Let no motion go on, also not when a program that is paused now is resumed."""
         self._receiver.write_deadline(NO_MOTION_TICKS)
+
+    def measure_load_anew(self) -> None:
+        """Measure the load from now on, before a new program may change the zero."""
+        self._recent_wrenches.clear()
 
     def knows_load(self, *, held: bool) -> bool:
         """Return whether the wrench was measured for long enough at rest that a new program can keep its zero."""

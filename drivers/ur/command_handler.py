@@ -78,6 +78,8 @@ class Recovery:
         self.refusal: str | None = None
         # Whether the gripper holds something.
         self.held = False
+        # The daemon sees that the zero of the wrench may change, a second before the program starts.
+        arm.measure_load_anew()
 
     @property
     def operator_asked(self) -> bool:

@@ -146,7 +146,7 @@ class Spring:
 def test_wrench_is_the_plants_torque_about_the_tool_axis():
     spring = Spring()
     robot = Robot(plant=spring)
-    robot.exact_wrench = True
+    robot.arm.wrench_error_factor = 0.0
     robot.upload(control_script())
     turn(robot, 0.5, 10.0)
     wait(robot, 1.0)
@@ -154,12 +154,12 @@ def test_wrench_is_the_plants_torque_about_the_tool_axis():
     expected = -2.0 * robot.arm.q_rad[5]
     # The tool points down: its axis is -z of the base.
     assert robot.arm.wrench == pytest.approx([0, 0, 0, 0, 0, -expected], abs=1e-9)
-    robot.exact_wrench = False
+    robot.arm.wrench_error_factor = 1.0
     wait(robot, 0.5)
     error = np.abs(robot.arm.wrench - robot.arm.load)
     assert 0.0 < np.linalg.norm(error[:3]) <= 3.5
     assert 0.0 < np.linalg.norm(error[3:]) <= 0.2
-    robot.exact_wrench = True
+    robot.arm.wrench_error_factor = 0.0
     robot.registers.write("input_int_register_0", 0, robot.time_s)
     do(robot, robots.SPEED_STOP, 10.0)
     do(robot, robots.ZERO_FT)

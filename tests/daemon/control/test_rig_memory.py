@@ -17,12 +17,12 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import FOLLOWED_MM, SAME_WIDTH_MM, Grip
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.control.wrench import wrench_source
-from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memory, write_memory
+from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, Rig, new_loop, phase, started, stop
-from tests.drivers.ur.handler_bench import SETTINGS
+from tests.drivers.ur.handler_bench import SETTINGS, HandlerBench
 
 
 @pytest.fixture
@@ -496,3 +496,25 @@ async def test_no_zero_is_taken_before_the_gripper_shows_what_it_holds():
     after.run(0.1)
     assert after.control_loop.tool.may_still_hold is None
     assert after.control_loop.operator.tare_refusal(confirmed=True) is None, "it holds nothing"
+
+
+async def test_a_daemon_that_is_killed_while_a_program_starts_leaves_no_zero_of_the_wrench():
+    """The controller zeroes it with the load as the program starts, and the worker answers later."""
+    before = Rig(ControlLoop(CONFIG, {"right": EIT, "wrench": wrench_source(125.0)}, ("gripper", "right")))
+    before.control_loop.on_zero("wrench")
+    before.force_n = 60.0
+    before.run(0.6)
+    robot, ready = UrRobot(SETTINGS), HandlerBench().state
+    memory = RigMemory(FILES, before.control_loop, robot=robot)
+    for recovering, program_running, tared in (
+        (False, True, True),
+        (True, False, False),
+        # A start that was given up; the program may have begun.
+        (False, False, False),
+        (True, True, False),
+        (False, True, True),
+    ):
+        runtime_state = 2 if program_running else 1
+        robot.handle_message(0, replace(ready, recovering=recovering, runtime_state=runtime_state))
+        await memory.save_present()
+        assert read_memories(FILES).wrench_tared is tared

@@ -165,6 +165,9 @@ class FakeArm:
         self.stale_command = False
         return True
 
+    def measure_load_anew(self) -> None:
+        pass
+
     def knows_load(self, *, held: bool) -> bool:  # noqa: ARG002 - nothing is measured here
         return True
 

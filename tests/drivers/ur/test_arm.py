@@ -238,6 +238,8 @@ def test_a_load_is_known_after_a_second_of_samples(arm):
     assert not one.knows_load(held=True)
     rest(one, 1.0, SIX)
     assert one.knows_load(held=True)
+    one.measure_load_anew()
+    assert not one.knows_load(held=True)
 
 
 @pytest.mark.parametrize("held", [True, False])

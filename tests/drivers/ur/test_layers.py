@@ -240,7 +240,7 @@ def test_script_keeps_the_wrist_within_its_range(direction):
 )
 def test_script_stops_beyond_the_hard_force_and_torque_until_rest_is_asked_for(part, hard):
     arm, command = guarded_arm(), WristSpeed(FASTEST, 4.0)
-    arm.robot.exact_wrench = True
+    arm.robot.arm.wrench_error_factor = 0.0
     load = arm.robot.arm.load
     load[part] = 0.57 * hard
     assert not turn(arm, command, 0.3)[-1].rests
@@ -313,7 +313,7 @@ def test_an_emulated_robot_whose_time_stands_still_has_longer_for_a_straight_mov
 def test_a_program_that_starts_while_something_is_held_keeps_its_limits(held):
     """An e-Series zeroes its wrench then: with 0.7 of the largest torque held, and with 0.4 that come later."""
     arm, command = guarded_arm(), WristSpeed(FASTEST, 4.0)
-    arm.robot.exact_wrench = True
+    arm.robot.arm.wrench_error_factor = 0.0
     load = arm.robot.arm.load
     load[5] = 0.7 * LIMITS.torque_nm.hard
     assert not turn(arm, command, 0.3)[-1].rests

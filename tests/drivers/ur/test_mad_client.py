@@ -126,7 +126,7 @@ def test_a_deadline_of_an_earlier_program_that_the_clock_reaches_does_not_count(
 def test_the_wrench_is_zeroed_only_at_rest_and_below_its_hard_limits(moves):
     """Another zero would hide a load that is too large."""
     arm = guarded_arm()
-    arm.robot.exact_wrench = True
+    arm.robot.arm.wrench_error_factor = 0.0
     arm.robot.arm.load[5] = 0.9 * LIMITS.torque_nm.hard if moves else 1.1 * LIMITS.torque_nm.hard
     if moves:
         turn(arm, WristSpeed(0.5, 4.0), 0.2)

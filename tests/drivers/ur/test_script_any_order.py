@@ -30,13 +30,12 @@ CYCLES_OF_A_COMMAND = 3
 INTERRUPTED = 0.002
 # What a client may do at no time, and what the emulated controller cannot play.
 MISTAKES = ("another thread", "cannot play", "does not end")
+TOO_FAST_FOR_A_JOINT = "the line asks a joint for more than its largest speed"
 
 any_number = st.floats()
 speeds = st.floats(-3.0, 3.0) | st.sampled_from([-FASTEST, -1e-3, 0.0, 1e-3, FASTEST])
 accelerations = st.floats(0.0, 10.0) | st.sampled_from([0.0, 1e-9, 1e-4, FLOOR, 100.0, math.nan, math.inf])
-# The worker slows a shorter way on which the tool turns, such as one that begins while the wrist brakes: the controller
-# would stop for safety.
-ways_m = st.tuples(*[st.floats(-0.05, 0.05)] * 3).filter(lambda way_m: math.hypot(*way_m) >= 0.005)
+ways_m = st.tuples(*[st.floats(-0.05, 0.05)] * 3)
 ENDS_RAD = LIMITS.joints.lower_rad[5] + LIMITS.joints.margin_rad, LIMITS.joints.upper_rad[5] - LIMITS.joints.margin_rad
 int32 = st.integers(-(1 << 31), (1 << 31) - 1)
 
@@ -50,7 +49,7 @@ class AnyOrder(RuleBasedStateMachine):
         if seed is not None:
             self.random = random.Random(seed)
             self.robot.interrupts = self.is_interrupted
-        x, y, z, *_ = map(float, self.robot.arm.pose)
+        x, y, z, *self.turned = map(float, self.robot.arm.pose)
         self.home = x, y, z
         # What is written in each cycle.
         self.command, self.numbers, self.asynchronous = 0, [0.0] * 8, True
@@ -58,6 +57,8 @@ class AnyOrder(RuleBasedStateMachine):
         # Since a deadline has held: for how long the arm has moved, and may move at most.
         self.moved_s = self.may_move_s = self.last_rad_per_s = 0.0
         self.has_moved_on_line, self.too_fast_cycles = False, 0
+        # Whether a straight move was written and has not begun: it waits until the motion before it is braked.
+        self.line_is_due = False
         self.begin_program()
 
     def is_interrupted(self, _thread: int) -> bool:
@@ -87,6 +88,7 @@ class AnyOrder(RuleBasedStateMachine):
         """Write a command, whatever was written before."""
         self.command, self.numbers, self.asynchronous = command, numbers, asynchronous
         self.may_move_s += CYCLES_OF_A_COMMAND * CYCLE_S
+        self.line_is_due = command == robots.MOVE_L
         if command == robots.MOVE_L and not self.has_moved_on_line:
             self.has_moved_on_line = True
             self.may_move_s += GRACES_S
@@ -98,8 +100,7 @@ class AnyOrder(RuleBasedStateMachine):
     @rule(way_m=ways_m, speed=st.floats(0.001, 3.0), acceleration=accelerations)
     def move(self, way_m: tuple[float, float, float], speed: float, acceleration: float) -> None:
         end = (here + way for here, way in zip(self.home, way_m, strict=True))
-        turned = map(float, self.robot.arm.pose[3:])
-        self.write(robots.MOVE_L, *end, *turned, speed, acceleration)
+        self.write(robots.MOVE_L, *end, *self.turned, speed, acceleration)
 
     @rule(speed=speeds, acceleration=accelerations, cycles=st.integers(1, 60))
     def go_on_turning(self, speed: float, acceleration: float, cycles: int) -> None:
@@ -127,7 +128,7 @@ class AnyOrder(RuleBasedStateMachine):
     def write_nonsense(self, command: int, numbers: list[float], place: int, value: float, asynchronous: bool) -> None:
         if command == robots.MOVE_L:
             # The emulated arm cannot go anywhere.
-            numbers = [*self.home, *map(float, self.robot.arm.pose[3:]), *numbers[6:]]
+            numbers = [*self.home, *self.turned, *numbers[6:]]
             numbers[place] = value
         self.scribble(command, numbers, asynchronous=asynchronous)
         self.step()
@@ -175,8 +176,7 @@ class AnyOrder(RuleBasedStateMachine):
         """Expect motion until the deadline, and while it ends, where the deadline counts."""
         left_s = (self.deadline - self.robot.registers[UPPER.clock]) * CYCLE_S
         if -CYCLE_S <= left_s <= LONGEST_S:
-            # A move that was written begins once the motion before it has been braked.
-            self.has_moved_on_line = self.command == robots.MOVE_L or robots.moving_asynchronously(self.robot)
+            self.has_moved_on_line = self.line_is_due or robots.moving_asynchronously(self.robot)
             self.moved_s, self.may_move_s = 0.0, left_s + BRAKING_S + CYCLES_OF_A_COMMAND * CYCLE_S
             self.may_move_s += GRACES_S * self.has_moved_on_line
 
@@ -184,6 +184,7 @@ class AnyOrder(RuleBasedStateMachine):
         if writes:
             send(self.robot, self.command, *self.numbers, asynchronous=self.asynchronous)
         self.robot.step(CYCLE_S)
+        self.line_is_due = self.line_is_due and not robots.moving_asynchronously(self.robot)
         self.note_deadline()
         self.moved_s += CYCLE_S * self.robot.arm.moving
         self.keeps_its_limits()
@@ -206,9 +207,13 @@ class AnyOrder(RuleBasedStateMachine):
         assert math.hypot(*arm.speed[:3]) <= 1.05 * LIMITS.linear_speed_m_per_s.inner, "beyond the emulated steps"
         assert LIMITS.joints.lower_rad[5] <= arm.q_rad[5] <= LIMITS.joints.upper_rad[5]
         assert self.moved_s <= self.may_move_s, "it moves after its deadline"
-        ended = [event.detail for event in self.robot.take_events() if event.name == "program-ended"]
+        events = self.robot.take_events()
+        ended = [event.detail for event in events if event.name == "program-ended"]
         assert not [detail for detail in ended if any(mistake in detail for mistake in MISTAKES)]
-        assert self.robot.safety_mode == 1
+        if self.robot.safety_mode != 1:
+            # The worker slows a short way on which the tool turns far; of another client's the controller takes care.
+            assert [event.detail for event in events if event.name == "protective-stop"] == [TOO_FAST_FOR_A_JOINT]
+            self.start(float(arm.q_rad[5]), None)
 
 
 AnyOrder.TestCase.settings = hypothesis_settings(max_examples=100, stateful_step_count=25, deadline=None)

@@ -22,7 +22,7 @@ DAEMON_COMMANDS = {
     "pause": "hold the arm until `resume`; moving fingers finish their move",
     "resume": "continue after `pause`",
     "stop": "stop the experiment and the arm; without an experiment, stop the daemon",
-    "release": "open the gripper, and a tool drops; or count a clamped one's angle anew; after a stop too; needs --yes",
+    "release": "open the gripper: a tool drops; or let a clamped one's angle count from 0; needs --yes",
     "unlock": "allow motion again after a stop, when no person is within reach; --yes where it opens the gripper",
 }
 # `stop` is never refused, and the others change nothing.

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Protocol, runtime_checkable
 
 from shearloop.daemon.loop_config import LoopConfig
@@ -131,16 +132,17 @@ def beyond_noise(times_ns: Sequence[int], torques_nm: Sequence[float], noise_nm:
 
     Noise about 0 would look like small loads. A stretch within the noise is 0 in its middle half.
     """
-    found = list(torques_nm)
-    begin = 0
-    while noise_nm > 0 and begin < len(found):
-        end = begin
-        while end < len(found) and abs(torques_nm[end]) <= noise_nm:
-            end += 1
-        for place in range(begin, end):
-            from_begin = (times_ns[place] - times_ns[begin]) / max(1, times_ns[end - 1] - times_ns[begin])
-            found[place] = 0.0 if 0.25 <= from_begin <= 0.75 else math.nan
-        begin = max(end, begin + 1)
+    found: list[float] = []
+    for is_noise, stretch in groupby(zip(times_ns, torques_nm, strict=True), lambda one: abs(one[1]) <= noise_nm):
+        samples = list(stretch)
+        if not is_noise or noise_nm == 0.0:
+            found += [torque_nm for _, torque_nm in samples]
+            continue
+        first_ns, last_ns = samples[0][0], samples[-1][0]
+        quarter_ns = 0.25 * (last_ns - first_ns)
+        for t_ns, _ in samples:
+            in_the_middle = first_ns + quarter_ns <= t_ns <= last_ns - quarter_ns
+            found.append(0.0 if in_the_middle else math.nan)
     return found
 
 

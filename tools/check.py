@@ -186,10 +186,10 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
     if (gripper := config.gripper) is not None:
         with parts.of("gripper"):
             gripper_calibration(gripper)
-            own = (
-                f"calibration {gripper.calibration}" if gripper.calibration else "widths by the manufacturer's figures"
-            )
-            parts.texts["gripper"] = f"{gripper.model}, {own}"
+            widths = "widths by the manufacturer's figures"
+            if gripper.calibration is not None:
+                widths = f"calibration {gripper.calibration}"
+            parts.texts["gripper"] = f"{gripper.model}, {widths}"
     with parts.of("robot"):
         if (settings := configured_settings(config)) is not None:
             if lines := why_not_driven(config, settings):

@@ -1,4 +1,4 @@
-"""The tool that the gripper holds, or that is clamped to the wrist: its grip, its angle, and what is known of both."""
+"""The tool that the gripper holds, or that is clamped to the wrist: its grip, its angle, and how far they are known."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -7,12 +7,12 @@ from shearloop.daemon.control.experiment_schema import GripStep, Opening
 from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
 from shearloop.daemon.control.inputs import GripperStatus, LatestInputs
 
-# Why nobody knows yet whether something is held.
+# Why it is not known yet whether something is held.
 GRIPPED_BEFORE = "the gripper has not answered yet, and an earlier daemon had gripped a tool"
 
 
 class _KnownGrip(NamedTuple):
-    """What was known of a grip; the names are those of `HeldTool`."""
+    """The state of a grip before another one; the names are as in `HeldTool`."""
 
     grip: Grip
     is_earlier: bool
@@ -21,7 +21,7 @@ class _KnownGrip(NamedTuple):
 
 @dataclass(slots=True)
 class HeldTool:
-    """What is known of the tool; the control loop tells of each gripper state, grip, release and start.
+    """The state of the tool; the control loop reports each gripper state, grip, release and start.
 
     `has_gripper`: a gripper of ours holds it; without one it is clamped by other means, and its grip is an angle alone.
     """
@@ -40,9 +40,9 @@ class HeldTool:
     expected: bool = False
     # Why a release after a stop did not open the gripper, until the operator acknowledges it.
     release_error: str | None = None
-    # Whether the fingers close tighter on what they hold already: the grip and its angle stay.
+    # Whether the fingers close tighter on a held object: the grip and its angle stay.
     _tightens: bool = False
-    # What was known as the present `grip` step began, which may be refused.
+    # The state as the present `grip` step began, which may be refused.
     _before_closing: _KnownGrip | None = None
     # Awaits the gripper's first state that shows whether a grip of an earlier process is the present one.
     _on_judged: OnJudged | None = None
@@ -88,7 +88,7 @@ class HeldTool:
         self._tightens, self._before_closing = False, None
 
     def count_angle(self, wrist_rad: float) -> float:
-        """Return the wrist's angle from which the tool's angle counts: the present one where none counts yet."""
+        """Return the wrist's angle at which the tool's angle is 0: the present one where none counts yet."""
         if self.grip.origin_rad is None:
             self.grip = replace(self.grip, origin_rad=wrist_rad)
             return wrist_rad
@@ -101,12 +101,12 @@ class HeldTool:
         return 0.0 if arm is None or origin_rad is None else arm.wrist_rad - origin_rad
 
     def begin_grip(self, action: GripStep, origin_rad: float) -> None:
-        """Note what is known of the tool as the fingers begin to move."""
+        """Keep the state of the tool as the fingers begin to move."""
         # A process that dies while the fingers close leaves this force behind.
         force_n = max(self.grip.force_n or 0.0, action.force_n)
         self._before_closing = _KnownGrip(self.grip, self.is_earlier, self.another)
         self._tightens = not isinstance(action, Opening) and self._has_grip()
-        # While fingers open, their last width on the tool tells whether they have let it go.
+        # While fingers open, their last width on the tool shows whether they have let it go.
         width_mm = self.grip.width_mm if self._tightens or isinstance(action, Opening) else None
         self.grip = Grip(origin_rad, force_n, width_mm)
         self.is_earlier = False
@@ -135,7 +135,7 @@ class HeldTool:
         self.expected = action.expect_object or holding
 
     def on_grip_refused(self) -> None:
-        """Take that the present `grip` step was refused before the fingers moved: what they hold is as it was."""
+        """Take that the present `grip` step was refused before the fingers moved: the grip is as before."""
         if self._before_closing is not None:
             self.grip, self.is_earlier, self.another = self._before_closing
             self._tightens = False

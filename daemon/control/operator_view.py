@@ -1,4 +1,4 @@
-"""What the operator may do now, why not, and what it would do to a held tool: refusals, and questions before them."""
+"""The operator's commands at present: why each is refused, and which question comes before it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -77,7 +77,7 @@ class OperatorView:
         return None
 
     def why_no_tare_step(self) -> str | None:
-        """Return why an experiment cannot take a zero now, or None: nobody is there to confirm it."""
+        """Return why an experiment cannot take a zero now, or None: no operator confirms it."""
         if (reason := self.tool.held or self.tool.uncertain) is not None:
             return f"{reason}; put a `release` before it"
         if loaded := self._loaded():
@@ -112,8 +112,8 @@ class OperatorView:
         """Return what a release does now, for the operator who confirms it."""
         if not self.tool.has_gripper:
             present = f"at present {turned}" if (turned := self._clamped_turn()) else "no angle counts at present"
-            anew = "the angle of the clamped tool counts anew from the next start"
-            return f"nothing opens, because no gripper is configured; {anew}; {present}"
+            from_zero = "the angle of the clamped tool counts from 0 at the next start"
+            return f"nothing opens, because no gripper is configured; {from_zero}; {present}"
         gripper = self.inputs.gripper
         apart = f"its fingers are {gripper.width_mm:.0f} mm apart" if gripper is not None else "its width is unknown"
         what = self.tool.held or f"the gripper reports no object, and {apart}"
@@ -123,7 +123,7 @@ class OperatorView:
     def why_another_stop(self, named: int | None) -> str:
         """Return how the stop that waits differs from the one that an unlock names, if any; empty where it does not.
 
-        One that somebody else has acknowledged is none that an unlock could clear unseen.
+        A stop that another operator has acknowledged cannot be cleared unseen.
         """
         if named in (None, self.safety.waiting) or not self.safety.stopped:
             return ""
@@ -147,20 +147,20 @@ class OperatorView:
         return activation_sentence(self.tool.held or may_hold)
 
     def activation_note(self, file: ExperimentFile) -> str:
-        """Return what the first step with the gripper does besides, for the operator who starts; or an empty string."""
+        """Return a sentence on the activation before the first step with the gripper; empty without one."""
         first = first_gripper_step(file)
         if first is None or not self.tool.activates or not self.tool.may_hold():
             return ""
         return f" Before step {first[0]} the gripper is activated: its fingers open and close once, and a tool drops."
 
     def held_note(self, file: ExperimentFile) -> str:
-        """Return what is held as an experiment begins to turn it, for the operator's question; or an empty string."""
+        """Return a sentence on the held tool, for the question before a start; empty where no step turns it."""
         if not self.tool.has_gripper:
             turned = self._clamped_turn()
-            anew = "if another tool is clamped, `shearloop command release --yes` lets its angle count anew"
-            return f" At present the clamped tool's angle counts on: {turned}; {anew}." if turned else ""
+            from_zero = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
+            return f" At present the clamped tool's angle goes on: {turned}; {from_zero}." if turned else ""
         held, unknown, first = self.tool.held, self.tool.unknown_grip, first_gripper_step(file)
-        # A `grip` closes tighter on what is held, and its angle stays as unknown as it is.
+        # A `grip` closes tighter on the held tool, and its angle stays unknown.
         turns = first_motion_before_grip(file) is not None
         turns = turns or bool(unknown and first is not None and isinstance(first[1], GripStep))
         if held is None or not turns:
@@ -208,7 +208,7 @@ class OperatorView:
         return f"{why}; put a `grip` or a `release` before {motion}"
 
     def _why_no_activation(self, file: ExperimentFile) -> str | None:
-        """Return why an experiment must not activate the gripper, or None: its grip would drop what is held."""
+        """Return why an experiment must not activate the gripper, or None: its grip would drop the held tool."""
         first, held = first_gripper_step(file), self.tool.may_still_hold
         if first is None or not isinstance(first[1], GripStep) or not self.tool.activates or held is None:
             return None
@@ -220,7 +220,7 @@ class OperatorView:
         )
 
     def _why_no_grip(self, file: ExperimentFile) -> str | None:
-        """Return why the first `grip` would open the fingers on what they hold, or None."""
+        """Return why the first `grip` would open the fingers on the held tool, or None."""
         first, gripper, held = first_gripper_step(file), self.inputs.gripper, self.tool.held
         if first is None or gripper is None or held is None:
             return None

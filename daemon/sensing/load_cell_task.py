@@ -38,8 +38,8 @@ class LoadCellTask:
         self._zero_from_ns = self._zero_until_ns = 0
         self._zero_error: str | None = None
         self._confirmed = False
-        # By which a zero is judged: with the zero before the first tare, or with the last that the operator confirmed.
-        # Small loads in one zero after the other would otherwise add up.
+        # A new zero is judged by this one: of the daemon's start, or of the last confirmed tare. Judged by the latest,
+        # small loads in one tare after the other would add up.
         self._judged_by: LoadCalibration | None = None
         self._sampled = asyncio.Event()
         self._latest: LoadSample | None = None
@@ -68,12 +68,12 @@ class LoadCellTask:
     def tare(self, *, confirmed: bool = False) -> None:
         """Make the mean of samples measured from now on the zero; samples under way belong to the load before.
 
-        A mean that is a load is refused unless the operator has `confirmed` that there is none. It is judged by the
-        zero that the operator confirmed last, else by that of the daemon's start.
+        A mean that is a load is refused unless the operator has `confirmed` that nothing is loaded. It is judged by the
+        zero of the last confirmed tare, else by the one at the daemon's start.
         """
         self._zeroing, self._zero_error, self._confirmed = [], None, confirmed
         if self._loop is not None:
-            # Whoever asks for a zero does not trust the one before.
+            # A request for a zero means that the one before is not trusted.
             self._loop.on_zero(LOAD_CELL, known=False)
         now_ns = self._clock.now_ns()
         # The middle of the first settled reading.
@@ -148,7 +148,7 @@ class LoadCellTask:
     def _why_no_zero(self, raw: float, samples: Sequence[float]) -> str:
         """Return why the mean of raw samples is no zero, or an empty string.
 
-        The operator can confirm that a constant torque is no load, and not that a torque that changes is none.
+        The operator can confirm that a constant torque is no load. A torque that changes is a load.
         """
         calibration = self._board.calibration
         changed_nm = abs(calibration.torque_nm(max(samples)) - calibration.torque_nm(min(samples)))

@@ -20,7 +20,7 @@ CLOSE_RTDE: Final = signal.SIGUSR2
 
 
 class ForgetfulReceiver(RtdeReceiver):
-    """A connection whose deadlines can end."""
+    """A connection that can stop writing deadlines."""
 
     _forgets: ClassVar[bool] = False
 
@@ -36,9 +36,9 @@ class ForgetfulReceiver(RtdeReceiver):
 
 
 def close_rtde() -> None:
-    """Close every RTDE connection of this process, whoever holds it."""
+    """Close every RTDE connection of this process, also those of ur-rtde."""
     for entry in Path("/proc/self/fd").iterdir():
-        # A socket without a peer, or one that was closed meanwhile, is none of RTDE.
+        # A socket without a peer, or one that was closed meanwhile, does not belong to RTDE.
         with suppress(OSError):
             if entry.is_socket():
                 _shut_down(os.dup(int(entry.name)))
@@ -47,7 +47,7 @@ def close_rtde() -> None:
 def _shut_down(fd: int) -> None:
     """Close a connection if it is one to RTDE, for all who hold it."""
     with socket.socket(fileno=fd) as connection:
-        # The pipe to the daemon is a local socket, whose peer has no port.
+        # The pipe to the daemon is a local socket: its peer has no port.
         is_network = connection.family in (socket.AF_INET, socket.AF_INET6)
         if is_network and connection.getpeername()[1] == RTDE_PORT:
             connection.shutdown(socket.SHUT_RDWR)

@@ -15,6 +15,10 @@ def why_no_host(host: str) -> str:
     """Return why a text is no name or address of a computer, as the end of a sentence, or an empty string."""
     if not host.strip():
         return "is empty"
+    if host != host.strip():
+        return "begins or ends with a space"
+    if not is_address(host) and (unfit := set(host) & set(" :/@[]")):
+        return f"is no name or address of a computer: take out {' and '.join(map(repr, sorted(unfit)))}, and any port"
     try:
         host.encode("idna")
     except UnicodeError:

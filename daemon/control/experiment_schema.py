@@ -13,6 +13,7 @@ from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, FileKind, eit
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
 from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S, GripperModel
+from shearloop.drivers.ur.poses import ONLY_TURNS_M, turn_between
 from shearloop.mistakes import shown
 
 MOST_ANGLES = 1000
@@ -415,13 +416,15 @@ def _outlined(content: object) -> Step:
 class Demand(NamedTuple):
     """The largest torque (N·m) and angle from the grip (rad) of a step, and its times.
 
-    It stands still for `stands_s` in all, and takes about `moves_s` for everything else.
+    It stands still for `stands_s` in all, and takes about `moves_s` for everything else. `begins_anywhere`: it moves to
+    a pose from one that is not known before, so that `moves_s` is a guess.
     """
 
     torque_nm: float = 0.0
     angle_rad: float = 0.0
     stands_s: float = 0.0
     moves_s: float = 0.0
+    begins_anywhere: bool = False
 
     @property
     def takes_s(self) -> float:
@@ -440,10 +443,11 @@ def _travel_rad(angles_rad: Sequence[float]) -> float:
 
 
 class Before(NamedTuple):
-    """What a step begins at: the torque that is held, and the angle of the wrist joint, None where it is not known."""
+    """What a step begins at: the held torque, the wrist joint's angle, and the tool's pose; None for unknown ones."""
 
     torque_nm: float = 0.0
     wrist_rad: float | None = None
+    pose_m_rad: Sequence[float] | None = None
 
 
 NOTHING_BEFORE: Final = Before()
@@ -461,6 +465,8 @@ def demands(planned: Iterable[Step], speeds: Speeds = AS_ASKED) -> Iterator[Dema
                 before = Before(step.signed_torque_nm)
             case GripStep() | ReleaseStep() | TwistStep(return_to_start=True):
                 before = Before(wrist_rad=before.wrist_rad)
+            case ApproachStep(pose_m_rad=pose):
+                before = Before(before.torque_nm, pose_m_rad=pose)
             case TwistStep() | TightenStep() | IdentifyStep():
                 # How they end is not known before.
                 before = NOTHING_BEFORE
@@ -503,7 +509,15 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
             # Where the wrist is, is known only there.
             travel_rad = 1.0 if before.wrist_rad is None else abs(angle_rad - before.wrist_rad)
             return Demand(moves_s=SETTLES_S + travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s))
-        case ApproachStep() | GripStep() | ReleaseStep() | AdaptStep():
+        case ApproachStep(pose_m_rad=tuple() as pose) if before.pose_m_rad is not None:
+            speed = min(step.speed_m_per_s, speeds.linear_m_per_s)
+            way_m, turn_rad = math.dist(pose[:3], before.pose_m_rad[:3]), turn_between(pose, before.pose_m_rad)
+            # The tool turns evenly on its way, and no faster than the wrist may.
+            turns_s = turn_rad / (speed if way_m <= ONLY_TURNS_M else speeds.wrist_rad_per_s)
+            return Demand(moves_s=1.0 + max(way_m / speed, turns_s))
+        case ApproachStep():
+            return Demand(moves_s=3.0, begins_anywhere=True)
+        case GripStep() | ReleaseStep() | AdaptStep():
             return Demand(moves_s=3.0)
         case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | TurnToStep() | WaitStep():
             return Demand()

@@ -149,6 +149,8 @@ def plan_of(
             notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques of the grip")
             duration_s += warm_up_s
             waits = False
+        if needs.begins_anywhere:
+            notes.append("how long it takes depends on where the arm stands, and is a guess here")
         if step.timeout_s is not None and needs.takes_s > step.timeout_s:
             notes.append(f"its timeout_s of {step.timeout_s:g} s may stop it before its end")
         if number == untared:

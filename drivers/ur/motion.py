@@ -22,6 +22,7 @@ from shearloop.drivers.ur.messages import (
     Stop,
     WristSpeed,
 )
+from shearloop.drivers.ur.poses import ONLY_TURNS_M, turn_between
 from shearloop.drivers.ur.settings import Bound, InstalledTool, Six, UrLimits, UrSettings
 
 if TYPE_CHECKING:
@@ -314,9 +315,9 @@ def _old(sample: RtdeSample) -> str:
 
 
 def _nominal_move_s(move: MoveLinear, sample: RtdeSample) -> float:
-    distance_m = math.dist(move.pose[:3], sample.tcp_pose[:3])
-    # At most half a turn; a move that only turns takes its speed as rad/s.
-    way = max(distance_m, math.pi if distance_m < 1e-3 else 0.0)
+    way = math.dist(move.pose[:3], sample.tcp_pose[:3])
+    if way <= ONLY_TURNS_M:
+        way = turn_between(move.pose, sample.tcp_pose)
     return way / move.speed_m_per_s + move.speed_m_per_s / move.acceleration_m_per_s2
 
 
@@ -392,7 +393,7 @@ def clip_linear(asked: MoveLinear, here: Six, limits: UrLimits) -> tuple[MoveLin
         asked.acceleration_m_per_s2, limits.linear_acceleration_m_per_s2, "linear acceleration", reasons
     )
     way_m, turn_rad = math.dist(here[:3], asked.pose[:3]), turn_between(here, asked.pose)
-    if way_m > 0 and turn_rad > 0:
+    if way_m > ONLY_TURNS_M and turn_rad > 0:
         m_per_rad = way_m / turn_rad
         turning_m_per_s = m_per_rad * limits.wrist_speed_rad_per_s.inner
         if speed > turning_m_per_s:
@@ -400,20 +401,6 @@ def clip_linear(asked: MoveLinear, here: Six, limits: UrLimits) -> tuple[MoveLin
             speed = turning_m_per_s
         acceleration = min(acceleration, m_per_rad * limits.wrist_acceleration_rad_per_s2.inner)
     return MoveLinear(asked.pose, speed, acceleration), tuple(reasons)
-
-
-def turn_between(pose: Six, other: Six) -> float:
-    """Return the angle between the orientations of two poses, 0 to pi."""
-    dot = sum(one * another for one, another in zip(_quaternion(pose), _quaternion(other), strict=True))
-    return 2.0 * math.acos(min(1.0, abs(dot)))
-
-
-def _quaternion(pose: Six) -> tuple[float, float, float, float]:
-    x, y, z = pose[3:]
-    half_rad = 0.5 * math.hypot(x, y, z)
-    # sin(a)/(2 a) is 1/2 at 0.
-    part = math.sin(half_rad) / (2.0 * half_rad) if half_rad else 0.5
-    return math.cos(half_rad), part * x, part * y, part * z
 
 
 def is_recent(sample: RtdeSample, settings: UrSettings) -> bool:

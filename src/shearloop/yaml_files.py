@@ -226,7 +226,7 @@ def _meant(path: Path) -> str:
         # A folder of `init` has its configuration under this name.
         near = ["rig.yaml"] if "rig.yaml" in names else names
     else:
-        near = get_close_matches(path.name, names, 1)
+        near = get_close_matches(path.name, [name for name in names if name != path.name], 1)
     return f"; did you mean {folder / near[0]}?" if near else ""
 
 

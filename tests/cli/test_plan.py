@@ -1,5 +1,6 @@
 """The rehearsal: `check` prints an experiment's plan, and what the configured devices do not allow."""
 
+import math
 import re
 from pathlib import Path
 
@@ -232,6 +233,22 @@ def test_the_duration_knows_what_the_steps_before_have_left():
     assert durations_s[2] == pytest.approx(2 * (0.05 + 0.25) / 0.1 + 4 * 0.5)
     assert durations_s[3:5] == pytest.approx([12 + 0.08 / 0.04, 12 + 0.13 / 0.04])
     assert durations_s[6] == durations_s[3]
+
+
+def test_the_duration_of_a_move_between_two_poses_counts_the_tools_turn():
+    """A tool that turns by 90 degrees on 5 mm is slowed to the wrist's speed. The first move begins anywhere."""
+    poses = [
+        (0.3, -0.4, 0.3, 3.14159, 0.0, 0.0),
+        (0.3, -0.4, 0.305, 2.22144, 2.22144, 0.0),
+        (0.3, -0.4, 0.405, 2.22144, 2.22144, 0.0),
+    ]
+    steps = [{"do": "approach", "pose_m_rad": pose, "speed_m_per_s": 0.05, "timeout_s": 4} for pose in poses]
+    robot = read_settings(ROBOT).limits
+    guessed, turned, straight = plan_of(ExperimentFile.model_validate({"name": "one", "steps": steps}), robot).steps
+    assert "is a guess here" in " ".join(guessed.notes)
+    assert turned.duration_s == pytest.approx(1.0 + math.pi / 2 / robot.wrist_speed_rad_per_s.inner, rel=1e-3)
+    assert turned.notes == ("its timeout_s of 4 s may stop it before its end",)
+    assert straight.duration_s == pytest.approx(1.0 + 0.1 / 0.05, rel=1e-3)
 
 
 def test_an_experiment_without_its_steps_is_still_one(tmp_path, capsys):

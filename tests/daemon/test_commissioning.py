@@ -115,6 +115,12 @@ def changed(report: Report, **rig: str | bool) -> Report:
     return report.model_copy(update={"rig": report.rig.model_copy(update=rig)})
 
 
+def with_a_stage_of(report: Report, date: datetime) -> Report:
+    """Return the report whose last stage alone has another date."""
+    *stages, last = report.stages
+    return report.model_copy(update={"stages": (*stages, last.model_copy(update={"date": date}))})
+
+
 @pytest.mark.parametrize(
     ("change", "now", "why"),
     [
@@ -127,6 +133,8 @@ def changed(report: Report, **rig: str | bool) -> Report:
         (lambda report: report.model_copy(update={"stages": ()}), NOW, "no stage"),
         (lambda report: report, NOW + timedelta(days=MOST_AGE_DAYS, hours=1), "older than"),
         (lambda report: report, NOW - timedelta(days=2), "in the future"),
+        (lambda report: with_a_stage_of(report, NOW + timedelta(days=2)), NOW, "in the future"),
+        (lambda report: with_a_stage_of(report, NOW - timedelta(days=MOST_AGE_DAYS + 1)), NOW, "older than"),
     ],
 )
 def test_a_report_that_does_not_count_raises_and_supplies_nothing(tmp_path, change, now, why):

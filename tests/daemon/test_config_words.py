@@ -65,7 +65,22 @@ def test_an_address_that_cannot_be_bound_is_refused_with_the_cause(key, address,
     assert "network" not in said
 
 
-@pytest.mark.parametrize("host", ["192.168.1.300", "192.168.1", "1.2.3.4.5", "", " ", "a..b"])
+@pytest.mark.parametrize(
+    "host",
+    [
+        "192.168.1.300",
+        "192.168.1",
+        "1.2.3.4.5",
+        "",
+        " ",
+        "a..b",
+        "192.168.1.10:30004",
+        "http://arm",
+        "arm ",
+        "[::1]",
+        "a b",
+    ],
+)
 def test_a_host_that_is_no_address_is_refused_everywhere(host, tmp_path):
     assert why_no_host(host)
     gripper = {"gripper": {"socket": {"host": host}}, "robot": "ur.yaml", "load_cell": {"device": {"path": "port"}}}

@@ -1,0 +1,21 @@
+"""Orientations of poses: x, y, z in m and a rotation vector in rad, as URScript has them."""
+
+import math
+from collections.abc import Sequence
+
+# The controller takes the speed of a shorter straight move, which only turns the tool, in rad/s.
+ONLY_TURNS_M = 1e-6
+
+
+def turn_between(pose: Sequence[float], other: Sequence[float]) -> float:
+    """Return the angle between the orientations of two poses, 0 to pi."""
+    dot = sum(one * another for one, another in zip(_quaternion(pose), _quaternion(other), strict=True))
+    return 2.0 * math.acos(min(1.0, abs(dot)))
+
+
+def _quaternion(pose: Sequence[float]) -> tuple[float, float, float, float]:
+    x, y, z = pose[3:]
+    half_rad = 0.5 * math.hypot(x, y, z)
+    # sin(a)/(2 a) is 1/2 at 0.
+    part = math.sin(half_rad) / (2.0 * half_rad) if half_rad else 0.5
+    return math.cos(half_rad), part * x, part * y, part * z

@@ -23,6 +23,7 @@ from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState, Stop, WristSpeed
 from shearloop.drivers.ur.settings import read_settings
+from shearloop.emulators.emulated_rig import NOISE_NM
 from tests.emulator_process import EmulatorProcess, Event
 from tests.running import running
 
@@ -31,6 +32,8 @@ SPEED = 10
 PACE = ("--speed", str(SPEED), "--rate-hz", "250", "--unlock-wait-s", "0.2", "--power-on-s", "0.1")
 DEADLINE_S = 30
 N_FRAMES, N_SAMPLES = 6, 20
+# Of a mean of so many samples: six times its standard deviation.
+LOAD_NOISE_NM = 6 * NOISE_NM / N_SAMPLES**0.5
 PERIOD_NS = round(0.5408e9 / SPEED)
 CM_PER_NM = (1.25 - 1.85) / 0.14
 PATTERN = np.cos(PAPER_TABLE.electrodes @ [0.3, 0.1, 0.2, 0.5])

@@ -23,7 +23,7 @@ THINGS = {
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add a sub-parser per thing."""
     parser.epilog = (
-        "The first time, follow docs/first-calibration.md: load, gripper, recording, creep. Without a THING, it "
+        "The first time, follow docs/calibrations.md: load, gripper, recording, creep. Without a THING, it "
         "calibrates on recordings: `shearloop calibrate REC.mcap --out right.cal`. See also `shearloop skin calibrate`."
     )
     explained = "`shearloop calibrate THING --help` explains one"

@@ -171,7 +171,7 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = N
     elif needs_keys(address):
         raise UserError(
             f"{address} is not on this machine: give your key with --key and the daemon's with --server-key; "
-            "`shearloop keys client` makes yours, docs/security.md shows the rest"
+            "`shearloop keys client` makes yours, docs/service.md shows the rest"
         )
     try:
         socket.connect(address)

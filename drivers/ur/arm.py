@@ -5,6 +5,7 @@ its process when RTDE is lost or it has connected again. So it has a process of 
 """
 
 import ctypes
+import math
 import os
 import sys
 import time
@@ -81,6 +82,8 @@ class UrArm:
         self.wrench_zero: Six = (0.0,) * 6
         # Of the latest samples at rest, as the controller measures them: one is known to its noise only.
         self._recent_wrenches: deque[Six] = deque(maxlen=round(_HELD_OVER_S * settings.rate_hz))
+        # When the latest sample that was read was made, by the controller's clock.
+        self._measured_s = math.nan
         # The wrench before a program was first sent, where something was held, until that program has its zero.
         self._held: Six | None = None
         # Whether the program that was sent last has answered.
@@ -104,11 +107,13 @@ class UrArm:
             and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
             rest_rad_per_s=self._settings.rest_rad_per_s,
         )
-        if read.rests:
-            self._recent_wrenches.append(sample.wrench)
-        else:
+        if not read.rests:
             # A motion has a wrench of its own.
             self._recent_wrenches.clear()
+        elif sample.timestamp_s != self._measured_s:
+            # Commands between two samples read the same one again.
+            self._recent_wrenches.append(sample.wrench)
+        self._measured_s = sample.timestamp_s
         return read
 
     def take_errors(self) -> list[ControllerError]:
@@ -200,9 +205,13 @@ class UrArm:
 
         With something held the zero is known once the wrench has been measured for a second of the program.
         """
-        armed = self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)
-        if not (armed and self._settings.facts.zeroes_at_start):
-            return armed
+        if self._answered:
+            # Each command that is carried out once takes four of the worker's cycles.
+            fed = self.send_heartbeat()
+        else:
+            fed = self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)
+        if not (fed and self._settings.facts.zeroes_at_start):
+            return fed
         if not self._answered:
             self._answered = True
             self._recent_wrenches.clear()

@@ -256,6 +256,35 @@ def test_the_kept_zero_is_known_to_less_than_the_noise_of_one_sample(arm, monkey
     assert -one.wrench_zero[5] == pytest.approx(0.3 if held else 0.0, abs=0.03)
 
 
+def test_the_wait_for_the_load_of_a_new_program_takes_one_command_and_then_heartbeats(arm, monkeypatch):
+    """Each command that is carried out once takes several cycles, and the wait is a second of cycles."""
+    monkeypatch.setattr(arm.ScriptPort, "send", lambda *_: None)
+    one = arm.UrArm(SETTINGS)
+    one.upload(held=True)
+    Client.made.calls.clear()
+    for number in range(round(SETTINGS.rate_hz)):
+        Receiver.made.sample = received(2.0 + number / 125)
+        assert not one.arm_watchdog()
+        one.read()
+    one.script_readiness.waiting = False
+    assert one.arm_watchdog()
+    sent = [name for name in Client.made.calls if name != "isConnected"]
+    assert sent == ["setWatchdog"] + ["kickWatchdog"] * round(SETTINGS.rate_hz)
+
+
+def test_a_sample_that_is_read_twice_is_measured_once(arm):
+    """Each command reads the latest sample again: half a second of samples would pass for a second."""
+    one = arm.UrArm(SETTINGS)
+    for number in range(round(SETTINGS.rate_hz) - 1):
+        Receiver.made.sample = received(1.0 + number / 125)
+        one.read()
+        one.read()
+    assert not one.knows_load(held=True)
+    Receiver.made.sample = received(3.0)
+    one.read()
+    assert one.knows_load(held=True)
+
+
 @pytest.mark.parametrize("held", [True, False])
 def test_wrench_of_what_is_held_outlives_the_zero_of_a_new_program(arm, monkeypatch, held):
     """An e-Series zeroes its wrench as a program starts."""

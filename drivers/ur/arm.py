@@ -16,7 +16,13 @@ from statistics import fmean
 
 import rtde_control
 
-from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge, ScriptReadiness, command_dashboard
+from shearloop.drivers.ur.control_box import (
+    RtdeReceiver,
+    SampleAge,
+    ScriptReadiness,
+    command_dashboard,
+    lose_dead_peers_of_ports,
+)
 from shearloop.drivers.ur.messages import (
     RUNTIME_PLAYING,
     ControllerError,
@@ -74,6 +80,7 @@ class UrArm:
         flags = int(kind.FLAG_NO_WAIT) | (int(kind.FLAG_UPPER_RANGE_REGISTERS) if registers.first else 0)
         self._control = kind(settings.host, settings.rate_hz, flags)
         _set_timer_slack(0)
+        lose_dead_peers_of_ports()
         self._script_port = ScriptPort(settings.host, _UPLOAD_S)
         # A straight move was begun, and the wrist has not turned since.
         self._may_move_linearly = False

@@ -5,12 +5,13 @@ check the answer to its protocol request and waits without a limit for a silent 
 """
 
 import math
+import os
 import re
 import select
 import socket
 import struct
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final
@@ -327,6 +328,18 @@ def lose_dead_peers(connection: socket.socket) -> None:
         (socket.TCP_USER_TIMEOUT, 1000 * _PEER_GONE_S),
     ):
         connection.setsockopt(socket.IPPROTO_TCP, option, value)
+
+
+def lose_dead_peers_of_ports(ports: Iterable[int] = tuple(SERVICES)) -> None:
+    """Call `lose_dead_peers` for all connections of this process to these ports: ur-rtde hides its sockets."""
+    for descriptor in os.listdir("/proc/self/fd"):
+        # The listing's own descriptor is closed by then, and a socket that waits for clients has no peer.
+        with suppress(OSError):
+            if not os.readlink(f"/proc/self/fd/{descriptor}").startswith("socket:"):
+                continue
+            with socket.socket(fileno=os.dup(int(descriptor))) as connection:
+                if connection.family in (socket.AF_INET, socket.AF_INET6) and connection.getpeername()[1] in ports:
+                    lose_dead_peers(connection)
 
 
 def _agree_on_protocol(connection: socket.socket) -> bool:

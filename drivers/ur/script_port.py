@@ -11,6 +11,7 @@ from typing import Final
 
 from shearloop.drivers.defaults import SCRIPT_PORT
 from shearloop.drivers.errors import system_reason
+from shearloop.drivers.ur.control_box import lose_dead_peers
 from shearloop.drivers.ur.messages import RobotLostError
 
 # Some seconds of states.
@@ -36,6 +37,7 @@ class ScriptPort:
         unsent = memoryview(program.encode())
         try:
             self._connection = socket.create_connection(self._address, self._timeout_s)
+            lose_dead_peers(self._connection)
             self._connection.setblocking(False)
             while unsent:
                 waited = max(0.0, until_s - time.monotonic())

@@ -8,7 +8,7 @@ from shearloop.daemon.config import GripperConfig
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.robotiq.gripper import ACTIVATION_DEADLINE_NS, PAUSE_NS, RESET_DEADLINE_NS, WidthCalibration
 from shearloop.drivers.robotiq.messages import GripperState
-from shearloop.drivers.robotiq.models import MODELS
+from shearloop.drivers.robotiq.models import MODELS, ModelName
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.fingers import FINGERS_MM_PER_S, GENTLE_N, Gripper, close_fingers, open_fingers
 from shearloop.tools.commission.operator import Played
@@ -105,13 +105,27 @@ def judge_widths(gauges: Sequence[tuple[float, float]], config: GripperConfig) -
     """Return the line on a table of widths through gauges, and the table."""
     limit, promise = f"± {WIDTH_MM:g} mm", "diameters are right"
     try:
-        found = WidthCalibration.of_gauges(gauges, config.model)
+        errors_mm = [_error_mm(gauge, gauges, config.model) for gauge in gauges]
     except DeviceCalibrationError as error:
         return judged("widths", str(error), limit, promise, passed=False, count=len(gauges)), Supplied()
-    error_mm = max(abs(found.width_mm(counts) - width_mm) for counts, width_mm in gauges)
-    passed = error_mm <= WIDTH_MM
-    line = judged("widths", f"{error_mm:.2f} mm from the table", limit, promise, passed=passed, count=len(gauges))
+    passed = max(errors_mm) <= WIDTH_MM
+    value = f"{max(errors_mm):.2f} mm off, each gauge between two others by the table of those"
+    line = judged("widths", value, limit, promise, passed=passed, count=len(gauges))
     return line, Supplied(widths=tuple(gauges)) if passed else Supplied()
+
+
+def _error_mm(gauge: tuple[float, float], gauges: Sequence[tuple[float, float]], model: ModelName) -> float:
+    """Return the error at a gauge of the table of all other widths, or of all where it is the narrowest or widest.
+
+    A table of other widths says what happens at a tool that no gauge was like. Outside its gauges a table is a guess.
+    Raises DeviceCalibrationError where no table goes through the gauges.
+    """
+    counts, width_mm = gauge
+    others = [other for other in gauges if other[1] != width_mm]
+    widths_mm = [width_mm for _, width_mm in gauges]
+    between = min(widths_mm) < width_mm < max(widths_mm)
+    table = WidthCalibration.of_gauges(others if between else gauges, model)
+    return abs(table.width_mm(counts) - width_mm)
 
 
 def _objects(context: Context, gripper: Gripper) -> list[Line]:

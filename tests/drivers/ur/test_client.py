@@ -5,13 +5,16 @@ import contextlib
 import os
 import re
 import signal
+import socket
 import sys
 import time
 from collections.abc import AsyncIterator
+from pathlib import Path
 
 import pytest
 
 from shearloop.drivers.connection import LinkObserver
+from shearloop.drivers.defaults import RTDE_PORT
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.control_box import probe_controller, query_controller
 from shearloop.drivers.ur.messages import Enable, MoveLinear, RobotLostError, Stop, Unlock, WristSpeed, ZeroForceTorque
@@ -28,6 +31,16 @@ pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to
 
 # A twist whose client dies: its deadline in these tests, and the time to brake.
 STOPPED_WITHIN_S = settings_for("a-robot").standstill_s
+# The timer of a connection in /proc/net/tcp.
+KEPT_ALIVE = "02"
+
+
+def timers_of(pid: int, host: str, port: int) -> list[str]:
+    """Return the timer of each connection of a process to a port of a host (proc(5), /proc/net/tcp)."""
+    address = f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}:{port:04X}"
+    inodes = {os.readlink(path) for path in Path(f"/proc/{pid}/fd").iterdir() if path.exists()}
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    return [row[5].partition(":")[0] for row in rows if row[2] == address and f"socket:[{row[9]}]" in inodes]
 
 
 async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5) -> None:
@@ -59,6 +72,15 @@ async def stops(controller: ControllerProcess, since_ns: int, within_s: float = 
     stopped = await controller.event("motion-stopped", since_ns)
     assert (stopped["t_mono_ns"] - since_ns) / 1e9 <= within_s
     return stopped
+
+
+async def test_every_connection_of_the_worker_ends_when_the_controller_has_vanished(controller):
+    """Ours is kept alive, and so is that of ur-rtde."""
+    async with running(settings_for(controller.host)) as robot, asyncio.timeout(DEADLINE_S):
+        await until(robot, lambda state: state.program_running and not state.recovering)
+        # Another timer runs while something that was sent is not acknowledged.
+        while timers_of(pid_of(robot), controller.host, RTDE_PORT) != [KEPT_ALIVE] * 2:
+            await robot.next_state()
 
 
 async def test_states_arrive_and_replies_hold_the_sent_command(controller):

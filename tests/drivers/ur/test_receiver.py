@@ -1,5 +1,6 @@
 """RTDE samples from bytes and on a connection."""
 
+import contextlib
 import errno
 import math
 import socket
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur.control_box import RtdeReceiver, SampleParser
+from shearloop.drivers.ur.control_box import RtdeReceiver, SampleParser, lose_dead_peers_of_ports
 from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
 
 TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,DOUBLE,INT32,INT32,DOUBLE"
@@ -153,6 +154,17 @@ def test_deadline_is_written_to_its_register(play):
     receiver.close()
     receiver.write_deadline(1)
     assert not receiver.connected
+
+
+def test_connections_that_a_library_hides_lose_a_vanished_controller_too():
+    with contextlib.ExitStack() as stack:
+        listening = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(2)]
+        ports = [one.getsockname()[1] for one in listening]
+        robot, other = (stack.enter_context(socket.create_connection(("127.0.0.1", port))) for port in ports)
+        lose_dead_peers_of_ports(ports[:1])
+        timeouts_ms = [one.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) for one in (robot, other)]
+        assert timeouts_ms == [3000, 0]
+        assert robot.send(b"it is still open") == 16
 
 
 def test_controller_that_vanishes_is_lost_in_seconds(play):

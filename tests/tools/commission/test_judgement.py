@@ -15,6 +15,7 @@ from shearloop.daemon.commissioning import NOTHING_SUPPLIED
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
+from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.tools.commission import boards, tool
 from shearloop.tools.commission.boards import judge_frames, judge_load
@@ -412,6 +413,20 @@ def test_five_gauges_make_a_table_of_widths():
     assert (failed([line]), len(supplied.widths)) == ([], 5)
     line, supplied = judge_widths([*gauges[:2], (90.0, 66.0), *gauges[3:]], SimpleNamespace(model="2F-140"))
     assert (failed([line]), supplied.widths) == (["widths"], None)
+
+
+def test_a_gauge_is_judged_by_the_table_of_the_others():
+    """One that is 1.6 mm off draws its own table along, so that this table is only 0.9 mm off there."""
+    gauges = [(10.0 + 40.0 * number, 100.0 - 20.0 * number) for number in range(5)]
+    gauges[2] = (90.0, 61.6)
+    own = WidthCalibration.of_gauges(gauges, "2F-140")
+    assert max(abs(own.width_mm(counts) - width_mm) for counts, width_mm in gauges) < 1.0
+    line, supplied = judge_widths(gauges, SimpleNamespace(model="2F-140"))
+    assert (failed([line]), supplied.widths) == (["widths"], None)
+    assert line.value.startswith("1.6")
+    # The outermost ones are judged by a table that goes through them.
+    line, _ = judge_widths([gauges[0], gauges[4]], SimpleNamespace(model="2F-140"))
+    assert line.value.startswith("0.00")
 
 
 def test_the_robot_itself_bounds_every_motion():

@@ -1,12 +1,13 @@
-"""What twists of known torque are worth: the later twists of a grip, before and after the gain is adapted to the first.
+"""Measures the error on the later twists of a grip, before and after the first twists adapt the gain.
 
     python -m benchmarks.adaptation RECORDINGS --out DIR
 
-RECORDINGS holds streams. Each twist of a recording is left out in turn, after the first 1, 2 and 3, which are left out
-too and adapt the gain. Factors on the torque emulate grips of other gains. The last rows are a calibration on one grip
-of a 30 mm cylinder, adapted in the other one, both ways: the only grips whose gain did change. Columns: not
-adapted; as `shearloop adapt` does it; as if all that twists show were followed; as if the gain drifted by a tenth
-within a grip. Each cell has RMSE and score of the loaded frames, in mN·m, and their coverage. Writes adaptation.json.
+RECORDINGS holds streams. Each twist of a recording is left out in turn. The first 1, 2 or 3 twists are left out too,
+and adapt the gain. Factors on the torque emulate grips with other gains. In the last rows one grip of a 30 mm cylinder
+calibrates and the other one adapts, both ways. These are the only two grips with different gains. The columns are: not
+adapted; adapted as by `shearloop adapt`; always corrected by all that the twists show; corrected as if the gain drifted
+by a tenth within a grip. Each cell has RMSE and score of the loaded frames, in mN·m, and their coverage. Writes
+adaptation.json.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,13 +31,13 @@ from shearloop.tools.recordings.frames import read_recording
 
 STREAM, CYLINDERS, GRIPS = "3 December", ("20mm_1", "30mm_1", "30mm_2", "40mm_1"), ("30mm_1", "30mm_2")
 FACTORS, UNCHANGED, TWISTS = (0.7, 0.85, 1.0, 1.17, 1.4), (1.0,), (1, 2, 3)
-# A spread of the torque without motion so small that it only marks another tool, whose twists are followed always.
+# This spread of the torque without motion is too small to matter. It marks another tool: the gain follows its twists.
 MARK, DRIFT = 1e-9, 0.1
 VARIANTS = ("not adapted", "adapted", "followed always", "as if it drifted")
 
 
 class Row(NamedTuple):
-    """The figures of loaded frames by variant, after so many twists of a recording with a factor on the torque."""
+    """The figures of loaded frames by variant, for one recording, one number of twists and one factor on the torque."""
 
     recording: str
     twists: int
@@ -45,7 +46,7 @@ class Row(NamedTuple):
 
 
 class Material(NamedTuple):
-    """Recordings, how they are calibrated on, what is left out of them, and the factors on the torque."""
+    """Recordings, the recipe of their calibration, the kind of block to leave out, and the factors on the torque."""
 
     title: str
     recipe: Recipe
@@ -55,7 +56,7 @@ class Material(NamedTuple):
 
 
 def materials(streams: dict[str, FrameSeries], recording: Path) -> Iterator[Material]:
-    """Yield each part of the table, from all streams and from the recording of the one with ten twists."""
+    """Yield each part of the table, from all streams and from the recording with ten twists."""
     recipe, read = Recipe(DEFAULT), read_recording(recording)
     for sides in FINGERTIPS:
         chosen = [series_of(read, sides)]
@@ -67,7 +68,7 @@ def materials(streams: dict[str, FrameSeries], recording: Path) -> Iterator[Mate
 
 
 def variants(calibration: Calibration) -> dict[str, Calibration]:
-    """Return the calibration as it is, as if its twists were followed always, and as if its gain drifted."""
+    """Return the calibration unchanged, one that always follows its twists, and one with a drift of the gain."""
     gain = calibration.gain_regressor().gain
     gains = (gain, replace(gain, zero=MARK), replace(gain, drift=DRIFT))
     return {name: _with_gain(calibration, one) for name, one in zip(VARIANTS[1:], gains, strict=True)}
@@ -79,7 +80,7 @@ def _with_gain(calibration: Calibration, gain: GainSpread) -> Calibration:
 
 
 def judge(plan: Plan, block: Block, calibration: Calibration, factor: float) -> dict[str, EstimateTrack]:
-    """Return the track of a block with a factor on the torque, by each variant."""
+    """Return the track of a block by variant, with a factor on the torque."""
     (span,), first = block.judged, block.adapted
     if first is None:
         raise ValueError("the plan does not adapt")
@@ -92,13 +93,13 @@ def judge(plan: Plan, block: Block, calibration: Calibration, factor: float) -> 
 
 
 def rows_of(material: Material, n_twists: int) -> Iterator[Row]:
-    """Yield the figures after so many twists, by factor."""
+    """Yield the figures after `n_twists` twists, by factor."""
     names = [str(number) for number in range(len(material.recordings))]
     plan = plan_left_out(material.kind, material.recipe, material.recordings, names, adapt_twists=n_twists)
     fitted = [(block, fit_without(material.recipe.fit, plan.recordings, block)) for block in plan.blocks]
     for factor in material.factors:
         each = [judge(plan, block, calibration, factor) for block, calibration in fitted]
-        # A frame is loaded whatever the factor on its torque.
+        # The factor does not change which frames are loaded.
         figures = {
             name: figures_by_load([one[name] for one in each], factor * LOADED_NM)["loaded"] for name in VARIANTS
         }

@@ -38,7 +38,7 @@ _ANOTHER_DAEMON = "it is meant for an earlier daemon, and this one has begun sin
 
 
 class TareRefusal(Protocol):
-    """Says why no zero may be taken now."""
+    """Says why no zero may be taken at present."""
 
     def __call__(self, *, confirmed: bool = False) -> str | None:
         """Return why not, or None; `confirmed`: the operator says that nothing is loaded."""
@@ -64,11 +64,11 @@ class Commands:
     experiment: "ConfiguredExperiment | None"
     health: HealthReporter
     daemon_end: asyncio.Event
-    # Why no zero may be taken now, of the control loop or of the sensors alone.
+    # Why no zero may be taken at present, by the control loop or by the sensors alone.
     tare_refusal: TareRefusal
     # Receives each answered command, except questions.
     report: Callable[["Answered"], None] = lambda _: None
-    # Of this process: in a container, each has the same number.
+    # Random for each process, because every process in a container has the same number.
     instance: str = field(default_factory=lambda: secrets.token_hex(8))
 
     def handlers(self) -> Mapping[str, Handler]:
@@ -103,7 +103,7 @@ class Commands:
                 self.report(Answered(name, request, refusal))
 
     async def _experiments(self, _request: Request) -> Reply:
-        """Return the experiments that `start` may name, and the one that it runs if it names none."""
+        """Return the experiments that `start` may name, and the configured one, which it runs without a name."""
         rig = required_rig(self.rig)
         try:
             found = await rig.experiments.list(rig.reading_refusal)
@@ -215,17 +215,17 @@ class Commands:
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}
 
     async def _stop(self, request: Request) -> Reply:
-        # By the process a page finds out that it showed another daemon.
+        # The number of the process shows a page that it displayed another daemon.
         return {**self._stopped(request), "process": os.getpid()}
 
     def _stopped(self, request: Request) -> Reply:
-        """Stop what moves or is about to, else the daemon; return what was stopped."""
-        # A word that is not known may be a misspelt `spare_daemon`.
+        """Stop a motion or the beginning of one, else the daemon; return what was stopped."""
+        # An unknown argument may be a misspelt `spare_daemon`.
         spare_daemon = bool(request.get("spare_daemon") or request.keys() - {"command", "by", "spare_daemon"})
         held = self.rig.control_loop.tool.may_still_hold if self.rig is not None else None
         stopped = None
         if self.rig is not None:
-            # Where something may be held, a stop keeps the daemon, and the next start waits.
+            # If the gripper may hold something, a stop keeps the daemon, and the next start waits.
             stopped = self.rig.runner.stop(also_idle=spare_daemon or held is not None)
         waiting = self.experiment.call_off() if self.experiment is not None else None
         if stopped is not None:
@@ -234,7 +234,7 @@ class Commands:
             # The live page's stop button stops motion, but not the daemon.
             return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
         if held is not None:
-            # Somebody who presses twice must still be able to open the gripper.
+            # An operator who stops twice must still be able to open the gripper.
             return {"stopped": "", "held": held}
         # Nothing moves, so the daemon itself stops, once the reply is sent.
         asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
@@ -245,7 +245,7 @@ def check_arguments(name: str, request: Request) -> None:
     """Raise CommandRefusedError for an argument that a command does not have, or of another type.
 
     A misspelt `experiment` would start the configured one, and a `confirmed` of "no" would confirm.
-    A stop takes anything.
+    `stop` accepts any argument.
     """
     if name == STOP:
         return
@@ -274,7 +274,7 @@ def _refuse_if(reason: str | None) -> None:
 
 
 def _refuse_if_changed(question: Question, sentence: str, request: Request) -> None:
-    """Refuse what was confirmed with another question in view, and ask the present one."""
+    """Refuse a confirmation of an earlier question, and return the present question."""
     if request.get("digest", question.digest) != question.digest:
         changed = f"the gripper's state has changed since the question, or something was stopped or run: {sentence}"
         changed += "; answer it again"

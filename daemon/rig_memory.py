@@ -1,6 +1,6 @@
-"""What must outlive the daemon's process: a stop, the experiment that runs, and the grip with its zeros.
+"""Keeps the state that must survive the daemon's process: a stop, the running experiment, and the grip with its zeros.
 
-There is a file for each robot.
+Each robot has a file.
 """
 
 import asyncio
@@ -49,27 +49,27 @@ class Remembered:
     force_n: float | None = None
     width_mm: float | None = None
     requested_counts: int | None = None
-    # The load cell's zero in this grip, in the board's unit, and the torque of one unit, which names its calibration:
-    # with a tool in the fingers nobody can take another zero.
+    # The load cell's zero in this grip, in the board's unit, and the torque of one unit, which identifies its
+    # calibration. With a tool in the fingers the load cell cannot get a new zero.
     load_zero: float | None = None
     load_nm_per_count: float | None = None
-    # The zero of the wrench in this grip, and whether it was taken; else it is that of a program's start.
+    # The zero of the wrench in this grip, and whether a tare took it. Otherwise the program's start set it.
     wrench_zero: Six | None = None
     wrench_tared: bool = False
 
     @property
     def grip(self) -> Grip:
-        """What is known of the grip."""
+        """The known facts of the grip."""
         return Grip(self.origin_rad, self.force_n, self.width_mm, self.requested_counts)
 
     @property
     def grips(self) -> bool:
-        """Whether a tool may be held."""
+        """Whether the gripper may hold a tool."""
         return self.grip != NO_GRIP or self.load_zero is not None or self.wrench_zero is not None
 
     @property
     def held(self) -> str:
-        """What is known of a tool that may be held, without a capital letter and a full stop; empty without a grip."""
+        """A sentence on a tool that may be held, without a capital letter and a full stop; empty without a grip."""
         if not self.grips:
             return ""
         known = [
@@ -85,7 +85,7 @@ class Remembered:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """The faults of the stop that waits for the operator, one for each code; an experiment that ran is one."""
+        """The faults of the stop that waits for the operator, one for each code; a killed experiment is one of them."""
         entries = list(self.stop)
         if self.running:
             ended = f"it was killed, it crashed or the power failed while {self.running!r} was under way"
@@ -94,7 +94,7 @@ class Remembered:
         for name, detail in entries:
             code = FaultCode.__members__.get(name, FaultCode.DAEMON_ENDED)
             of_code = details.setdefault(code, [])
-            # A stop that was stored has what the program before has joined.
+            # A stored stop has details that the earlier process has joined.
             if not any(detail in one for one in of_code):
                 of_code.append(detail)
         return tuple(Fault(code, "; ".join(of_code)) for code, of_code in details.items())
@@ -118,9 +118,9 @@ class Remembered:
 
 @dataclass(slots=True)
 class RigMemory:
-    """Keeps a rig's state in a file, which is replaced as a whole; the task follows loop, load cell and robot.
+    """Writes the state of loop, load cell and robot to a file, which is replaced as a whole.
 
-    A robot of several addresses has a file for each, with the same content.
+    A robot with several addresses has a file for each address, with the same content.
     """
 
     files: RobotFiles
@@ -130,22 +130,22 @@ class RigMemory:
     error: str = ""
     # The experiment that is about to begin.
     starting: str = ""
-    # None: the files have to be written, whatever the state.
+    # The state in the files; None: the files have to be written in any case.
     _written: Remembered | None = None
-    # The load cell's zero by its calibration, and the restored one.
+    # The load cell's zero in its calibration, and the restored zero.
     _calibrated_zero: float | None = None
     _load_restored: float | None = None
-    # Whether the wrench has the zero of the grip before, and whether that was taken.
+    # Whether the wrench has the zero of the earlier grip, and whether a tare took that zero.
     _wrench_restored: bool = False
     _wrench_tared: bool = False
-    # Whether the gripper has shown since if it still has that grip: until then the restored zeros are kept.
+    # Whether the gripper has shown if it still has the earlier grip. Until then the restored zeros are kept.
     _judged: bool = False
-    # Whether the controller may have zeroed its wrench with the load: a program was to start, and has not answered yet.
+    # Whether a program is starting: the controller may have zeroed its wrench under load.
     _wrench_changes: bool = False
     _writing: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
-        """Restore what the last daemon of this robot has left."""
+        """Restore the state that the last daemon of this robot has left."""
         remembered = read_memories(self.files)
         remembered.restore(self.loop, self._on_judged)
         files = self.files
@@ -153,9 +153,9 @@ class RigMemory:
         if len(files.states) == 1 and not any(path.exists() for path in elsewhere):
             self._written = remembered
         if not self.loop.tool.has_gripper:
-            # Zeros are kept for a grip alone.
+            # Only a grip keeps its zeros.
             return
-        # Until the gripper answers, its grip counts as the one before.
+        # Until the gripper answers, its grip counts as the earlier one.
         cell, zero = self.load_cell, remembered.load_zero
         if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:
             self._calibrated_zero, self._load_restored = cell.calibration.tare_counts, zero
@@ -165,7 +165,7 @@ class RigMemory:
             self.robot.restore_wrench_zero(remembered.wrench_zero)
 
     def _on_judged(self, why_another: str) -> None:
-        """Keep the zeros of the grip before, or take them back where the gripper does not have that grip any more."""
+        """Keep the zeros of the earlier grip, or remove them if the gripper does not have that grip any more."""
         zeros = [
             name
             for name, restored in ((LOAD_CELL, self._calibrated_zero is not None), (WRENCH, self._wrench_restored))
@@ -188,7 +188,7 @@ class RigMemory:
             cure="check what it holds; `shearloop command release --yes` opens it, and then `shearloop command tare`",
         )
         cell = self.load_cell
-        # A tare since then has a zero of its own.
+        # Keep the zero of a later tare.
         if (
             cell is not None
             and self._calibrated_zero is not None
@@ -199,7 +199,7 @@ class RigMemory:
             self.robot.forget_wrench_zero()
 
     async def run(self) -> None:
-        """Write every change until cancelled, and meanwhile look for the addresses of a name that had none."""
+        """Write every change until cancelled; look up the addresses of a name that had none."""
         async with asyncio.TaskGroup() as group:
             if not self.files.known:
                 group.create_task(self._look_up())
@@ -214,7 +214,7 @@ class RigMemory:
                 return
 
     async def begins(self, experiment: str) -> str | None:
-        """Write that an experiment begins, before anything moves; return None, or why it cannot be written."""
+        """Write that an experiment begins, before anything moves; return why it cannot be written, or None."""
         self.starting = experiment
         await self.save_present()
         return self.error or None
@@ -233,20 +233,20 @@ class RigMemory:
 
     @property
     def _knows_load_zero(self) -> bool:
-        """Whether the load cell's zero was taken; else it is its calibration's, of another day."""
+        """Whether a tare took the load cell's zero; otherwise the zero is the calibration's, from another day."""
         cell = self.load_cell
         restored = cell is not None and cell.calibration.tare_counts == self._load_restored
         return self.loop.has_zero(LOAD_CELL) or (restored and not self._judged)
 
     @property
     def _knows_wrench_zero(self) -> bool:
-        """Whether the wrench's zero was taken, and is the one of the program that runs."""
+        """Whether a tare took the wrench's zero, in the running program."""
         if self._wrench_changes:
             return False
         return self.loop.has_zero(WRENCH) or (self._wrench_tared and not self._judged)
 
     def _watch_wrench(self) -> None:
-        """Note whether a program is about to start: a daemon killed meanwhile must not leave the zero from before."""
+        """Note whether a program is starting: if the daemon is killed now, the earlier zero must not be used."""
         robot_state = self.robot.state if self.robot is not None else None
         if robot_state is None:
             return
@@ -256,7 +256,7 @@ class RigMemory:
             self._wrench_changes = False
 
     async def save(self, state: Remembered) -> None:
-        """Write a state, unless the file has it already; a failure is logged once, and tried again."""
+        """Write a state, unless the file has it already; a failure is logged once, and the write is tried again."""
         async with self._writing:
             if state == self._written and not self.error:
                 return
@@ -278,7 +278,7 @@ class RigMemory:
 
 
 def read_memory(path: Path) -> Remembered:
-    """Return the state in a file; one that cannot be read counts as a stop, a missing one as none."""
+    """Return the state in a file; an unreadable file counts as a stop, a missing file as no stop."""
     try:
         content: Any = json.loads(read_file(path, _MOST_BYTES))
         if content.pop("version") != VERSION:
@@ -292,10 +292,11 @@ def read_memory(path: Path) -> Remembered:
 
 
 def read_memories(files: RobotFiles) -> Remembered:
-    """Return the state in the files of one robot: of its stops none is missed, and of its grips the latest counts.
+    """Return the state in the files of one robot: all of its stops, and its latest grip.
 
-    Where a name has no known address, the state under that address is not found: this counts as a stop. So does another
-    address: the robot there may be another one. Its own grip then counts before one that was left at that address.
+    If a name has no known address, the state under that address cannot be found, and this counts as a stop. A new
+    address counts as a stop too, because the robot there may be another one. Then the grip in the name's own file
+    counts before a grip in the file of the new address.
     """
     newest_first = _newest_first(files)
     stops = [fault for state in newest_first for fault in state.stop]

@@ -348,7 +348,7 @@ class ControlLoop:
     def _choose_command(
         self, experiment: Experiment, wrist_rad: float, origin_rad: float, t_ns: int, *, held: bool
     ) -> None:
-        """Let the experiment choose its command; one that turns a tool of which nobody knows ends it."""
+        """Let the experiment choose its command; it ends if it would turn a tool that may be in the gripper."""
         latest = self.inputs.torques.get(experiment.file.torque_source)
         torque_nm = latest.torque_nm if latest is not None and not held else None
         stands = held or self._awaited_torques(experiment, t_ns) is not None

@@ -1,4 +1,4 @@
-"""The tool that the gripper holds, or that is clamped to the wrist: its grip, its angle, and how far they are known."""
+"""The tool in the gripper, or clamped to the wrist: its grip, its angle, and whether both are known."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -12,7 +12,7 @@ GRIPPED_BEFORE = "the gripper has not answered yet, and an earlier daemon had gr
 
 
 class _KnownGrip(NamedTuple):
-    """The state of a grip before another one; the names are as in `HeldTool`."""
+    """The state before a `grip` step; the fields are as in `HeldTool`."""
 
     grip: Grip
     is_earlier: bool
@@ -23,40 +23,41 @@ class _KnownGrip(NamedTuple):
 class HeldTool:
     """The state of the tool; the control loop reports each gripper state, grip, release and start.
 
-    `has_gripper`: a gripper of ours holds it; without one it is clamped by other means, and its grip is an angle alone.
+    `has_gripper`: our gripper holds the tool. Otherwise the tool is clamped by other means, and its grip has only an
+    angle.
     """
 
     inputs: LatestInputs
     has_gripper: bool
     # The present grip.
     grip: Grip = NO_GRIP
-    # Whether an earlier process has closed it: the pendant may have gripped the same tool again, as far closed.
+    # Whether an earlier process closed the fingers. The pendant may have gripped the tool again, to the same width.
     is_earlier: bool = False
-    # Why the object is of another grip than the last one that was known.
+    # Why the gripper does not have the last known grip any more.
     another: str = ""
-    # Requests of other programs to the gripper that are known; one that comes during an experiment is a fault.
+    # The number of known requests of other programs to the gripper. A further one during an experiment is a fault.
     others_requests: int = 0
-    # Whether the experiment should have a tool between the fingers.
+    # Whether the experiment needs a tool between the fingers.
     expected: bool = False
     # Why a release after a stop did not open the gripper, until the operator acknowledges it.
     release_error: str | None = None
-    # Whether the fingers close tighter on a held object: the grip and its angle stay.
+    # Whether the fingers close tighter on a held object. The grip and its angle then continue.
     _tightens: bool = False
-    # The state as the present `grip` step began, which may be refused.
+    # The state before the present `grip` step, for the case that the step is refused.
     _before_closing: _KnownGrip | None = None
-    # Awaits the gripper's first state that shows whether a grip of an earlier process is the present one.
+    # Called when the gripper first shows whether it still has the grip of an earlier process.
     _on_judged: OnJudged | None = None
 
     def restore_grip(self, grip: Grip, on_judged: OnJudged) -> None:
-        """Take the grip that a process before this one has closed, until the gripper shows whether it still has it."""
+        """Use the grip of an earlier process, until the gripper shows whether it still has this grip."""
         self.grip, self.is_earlier, self._on_judged = grip, True, on_judged
 
     def restore_clamped(self, origin_rad: float | None) -> None:
-        """Take where a process before this one began to count the angle of the clamped tool."""
+        """Use the wrist's angle at which an earlier process began to count the angle of the clamped tool."""
         self.grip = Grip(origin_rad)
 
     def on_gripper(self, gripper: GripperStatus, *, judges: bool) -> None:
-        """Take the gripper's latest state; `judges` whether it still has the grip, as it does between experiments."""
+        """Take the gripper's latest state; `judges`: decide whether it still has the grip, as between experiments."""
         if self._tightens:
             self.grip = self.grip.pressed(gripper)
         if judges:
@@ -65,7 +66,7 @@ class HeldTool:
             self.grip = self.grip.followed(gripper)
 
     def judge(self, gripper: GripperStatus) -> None:
-        """Forget a grip that the gripper does not have at present: the next one has an angle of its own."""
+        """Forget a grip that the gripper does not have any more: the next grip has its own angle."""
         judged = self._on_judged
         why = self.grip.why_another(gripper)
         if gripper.others_requests != self.others_requests:
@@ -81,14 +82,14 @@ class HeldTool:
             self.another = ""
 
     def begin_experiment(self) -> None:
-        """Take that an experiment begins; the angle belongs to the grip, and goes on."""
+        """Prepare for an experiment; the angle belongs to the grip and continues."""
         gripper = self.inputs.gripper
-        # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
+        # Without our gripper the tool is held by other means. Our gripper may hold a tool already.
         self.expected = not self.has_gripper or (gripper is not None and gripper.holding)
         self._tightens, self._before_closing = False, None
 
     def count_angle(self, wrist_rad: float) -> float:
-        """Return the wrist's angle at which the tool's angle is 0: the present one where none counts yet."""
+        """Return the wrist's angle at which the tool's angle is 0; if no angle counts yet, the present one."""
         if self.grip.origin_rad is None:
             self.grip = replace(self.grip, origin_rad=wrist_rad)
             return wrist_rad
@@ -96,24 +97,24 @@ class HeldTool:
 
     @property
     def twisted_rad(self) -> float:
-        """How far the wrist has turned since the grip; 0 where no angle counts."""
+        """How far the wrist has turned since the grip; 0 if no angle counts."""
         arm, origin_rad = self.inputs.arm, self.grip.origin_rad
         return 0.0 if arm is None or origin_rad is None else arm.wrist_rad - origin_rad
 
     def begin_grip(self, action: GripStep, origin_rad: float) -> None:
-        """Keep the state of the tool as the fingers begin to move."""
-        # A process that dies while the fingers close leaves this force behind.
+        """Store the state of the tool before the fingers move, and begin a new grip."""
+        # If this process dies while the fingers close, the next process finds this force.
         force_n = max(self.grip.force_n or 0.0, action.force_n)
         self._before_closing = _KnownGrip(self.grip, self.is_earlier, self.another)
         self._tightens = not isinstance(action, Opening) and self._has_grip()
-        # While fingers open, their last width on the tool shows whether they have let it go.
+        # While the fingers open, their last width on the tool shows whether they have let the tool go.
         width_mm = self.grip.width_mm if self._tightens or isinstance(action, Opening) else None
         self.grip = Grip(origin_rad, force_n, width_mm)
         self.is_earlier = False
         self.another = ""
 
     def _has_grip(self) -> bool:
-        """Return whether the fingers hold something, or may still hold it in the grip that is known."""
+        """Return whether the fingers hold something, or may still hold the tool of the known grip."""
         gripper = self.inputs.gripper
         # An activation opens the fingers before they close.
         if gripper is None or self.activates:
@@ -122,7 +123,7 @@ class HeldTool:
         return gripper.holding or (was_held and (gripper.uncertain or gripper.moving))
 
     def on_grip_ended(self, action: GripStep) -> None:
-        """Take what the fingers have done; fingers that closed tighter keep the grip and its angle."""
+        """Take the end of a `grip` step; fingers that closed tighter keep the grip and its angle."""
         gripper, arm = self.inputs.gripper, self.inputs.arm
         holding = gripper is not None and gripper.holding
         if isinstance(action, Opening) and not holding:
@@ -135,13 +136,13 @@ class HeldTool:
         self.expected = action.expect_object or holding
 
     def on_grip_refused(self) -> None:
-        """Take that the present `grip` step was refused before the fingers moved: the grip is as before."""
+        """Restore the grip after the present `grip` step was refused before the fingers moved."""
         if self._before_closing is not None:
             self.grip, self.is_earlier, self.another = self._before_closing
             self._tightens = False
 
     def on_release_ended(self, error: str | None = None) -> None:
-        """Take the end of a release after a stop or by the operator, and why the gripper did not open, if so."""
+        """Take the end of a release, after a stop or by the operator; `error`: why the gripper did not open."""
         self.release_error = error
         if error is None:
             self.grip = NO_GRIP
@@ -160,8 +161,8 @@ class HeldTool:
 
     @property
     def unknown_grip(self) -> str:
-        """Why the present grip is not known; empty where it is, or where nothing is held."""
-        # A turn gives a grip an angle, and only a `grip` step its force.
+        """Why the present grip is not known; empty if it is known, or if the gripper holds nothing."""
+        # Any turn gives a grip an angle, but only a `grip` step gives it a force.
         known = self.grip.force_n is not None
         if self.another or known or self.held is None or self._on_judged is not None:
             return self.another
@@ -180,7 +181,7 @@ class HeldTool:
 
     @property
     def may_still_hold(self) -> str | None:
-        """The object between the fingers, or why a tool that was gripped may still be there; None without one."""
+        """The object between the fingers, or why a gripped tool may still be there; None without both."""
         if self.inputs.gripper is None:
             return GRIPPED_BEFORE if self.may_hold() else None
         if self.held is not None or self.grip.force_n is None:
@@ -188,7 +189,7 @@ class HeldTool:
         return self.uncertain
 
     def may_hold(self) -> bool:
-        """Return whether the gripper holds something, or does not know; a grip of an earlier process counts."""
+        """Return whether the gripper holds something or does not know; a grip of an earlier process counts too."""
         if not self.has_gripper:
             return False
         gripper = self.inputs.gripper
@@ -198,11 +199,11 @@ class HeldTool:
 
     @property
     def awaits_judgement(self) -> bool:
-        """Whether the gripper has not shown yet if it still has the grip of an earlier process."""
+        """Whether the gripper has not shown yet that it still has the grip of an earlier process, or not."""
         return self._on_judged is not None
 
     @property
     def activates(self) -> bool:
-        """Whether the gripper is activated before its next motion, as after a fault or a loss of power."""
+        """Whether the gripper must be activated before its next motion, as after a fault or a loss of power."""
         gripper = self.inputs.gripper
         return gripper is not None and (bool(gripper.fault) or gripper.inactive or gripper.too_hot)

@@ -33,8 +33,8 @@ class GripperStatus:
     """State of the gripper, as far as the loop needs it.
 
     `uncertain`: the gripper cannot say whether it holds an object, because it is inactive, lost its power, or was
-    stopped on its way. `requested_counts`: the position that it was last asked for, by anybody. `others_requests`: how
-    many requests of other programs were seen. `inactive`: it activates before its next motion, which opens and closes
+    stopped on its way. `requested_counts`: the position of the last request of any program. `others_requests`: the
+    number of requests of other programs. `inactive`: it activates before its next motion, which opens and closes
     the fingers once. `too_hot`: it refuses a grip, and activates before it opens.
     """
 

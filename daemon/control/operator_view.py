@@ -1,4 +1,4 @@
-"""The operator's commands at present: why each is refused, and which question comes before it."""
+"""The operator's commands: why each one is refused at present, and which question comes before it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ from shearloop.daemon.torques import CONFIRM_TARE, TorqueSource, loaded_sentence
 
 
 def activation_sentence(what: str) -> str:
-    """Return what an activation does after a fault, and to what."""
+    """Return a sentence on an activation after a fault; `what` is the object in the gripper."""
     return f"after its fault the gripper is activated again, which opens its fingers, and a tool in it drops; {what}"
 
 
 @dataclass(frozen=True, slots=True)
 class OperatorView:
-    """Answers of the present moment, by what the control loop knows; nothing here moves or changes anything.
+    """Answers from the control loop's present state; nothing here moves or changes anything.
 
-    `zero_known` says of each source whether its zero is; `running` gives the experiment that runs.
+    `zero_known` says for each source whether its zero is known. `running` returns the running experiment.
     """
 
     inputs: LatestInputs
@@ -40,7 +40,7 @@ class OperatorView:
     running: Callable[[], Experiment | None]
 
     def start_refusal(self) -> str | None:
-        """Return why no experiment at all can begin, or None."""
+        """Return why no experiment can begin, or None."""
         if (running := self.running()) is not None:
             return f"the experiment {running.file.name!r} is still running; stop it first"
         if self.safety.stopped:
@@ -50,7 +50,7 @@ class OperatorView:
         return None
 
     def file_refusal(self, file: ExperimentFile) -> str | None:
-        """Return why this experiment cannot begin with the tool and the zeros of now, or None."""
+        """Return why this experiment cannot begin with the present tool and zeros, or None."""
         if (reason := self.why_no_source(file) or self.why_not_with_tool(file)) is not None:
             return reason
         if isinstance(file.steps[0], TareStep) and (reason := self.why_no_tare_step()) is not None:
@@ -58,7 +58,7 @@ class OperatorView:
         return None
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
-        """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
+        """Return why no zero may be taken at present, or None; `confirmed`: by the operator, nothing is loaded."""
         if (running := self.running()) is not None:
             return (
                 f"the experiment {running.file.name!r} is running, and a new zero would change its "
@@ -77,7 +77,7 @@ class OperatorView:
         return None
 
     def why_no_tare_step(self) -> str | None:
-        """Return why an experiment cannot take a zero now, or None: no operator confirms it."""
+        """Return why a step `tare` cannot take a zero at present, or None; no operator confirms a step."""
         if (reason := self.tool.held or self.tool.uncertain) is not None:
             return f"{reason}; put a `release` before it"
         if loaded := self._loaded():
@@ -86,8 +86,8 @@ class OperatorView:
         return None
 
     def _loaded(self) -> str:
-        """Return which sensor measures a load that does not come from its drift, or an empty string."""
-        # Fingers that are known to be empty do not load a fingertip: its torque is drift.
+        """Return which sensor measures a load, as a sentence; empty without one. Drift does not count."""
+        # Empty fingers of the gripper do not load a fingertip, so its torque is drift.
         empty = self.tool.has_gripper and self.inputs.gripper is not None
         judged = {
             name: latest.torque_nm
@@ -97,7 +97,7 @@ class OperatorView:
         return loaded_sentence(judged)
 
     def release_refusal(self) -> str | None:
-        """Return why the operator cannot open the gripper now, or None; the arm is not asked."""
+        """Return why the operator cannot open the gripper at present, or None; the state of the arm does not count."""
         if (running := self.running()) is not None:
             return f"the experiment {running.file.name!r} is running; stop it first"
         if not self.tool.has_gripper:
@@ -109,7 +109,7 @@ class OperatorView:
         return None
 
     def release_question(self) -> str:
-        """Return what a release does now, for the operator who confirms it."""
+        """Return what a release would do, for the operator who confirms it."""
         if not self.tool.has_gripper:
             present = f"at present {turned}" if (turned := self._clamped_turn()) else "no angle counts at present"
             from_zero = "the angle of the clamped tool counts from 0 at the next start"
@@ -121,25 +121,25 @@ class OperatorView:
         return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
 
     def why_another_stop(self, named: int | None) -> str:
-        """Return how the stop that waits differs from the one that an unlock names, if any; empty where it does not.
+        """Return why an unlock names another stop than the one that waits; empty if it names this stop or none.
 
-        A stop that another operator has acknowledged cannot be cleared unseen.
+        So no operator acknowledges a stop that was not shown.
         """
         if named in (None, self.safety.waiting) or not self.safety.stopped:
             return ""
-        return f"another stop waits than the one that was shown: {self.safety.stop_causes}"
+        return f"the stop that waits is not the one that was shown: {self.safety.stop_causes}"
 
     def release_stakes(self) -> tuple[str, ...]:
-        """Return what a confirmation of `release_question` depends on; a width that wavers is not part of it."""
+        """Return the facts that a confirmation of `release_question` covers; the width varies and is none of them."""
         held = "held" if self.tool.held is not None else "nothing held"
         renewed = "renewed" if self.tool.activates else "as it is"
-        # A tool that was exchanged is held by another request, or from another angle.
+        # An exchanged tool shows as another request, or as another angle.
         gripper, grip = self.inputs.gripper, self.tool.grip
         requests = f"{gripper.requested_counts}, {gripper.others_requests} of others" if gripper is not None else "none"
         return held, renewed, requests, f"{grip.force_n} N from {grip.origin_rad} rad"
 
     def unlock_question(self) -> str:
-        """Return what an unlock drops, for the operator who confirms it; empty where it opens no fingers on a tool."""
+        """Return what an unlock would drop, for the operator who confirms it; empty if it drops no tool."""
         gripper = self.inputs.gripper
         if gripper is None or not gripper.fault or not self.tool.may_hold():
             return ""
@@ -154,13 +154,13 @@ class OperatorView:
         return f" Before step {first[0]} the gripper is activated: its fingers open and close once, and a tool drops."
 
     def held_note(self, file: ExperimentFile) -> str:
-        """Return a sentence on the held tool, for the question before a start; empty where no step turns it."""
+        """Return a sentence on the held tool, for the question before a start; empty if no step turns it."""
         if not self.tool.has_gripper:
             turned = self._clamped_turn()
             from_zero = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
             return f" At present the clamped tool's angle goes on: {turned}; {from_zero}." if turned else ""
         held, unknown, first = self.tool.held, self.tool.unknown_grip, first_gripper_step(file)
-        # A `grip` closes tighter on the held tool, and its angle stays unknown.
+        # A `grip` only closes tighter on the held tool, so the angle stays unknown.
         turns = first_motion_before_grip(file) is not None
         turns = turns or bool(unknown and first is not None and isinstance(first[1], GripStep))
         if held is None or not turns:
@@ -169,14 +169,14 @@ class OperatorView:
         return f" At present {held}.{angle}"
 
     def _clamped_turn(self) -> str:
-        """Return how far a clamped tool is turned, as a sentence; empty where no angle counts."""
+        """Return how far a clamped tool is turned, as a sentence; empty if no angle counts."""
         arm, origin_rad = self.inputs.arm, self.tool.grip.origin_rad
         if arm is None or origin_rad is None:
             return ""
         return f"it is turned by {arm.wrist_rad - origin_rad:+.3f} rad"
 
     def why_no_source(self, file: ExperimentFile) -> str | None:
-        """Return why its torque cannot drive an experiment, or None."""
+        """Return why the experiment's torque source cannot drive it, or None."""
         measured = [name for name, source in self.sources.items() if source.measures_torque]
         if file.torque_source not in measured:
             known = ", ".join(measured)
@@ -191,7 +191,7 @@ class OperatorView:
         return None
 
     def why_not_with_tool(self, file: ExperimentFile) -> str | None:
-        """Return why the tool that is held, or may be, forbids an experiment, or its torque's zero does."""
+        """Return why a tool in the gripper, or an unknown zero of the torque, forbids an experiment, or None."""
         driving = self.sources[file.torque_source]
         if reason := self._why_no_activation(file) or self._why_no_grip(file) or self._why_no_zero(file, driving):
             return reason
@@ -200,7 +200,7 @@ class OperatorView:
             return None
         step = file.steps[number - 1]
         straight = isinstance(step, ApproachStep)
-        # The limits watch a turn of a held tool. Nothing watches what a straight move does to it.
+        # Limits watch a turn of a held tool, but nothing watches a straight move with it.
         why = uncertain or (f"the gripper is closed: {self.tool.held}" if straight and self.tool.held else None)
         if why is None:
             return None
@@ -208,7 +208,7 @@ class OperatorView:
         return f"{why}; put a `grip` or a `release` before {motion}"
 
     def _why_no_activation(self, file: ExperimentFile) -> str | None:
-        """Return why an experiment must not activate the gripper, or None: its grip would drop the held tool."""
+        """Return why a `grip` must not activate the gripper, or None: an activation would drop the held tool."""
         first, held = first_gripper_step(file), self.tool.may_still_hold
         if first is None or not isinstance(first[1], GripStep) or not self.tool.activates or held is None:
             return None
@@ -233,11 +233,11 @@ class OperatorView:
         )
 
     def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
-        """Return why no tool can be turned by a torque without a zero, or None: every limit would be off by it."""
+        """Return why the driving torque needs a zero first, or None: without one, every limit would be wrong."""
         number = first_turn_before_tare(file, holds=self.tool.may_hold())
         if number is None or not driving.needs_zero or self.zero_known.get(driving.name, False):
             return None
-        # A command tares sensors, and an experiment the robot's wrench, too.
+        # The command tares only sensors. A step `tare` also tares the robot's wrench.
         command = "" if driving.from_robot else ", or send `shearloop command tare` with nothing gripped"
         tare = "a `release` and a `tare`" if self.tool.may_hold() else "a `tare`"
         return (

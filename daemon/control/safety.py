@@ -26,7 +26,7 @@ class Rule:
     A fault that `is_past` is detected after it is over, such as a pause of the loop. A fault that `explains` is
     reported first, and faults that only hold the wrist count as its consequences: queued data is old, and boards
     seem lost. Faults with one `timer` are one hold: a board that is silent is lost soon after. One that `stops_at_rest`
-    is a stop also where nothing moved: somebody was near the arm, or touched it.
+    is a stop even if nothing moved, because a person was near the arm, or touched it.
     """
 
     response: Response
@@ -171,7 +171,7 @@ class FaultCode(Enum):
     ROBOT_UNCONTROLLED = Rule(
         _KEEP,
         "the daemon has lost control of the robot: {detail}.",
-        "If nobody stopped it at the pendant, check its cable, and whether this computer is overloaded; then "
+        "If no person stopped it at the pendant, check its cable, and whether this computer is overloaded; then "
         "`shearloop command unlock`, and the experiment can begin.",
     )
     TASK_DIED = Rule(

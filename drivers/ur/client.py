@@ -25,15 +25,15 @@ from shearloop.drivers.ur.settings import Six, UrSettings
 
 # The settings for a controller, by its version and its serial number.
 SettingsFor: TypeAlias = Callable[[str, str], UrSettings]
-# A disconnecting worker stops the arm (1 s) and ends the program; after this time it is killed.
+# A worker that disconnects stops the arm (1 s) and ends the program. After this time it is killed.
 EXIT_S = 3.0
-# The worker's own alarms end it at a known place; the daemon kills it this much later.
+# The worker's own alarms end it at a known place. The daemon kills it this much later.
 GRACE_S = 1.0
 # The module of the worker.
 WORKER = "shearloop.drivers.ur.worker"
-# Only an update of the controller changes its version, and only another configuration what it has to be.
+# Only an update of the controller changes its version, and only another configuration changes the required one.
 LASTING = ("version", "not-emulated")
-# The worker's activity once it sends states.
+# The worker's activity while it sends states.
 CONTROLLING = "controlling"
 # The end of the worker's error output that a message quotes.
 LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
@@ -59,7 +59,7 @@ def missing_library() -> str:
 
 
 class UrRobot:
-    """A UR arm: `run` in a task of the daemon, `send` commands, read `state` (None while there is no connection)."""
+    """A UR arm: a task of the daemon runs `run`; `send` sends a command; `state` is None without a connection."""
 
     def __init__(
         self,
@@ -69,9 +69,9 @@ class UrRobot:
         settings_for: SettingsFor | None = None,
         worker: str = WORKER,
     ) -> None:
-        """`settings_for` returns the settings for a controller of this version and serial number, else these.
+        """`settings_for` returns the settings for a controller of a version and serial number; without it, these count.
 
-        It raises RobotLostError for a controller that is not to be driven. `worker` is the module of the worker.
+        It raises RobotLostError for a controller that must not be driven. `worker` is the module of the worker.
         """
         self._worker = worker
         self.settings = settings
@@ -79,9 +79,9 @@ class UrRobot:
         self.state: messages.RobotState | None = None
         self.monitor = monitor or LinkMonitor()
         self.losses: Counter[str] = Counter()
-        # How many states have come.
+        # The number of states that have arrived.
         self.states = 0
-        # Whether the gripper holds something, or may: then a new program keeps the zero of the wrench.
+        # Whether the gripper holds something, or may hold it. Then a new program keeps the zero of the wrench.
         self.holds: Callable[[], bool] = lambda: False
         self._told_held = False
         self._wrench_zero: Six = (0.0,) * 6
@@ -90,20 +90,20 @@ class UrRobot:
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
         self._warning = ""
-        # Those who wait for the next state.
+        # Tasks that wait for the next state.
         self._waiting: list[asyncio.Future[messages.RobotState]] = []
 
     @property
     def wrench_zero(self) -> Six:
-        """What the wrench is measured from, where the controller's own zero is another one."""
+        """The zero of the wrench, relative to the controller's own zero; all 0 if they are the same."""
         return self._wrench_zero
 
     def restore_wrench_zero(self, zero: Six) -> None:
-        """Take the zero of a process before this one, before the worker starts."""
+        """Set the zero that an earlier process kept; call this before the worker starts."""
         self._wrench_zero = self._restored_zero = zero
 
     def forget_wrench_zero(self) -> None:
-        """Take the restored zero back, as if there had been none: what is held is not what it was measured with."""
+        """Remove the restored zero, because the gripper holds another object than the zero was measured with."""
         if not any(self._restored_zero):
             return
         pairs = zip(self._wrench_zero, self._restored_zero, strict=True)
@@ -123,13 +123,13 @@ class UrRobot:
         }
 
     async def next_state(self) -> messages.RobotState:
-        """Return the next state; waits through losses of the connection."""
+        """Return the next state, also after a loss of the connection."""
         waiting: asyncio.Future[messages.RobotState] = asyncio.get_running_loop().create_future()
         self._waiting.append(waiting)
         return await waiting
 
     def send(self, command: messages.Command) -> asyncio.Future[messages.CommandReply]:
-        """Send a command at once and return its reply; when the worker dies first, the reply is a refusal."""
+        """Send a command at once and return its reply; if the worker dies first, the reply is a refusal."""
         replied: asyncio.Future[messages.CommandReply] = asyncio.get_running_loop().create_future()
         if self._connection is None or self.state is None:
             replied.set_result(messages.CommandReply(f"The robot is not connected. {self.monitor.latest.sentence}"))
@@ -144,18 +144,18 @@ class UrRobot:
 
     def _note_zeroed(self, replied: asyncio.Future[messages.CommandReply]) -> None:
         if not replied.cancelled() and not replied.result().refusal:
-            # Nothing of the restored zero is in the new one.
+            # The new zero contains no part of the restored one.
             self._restored_zero = (0.0,) * 6
 
     def _tell_held(self, connection: "WorkerConnection") -> None:
-        """Tell the worker of a change of what is held, before any command that follows from it."""
+        """Send the worker a change of `holds`, before any command that follows from it."""
         held = self.holds()
         if held is not self._told_held:
             self._told_held = held
             connection.send(messages.Held(held))
 
     def keep_moving(self) -> None:
-        """Let a straight move that is under way go on for `silence_timeout_s`; each decision calls this."""
+        """Let a running straight move continue for `silence_timeout_s`; each decision calls this."""
         if self._connection is not None and self.state is not None and self.state.motion == "linear":
             self._connection.send(messages.Heartbeat())
 
@@ -196,7 +196,7 @@ class UrRobot:
                 before, self.state = self.state, message
                 self._wrench_zero = message.wrench_zero
                 if not any(message.wrench_zero):
-                    # A tare, or the start of a program without a load, has ended the restored zero.
+                    # The restored zero ends with a tare, or with a program's start without a load.
                     self._restored_zero = (0.0,) * 6
                 self.states += 1
                 if self._connection is not None:
@@ -224,7 +224,7 @@ class UrRobot:
                 raise RobotLostError(message.kind, message.sentence)
 
     def _use(self, settings: UrSettings) -> None:
-        """Drive with these settings; raises RobotLostError where the worker has others, before it sends a program."""
+        """Drive with these settings; raises RobotLostError, before any program is sent, if the worker has others."""
         if settings != self.settings:
             self.settings = settings
             raise RobotLostError(
@@ -235,7 +235,7 @@ class UrRobot:
 
 
 class WorkerConnection(asyncio.SubprocessProtocol):
-    """The pipes to one worker, its end, and the reason for that."""
+    """The pipes to one worker, its end, and the reason why it ended."""
 
     def __init__(self, settings: UrSettings, robot: UrRobot) -> None:
         self._settings = settings
@@ -244,12 +244,12 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         self._received_s = time.monotonic()
         # Set when the worker has ended and all of its output was read.
         self._ended = asyncio.Event()
-        # Set then too, or when an error ends the connection before.
+        # Set at the worker's end too, or earlier if an error ends the connection.
         self._closed = asyncio.Event()
         self._error: Exception | None = None
         self._stderr_tail = b""
         self._activity = "starting"
-        # A worker that is silent for longer hangs.
+        # A worker that is silent for longer than this hangs.
         self._timeout_s = settings.connect_timeout_s + GRACE_S
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -262,7 +262,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         self._stdin.write(messages.encode(message, number))
 
     def pipe_data_received(self, fd: int, data: bytes) -> None:
-        """Handle output where it is read: waking a task for each of 125 states a second would double the cost."""
+        """Handle output at once, because a task that wakes for each of 125 states a second would double the cost."""
         if fd == 2:
             # After a crash the end of the error output is the only trace.
             self._stderr_tail = (self._stderr_tail + data)[-LAST_WORDS_BYTES:]
@@ -309,11 +309,11 @@ class WorkerConnection(asyncio.SubprocessProtocol):
 
     async def end(self) -> None:
         """Disconnect the worker, and kill it after `EXIT_S`."""
-        # Its last states do not count as a connection.
+        # The worker's last states do not count as a connection.
         self._closed.set()
         if self._process.get_returncode() is None:
             self.send(messages.Disconnect())
-        # The end of its input disconnects the worker too.
+        # The end of the worker's input disconnects it too.
         self._stdin.close()
         try:
             async with asyncio.timeout(EXIT_S):
@@ -357,7 +357,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
 
 
 async def _finish(ending: Coroutine[Any, Any, None]) -> None:
-    """Await to the end, also when cancelled meanwhile."""
+    """Wait for the end, even if this task is cancelled."""
     task = asyncio.ensure_future(ending)
     try:
         await asyncio.shield(task)

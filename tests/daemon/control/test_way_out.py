@@ -189,12 +189,12 @@ async def test_an_unlock_acknowledges_the_stop_that_was_shown_and_no_other():
         cell.runner.stop(also_idle=True)
         sent = len(cell.robot.commands)
         with pytest.raises(
-            CommandRefusedError, match="another stop waits than the one that was shown: the oper"
+            CommandRefusedError, match="the stop that waits is not the one that was shown: the oper"
         ) as one:
             await unlocked(cell, unlock, stop=shown["stop"])
-        assert one.value.facts["question"].startswith("Unlock? Another stop waits than the one that was shown: the op")
+        assert one.value.facts["question"].startswith("Unlock? The stop that waits is not the one that was shown: the")
         cell.runner.stop(also_idle=True)
-        with pytest.raises(CommandRefusedError, match="another stop waits") as two:
+        with pytest.raises(CommandRefusedError, match="the stop that waits is not the one") as two:
             await unlocked(cell, unlock, stop=shown["stop"], digest=one.value.facts["digest"])
         assert (cell.control_loop.safety.waiting, len(cell.robot.commands)) == (3, sent)
         # The question that comes with the refusal can be confirmed at once.

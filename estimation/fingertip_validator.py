@@ -9,7 +9,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy import linalg
@@ -52,8 +52,22 @@ _CLEARLY_NEARER, _SAME_SESSION, _GRIPPED_SCORE = 0.8, 0.01, 0.5
 _LOOSE_SHARE, _LEVEL_FRAMES = 0.4, 60
 # A channel that reads 0 in more of a part's frames is dead at calibration.
 _SILENT_SHARE = 0.05
+# The least noise of a relative change, as a share of the median of all channels.
+_LEAST_NOISE_SHARE = 0.3
 # The threshold's largest share of the way from idle to the weakest grip.
 _LARGEST_RISE = 1 / 3
+
+
+class GripParts(NamedTuple):
+    """A recording's (n, c) frames before its grip, in it, and after it; of the last there may be none."""
+
+    idle: FloatArray
+    gripped: FloatArray
+    released: FloatArray
+
+    def changes(self, base: FloatArray) -> "GripParts":
+        """Return the relative changes from an idle frame (c,)."""
+        return GripParts(*(relative_change(part, base) for part in self))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,55 +91,41 @@ class FingertipValidator:
     strength: CalibratedStrength | None = None
 
     @classmethod
-    def fit(cls, side: str, *recordings: tuple[FloatArray, FloatArray, FloatArray]) -> Self:
-        """Fit to each recording's (n, c) frames before, in, and after the grip (none after it is allowed).
+    def fit(cls, side: str, *recordings: GripParts) -> Self:
+        """Fit to recordings of one grip each.
 
-        Each recording is compared with its own idle frames, because the gel drifts between recordings.
+        Each is compared with its own idle frames, because the gel drifts between recordings. Raises CalibrationError
+        where the frames are too few, and where the grip does not show.
         """
-        n_idle, n_gripped = (min(len(one[i]) for one in recordings) for i in (0, 1))
+        n_idle, n_gripped = min(len(one.idle) for one in recordings), min(len(one.gripped) for one in recordings)
         if few := too_few_frames(n_idle, n_gripped):
             raise CalibrationError(f"side {side}: {few}")
-        bases = [np.median(idle, axis=0) for idle, _, _ in recordings]
-        noise = np.sqrt(np.mean([channel_noise(gripped) ** 2 for _, gripped, _ in recordings], axis=0))
-        silent = np.max([(part == 0.0).mean(axis=0) for one in recordings for part in one[:2]], axis=0)
-        noise = np.where(silent > _SILENT_SHARE, np.inf, noise)
+        bases = [np.median(one.idle, axis=0) for one in recordings]
         base = np.mean(bases, axis=0)
-        scale = np.where(np.isfinite(noise), noise, 1.0) / (base + SMALL_V)
-        floor = 0.3 * float(np.median(scale))
-        scale = np.where(np.isfinite(noise), np.maximum(scale, floor), np.inf)
-        relative = [
-            tuple(relative_change(part, own) for part in one) for own, one in zip(bases, recordings, strict=True)
-        ]
-
-        def discriminant(rows: slice) -> FloatArray:
-            parts = [np.concatenate([one[i][rows] for one in relative]) / scale for i in range(3)]
-            return _discriminant([part for part in parts if len(part)]) / scale
-
-        # Some combination of c channels separates any frames, so test it on frames that it was not fitted to.
-        half = discriminant(slice(0, None, 2))
-        for one in relative:
-            scores = [part[1::2] @ half for part in one]
-            not_gripped = np.concatenate([scores[0], *scores[2:]])
-            if np.quantile(scores[1], 0.01) <= np.quantile(not_gripped, 0.99):
-                raise CalibrationError(
-                    f"side {side}: gripped frames look like idle ones; did the fingertip touch the tool?"
-                )
-        weights = discriminant(slice(None))
-        idle_scores = np.concatenate([one[0] @ weights for one in relative])
-        rise = max(_IDLE_DEVIATIONS * float(idle_scores.std()), _LEAST_RISE)
-        highest_idle = float(np.quantile(idle_scores, 0.99))
-        weakest_grip = min(float(np.quantile(one[1] @ weights, 0.01)) for one in relative)
-        # Idle scores of different tools scatter further than the weakest grip of them.
-        threshold = highest_idle + min(rise, _LARGEST_RISE * max(weakest_grip - highest_idle, 0.0))
+        noise = _noise_of(recordings)
+        scale = _noise_of_changes(noise, base)
+        changes = [one.changes(own) for one, own in zip(recordings, bases, strict=True)]
+        if not _is_separable(changes, scale):
+            raise CalibrationError(
+                f"side {side}: gripped frames look like idle ones; did the fingertip touch the tool?"
+            )
+        weights = _grip_weights(changes, scale)
         step_limit = fall_limit = np.inf
-        if not any(len(released) for _, _, released in recordings):
-            gripped = [frames for _, frames, _ in recordings]
-            score = [one[1] @ weights for one in relative]
-            step_limit = _STEP_MARGIN * max(float(frame_steps(frames, noise).max()) for frames in gripped)
-            fall_limit = _STEP_MARGIN * max(float((one[:-STEP_FRAMES] - one[STEP_FRAMES:]).max()) for one in score)
-        mean = np.concatenate([gripped for _, gripped, _ in recordings]).mean(axis=0)
-        strength = CalibratedStrength.fit(_strength_weights(relative, scale), [one[1] for one in relative])
-        return cls(side, base, mean, noise, weights, threshold, step_limit, fall_limit, strength)
+        if not any(len(one.released) for one in recordings):
+            scores = [one.gripped @ weights for one in changes]
+            step_limit = _STEP_MARGIN * max(float(frame_steps(one.gripped, noise).max()) for one in recordings)
+            fall_limit = _STEP_MARGIN * max(float((one[:-STEP_FRAMES] - one[STEP_FRAMES:]).max()) for one in scores)
+        return cls(
+            side,
+            base,
+            np.concatenate([one.gripped for one in recordings]).mean(axis=0),
+            noise,
+            weights,
+            _grip_threshold(changes, weights),
+            step_limit,
+            fall_limit,
+            CalibratedStrength.fit(_strength_weights(changes, scale), [one.gripped for one in changes]),
+        )
 
     def looks_idle(self, frame: FloatArray) -> bool:
         """Return whether a session's first frame is idle: not clearly nearer to the calibrated grip."""
@@ -326,12 +326,59 @@ def _medians(rows: FloatArray, counts: IntArray) -> FloatArray:
     return np.where(counts > 0, halves / 2, 0.0)
 
 
-def _strength_weights(relative: Sequence[tuple[FloatArray, ...]], scale: FloatArray) -> FloatArray:
+def _noise_of(recordings: Sequence[GripParts]) -> FloatArray:
+    """Return the (c,) noise of gripped frames in volts, infinite for channels that were dead before or in a grip."""
+    noise = np.sqrt(np.mean([channel_noise(one.gripped) ** 2 for one in recordings], axis=0))
+    silent = np.max([(part == 0.0).mean(axis=0) for one in recordings for part in (one.idle, one.gripped)], axis=0)
+    return np.where(silent > _SILENT_SHARE, np.inf, noise)
+
+
+def _noise_of_changes(noise: FloatArray, base: FloatArray) -> FloatArray:
+    """Return the (c,) noise of relative changes from the idle frame `base`, infinite for dead channels.
+
+    No channel counts as much less noisy than the others.
+    """
+    alive = np.isfinite(noise)
+    scale = np.where(alive, noise, 1.0) / (base + SMALL_V)
+    least = _LEAST_NOISE_SHARE * float(np.median(scale))
+    return np.where(alive, np.maximum(scale, least), np.inf)
+
+
+def _is_separable(changes: Sequence[GripParts], scale: FloatArray) -> bool:
+    """Return whether the grip shows in each second frame, by weights that were fitted to the frames between.
+
+    Some combination of c channels separates any frames from any others that it was fitted to.
+    """
+    weights = _grip_weights(changes, scale, slice(0, None, 2))
+    for one in changes:
+        idle, gripped, released = (part[1::2] @ weights for part in one)
+        if np.quantile(gripped, 0.01) <= np.quantile(np.concatenate([idle, released]), 0.99):
+            return False
+    return True
+
+
+def _grip_weights(changes: Sequence[GripParts], scale: FloatArray, rows: slice = slice(None)) -> FloatArray:
+    """Return the (c,) weights of a grip's score, fitted to these rows of each part."""
+    parts = [np.concatenate([one[i][rows] for one in changes]) / scale for i in range(3)]
+    return _discriminant([part for part in parts if len(part)]) / scale
+
+
+def _grip_threshold(changes: Sequence[GripParts], weights: FloatArray) -> float:
+    """Return the score above which a fingertip is gripped."""
+    idle_scores = np.concatenate([one.idle @ weights for one in changes])
+    rise = max(_IDLE_DEVIATIONS * float(idle_scores.std()), _LEAST_RISE)
+    highest_idle = float(np.quantile(idle_scores, 0.99))
+    weakest_grip = min(float(np.quantile(one.gripped @ weights, 0.01)) for one in changes)
+    # Idle scores of different tools scatter further than the weakest grip of them.
+    return highest_idle + min(rise, _LARGEST_RISE * max(weakest_grip - highest_idle, 0.0))
+
+
+def _strength_weights(changes: Sequence[GripParts], scale: FloatArray) -> FloatArray:
     """Return the grip's discriminant of recordings with (n, c) relative changes idle, gripped and perhaps released.
 
     It ignores motion within each grip. A discriminant of all of them together would ignore how strong they are too.
     """
-    scaled = [[part / scale for part in one] for one in relative]
+    scaled = [[part / scale for part in one] for one in changes]
     within = np.vstack([part - part.mean(axis=0) for one in scaled for part in one if len(part)])
     parts = [np.concatenate([one[i] for one in scaled]) for i in range(3)]
     return _discriminant([part for part in parts if len(part)], within) / scale

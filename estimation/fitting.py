@@ -25,7 +25,7 @@ from shearloop.estimation.estimator import (
     Reading,
 )
 from shearloop.estimation.estimator_names import EstimatorName, estimator_class
-from shearloop.estimation.fingertip_validator import FingertipValidator, too_few_frames
+from shearloop.estimation.fingertip_validator import FingertipValidator, GripParts, too_few_frames
 from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, first_twists, loaded_log_gain
 from shearloop.estimation.grips import Grip, find_grips
 from shearloop.estimation.interval_regressor import IntervalRegressor
@@ -117,7 +117,7 @@ def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
         FingertipValidator.fit(
             side,
             *(
-                (frames[grip.idle, layer], frames[grip.gripped, layer], frames[grip.released, layer])
+                GripParts(frames[grip.idle, layer], frames[grip.gripped, layer], frames[grip.released, layer])
                 for frames, grip in grips
             ),
         )

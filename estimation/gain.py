@@ -84,34 +84,21 @@ class GainSpread:
         logarithms of the gains of grips that were left out of the fit, `halves` those of halves of a grip's twists. The
         fingertips share the prior.
         """
-        noise: list[FloatArray] = []
-        firsts: list[float] = []
-        squares, freedom, n_twists = 0.0, 0, 0
-        for grip in np.unique(grips):
-            own = np.flatnonzero(grips == grip)
-            twists = [own[rows] for rows in find_twists(truth[own])]
-            n_twists += len(twists)
-            gains_of_first: list[float] = []
-            gains_of_later: list[float] = []
-            for rows in twists:
-                gain = log_gain(predicted[rows], truth[rows])
-                if gain is None:
-                    noise.append(truth[rows])
-                    continue
-                noise.append(truth[rows] - math.exp(gain) * predicted[rows])
-                (gains_of_first if is_first[rows[0]] else gains_of_later).append(gain)
-            # A tool's own gain is not a difference between twists, so each grip counts from its own mean.
-            if gains_of_later:
-                mean = float(np.mean(gains_of_later))
-                squares += sum((gain - mean) ** 2 for gain in gains_of_later)
-                freedom += len(gains_of_later) - 1
-                firsts += [gain - mean for gain in gains_of_first]
-        noise_nm = float(np.sqrt(np.mean(np.concatenate(noise) ** 2))) if noise else 0.0
+        rows_of_grips = [np.flatnonzero(grips == grip) for grip in np.unique(grips)]
+        found = [_GripGains.of(predicted[rows], truth[rows], is_first[rows]) for rows in rows_of_grips]
+        errors_nm = [one for grip in found for one in grip.errors_nm]
+        noise_nm = float(np.sqrt(np.mean(np.concatenate(errors_nm) ** 2))) if errors_nm else 0.0
         least_noise_nm = _LEAST_NOISE * float(np.abs(truth).max(initial=0.0))
-        spreads = _UNREPEATED_SPREADS if 0 < n_twists < _REPEATING_TWISTS else PRIOR_SPREADS
+        # A tool's own gain is not a difference between twists, so each grip counts from its own mean.
+        compared = [grip for grip in found if grip.later]
+        freedom = sum(len(grip.later) - 1 for grip in compared)
+        squares = sum(sum((gain - grip.mean) ** 2 for gain in grip.later) for grip in compared)
         within = math.sqrt(squares / freedom) if freedom else 0.0
+        firsts = [gain - grip.mean for grip in compared for gain in grip.first]
         first = sum(firsts) / (_PRIOR_GRIPS + len(firsts))
         first_prior = FIRST_SPREAD / math.sqrt(fingertips)
+        n_twists = sum(len(grip.errors_nm) for grip in found)
+        spreads = _UNREPEATED_SPREADS if 0 < n_twists < _REPEATING_TWISTS else PRIOR_SPREADS
         prior = cls(
             spreads[fingertips],
             max(within, _LEAST_WITHIN),
@@ -274,6 +261,38 @@ class GainSpread:
             )
         explained += self.noise_nm**2 / max(float(predicted @ predicted), self.noise_nm**2)
         return self._with_recordings([max(gain**2 - explained, 0.0)])
+
+
+@dataclass(frozen=True, slots=True)
+class _GripGains:
+    """The logarithms of the gains of a grip's twists, the first after the grip apart from the later ones.
+
+    `errors_nm` has one row for each twist: what its gain does not explain.
+    """
+
+    first: Sequence[float]
+    later: Sequence[float]
+    errors_nm: Sequence[FloatArray]
+
+    @classmethod
+    def of(cls, predicted: FloatArray, truth: FloatArray, is_first: BoolArray) -> Self:
+        """Return the gains of (n,) predictions of one grip; a twist that they do not follow has none."""
+        first: list[float] = []
+        later: list[float] = []
+        errors_nm: list[FloatArray] = []
+        for rows in find_twists(truth):
+            gain = log_gain(predicted[rows], truth[rows])
+            if gain is None:
+                errors_nm.append(truth[rows])
+                continue
+            errors_nm.append(truth[rows] - math.exp(gain) * predicted[rows])
+            (first if is_first[rows[0]] else later).append(gain)
+        return cls(first, later, errors_nm)
+
+    @property
+    def mean(self) -> float:
+        """The mean of the later twists."""
+        return float(np.mean(self.later))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,1 +1,1 @@
-"""What runs on the robot's PC all day: configuration, tasks, control loop, safety, messages, recorder, live page."""
+"""The daemon on the robot's PC: configuration, tasks, control loop, safety, messages, recorder, live page."""

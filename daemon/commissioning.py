@@ -1,6 +1,6 @@
-"""What a rig's commissioning allows: the record of measurements, and the cap on a robot that has no valid one.
+"""The report of a rig's commissioning, the limits that it allows, and the cap on a robot without a valid report.
 
-It is a record, not a safety function: only the pendant's safety configuration is rated.
+The report is a record, not a safety function. Only the pendant's safety configuration is rated.
 """
 
 from collections.abc import Mapping
@@ -25,20 +25,20 @@ from shearloop.yaml_files import load_model
 Verdict = Literal["passed", "failed", "noted"]
 BoundT = TypeVar("BoundT", bound=Bound)
 
-# A robot without a valid report turns and moves no faster than this, and bears no larger torque.
+# A robot without a valid report turns and moves at most this fast, and may have at most this torque.
 CAPPED_RAD_PER_S: Final = 0.2
 CAPPED_M_PER_S: Final = 0.05
 CAPPED_NM: Final = 0.3
 # A report counts for this time after its oldest stage.
 MOST_AGE_DAYS: Final = 180
-# A computer's clock may be this much behind the one that dated the report.
+# This computer's clock may be this much behind the clock that dated the report.
 _CLOCKS_DIFFER = timedelta(days=1)
 # A measured value beyond this multiple of a capped speed stops the motion.
 _HARD: Final = 1.6
 CURE: Final = (
     "run `shearloop commission CONFIG --out FILE{option}`, then write `commissioned: FILE` into the configuration"
 )
-# The stages, by the first figure of their names, that a quantity needs: the daemon's limits of it depend on them.
+# The stages that a quantity's limits depend on, by the first figure of their names.
 _SPEED_NEEDS: Final = "0134"
 _TORQUE_NEEDS: Final = "01357"
 
@@ -73,7 +73,8 @@ NOTHING_SUPPLIED: Final = Supplied()
 class StageResult(Record):
     """The lines of one stage, who ran it, and when.
 
-    `judged_sha256s`: of what few stages judge, this one among them, in hexadecimal; what all need is in `RigIdentity`.
+    `judged_sha256s`: hashes of the keys and files that only this stage or a few stages judge, in hexadecimal.
+    `RigIdentity` has the hashes for all stages.
     """
 
     stage: str
@@ -89,7 +90,7 @@ class StageResult(Record):
         return all(line.verdict != "failed" for line in self.lines)
 
     def changed_since(self, hashes: Mapping[str, str]) -> list[str]:
-        """Return the keys of what this stage judged and has another of these hashes than then, for a sentence."""
+        """Return the keys and files that this stage judged and that have changed since, for a sentence."""
         now = judged_by(self.stage, hashes)
         return [f"`{key}`" for key, own in now.items() if self.judged_sha256s.get(key) != own]
 
@@ -103,11 +104,11 @@ class Report(Record):
 
     @property
     def passed(self) -> bool:
-        """Whether there is a stage, and none has a failed line."""
+        """Whether the report has a stage, and no stage has a failed line."""
         return bool(self.stages) and all(stage.passed for stage in self.stages)
 
     def with_stage(self, result: StageResult) -> "Report":
-        """Return the report with this result in the place of an earlier one of the same stage."""
+        """Return the report with this result, which replaces an earlier result of the same stage."""
         others = [stage for stage in self.stages if stage.stage != result.stage]
         stages = sorted([*others, result], key=lambda stage: stage.stage)
         return self.model_copy(update={"stages": tuple(stages)})
@@ -117,7 +118,7 @@ class Report(Record):
         return self.model_copy(update={"stages": tuple(stage for stage in self.stages if stage != result)})
 
     def stage(self, number: str) -> StageResult | None:
-        """Return the stage whose name begins with this figure, if it was run."""
+        """Return the stage with this figure at the beginning of its name, if it was run."""
         return next((stage for stage in self.stages if stage.stage.startswith(number)), None)
 
     def supplied(self) -> Supplied:
@@ -134,7 +135,7 @@ class Report(Record):
 
 @dataclass(frozen=True, slots=True)
 class MotionCap:
-    """The largest speeds and torque that a rig's report allows, and why no more."""
+    """The largest speeds and torque that a rig's report allows, and the reason for these limits."""
 
     why: str
     wrist_speed_rad_per_s: float = CAPPED_RAD_PER_S
@@ -151,7 +152,7 @@ class MotionCap:
 
 
 class Commissioning:
-    """The robot's settings as its report allows them. An emulated robot needs no report, unless it plays a real one."""
+    """The robot's settings within its report. An emulated robot needs no report, unless it plays a real robot."""
 
     def __init__(
         self,
@@ -162,9 +163,9 @@ class Commissioning:
         emulated: bool = False,
         rehearsed: bool = False,
     ) -> None:
-        """`reason` is why the report, or its absence, raises nothing; empty for a report that counts.
+        """`reason` says why the report, or its absence, raises nothing. It is empty for a report that counts.
 
-        `emulated` stands for a robot without a cap, `rehearsed` for an emulated one with the cap of the real one.
+        `emulated` means a robot without a cap, `rehearsed` an emulated robot with the cap of the real one.
         """
         self._given, self._report, self._reason, self._emulated = settings, report, reason, emulated
         self._rehearsed = rehearsed
@@ -173,7 +174,7 @@ class Commissioning:
 
     @property
     def cap(self) -> MotionCap | None:
-        """The cap that holds now; None for an emulated robot that plays no real one."""
+        """The present cap; None for an emulated robot that plays no real robot."""
         if self._emulated:
             return None
         if self._report is None or not self.counts:
@@ -191,7 +192,7 @@ class Commissioning:
 
     @property
     def settings(self) -> UrSettings:
-        """The robot's settings within the cap, with what a report that counts supplies."""
+        """The robot's settings within the cap, with the values that a counting report supplies."""
         cap, settings = self.cap, self._given
         if cap is None:
             return settings
@@ -210,25 +211,25 @@ class Commissioning:
             settings,
             limits=limits,
             rest_rad_per_s=settings.rest_rad_per_s if measured.rest_rad_per_s is None else measured.rest_rad_per_s,
-            # Braking before an end of a range counts on the longest delay: few turns may not have met it.
+            # Braking before an end of a range needs the longest delay, and the few measured turns may not show it.
             reaction_s=max(settings.reaction_s, measured.reaction_s or 0.0),
         )
 
     @property
     def supplied(self) -> Supplied:
-        """The values of a report that counts; without one, none."""
+        """The values of a counting report; empty without one."""
         return self._report.supplied() if self._report is not None and self.counts else NOTHING_SUPPLIED
 
     @property
     def counts(self) -> bool:
-        """Whether there is a report, and it raises what its stages cover."""
+        """Whether there is a report that raises the limits that its stages cover."""
         return self._report is not None and not (self._reason or self._other)
 
     def on_controller(self, polyscope: str, serial_number: str) -> UrSettings:
         """Compare the connected controller with the report's, and return the settings for it.
 
-        The controller of a rehearsal is emulated, and never the report's. Raises RobotLostError for a real controller
-        in an emulated rig: it has neither the deadlines nor the cap of a real one.
+        A rehearsal has an emulated controller, which is never the report's. Raises RobotLostError for a real controller
+        in an emulated rig, because this rig has neither the deadlines nor the cap of a real one.
         """
         plays = self._emulated or self._rehearsed
         if plays and (reason := why_not_emulated(self._given.host, serial_number)):
@@ -241,12 +242,12 @@ class Commissioning:
 
     @property
     def sentence(self) -> str:
-        """The cap in words; empty where there is none."""
+        """The cap in words; empty without a cap."""
         return self.cap.sentence if self.cap is not None else ""
 
 
 def _lowered(bound: BoundT, cap: float) -> BoundT:
-    """Return a bound on a speed with commands at or below the cap, and the measured value not far above it."""
+    """Return a bound on a speed that keeps commands at or below the cap, and measured values not far above it."""
     if bound.inner <= cap:
         return bound
     return replace(bound, inner=cap, hard=min(bound.hard, _HARD * cap))
@@ -255,8 +256,8 @@ def _lowered(bound: BoundT, cap: float) -> BoundT:
 def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime | None = None) -> Commissioning:
     """Return what a rig's report allows at a time, by default now.
 
-    A rehearsal has the cap of the rig that it plays; a report of emulated devices raises it too. Raises UserError for a
-    file that cannot be read or is no report: a mistake in the configuration.
+    A rehearsal has the cap of the rig that it plays, and a report of emulated devices raises this cap too. Raises
+    UserError for a file that cannot be read or is no report, which is a mistake in the configuration.
     """
     rehearsed = config.real is not config
     if config.emulated and not rehearsed:
@@ -271,11 +272,11 @@ def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime |
 def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
     """Return why a report does not count for a configuration, or an empty string."""
     seen = identity_of(config, report.rig.polyscope, report.rig.robot_serial_number)
-    # Each alone is enough, so that no slip in a file raises a real robot's cap.
+    # Each of these marks is enough, so one mistake in a file cannot raise a real robot's cap.
     is_emulated = report.rig.emulated or report.rig.robot_serial_number == EMULATED_SERIAL_NUMBER
     if is_emulated and not config.emulated:
         return f"{config.commissioned} is of emulated devices, and raises nothing on real ones"
-    # A rehearsal also shows what a report of the real devices raises.
+    # In a rehearsal a report of the real devices counts too.
     robot = {key: getattr(report.rig, key) for key in ("emulated", "robot_serial_number")}
     seen = seen.model_copy(update=robot)
     if differs := list(report.rig.differences(seen)):
@@ -301,7 +302,7 @@ def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
 
 
 def load_report(path: Path) -> Report:
-    """Return the report in a file; raises UserError for a file that is none."""
+    """Return the report in a file; raises UserError for a file that is not a report."""
     return load_model(path, Report, UserError, "report of a commissioning", "; make it with `shearloop commission`")
 
 

@@ -404,12 +404,12 @@ class DaemonConfig(ConfigModel):
 
 
 class RehearsedConfig(DaemonConfig):
-    """A configuration whose devices are all emulated, in the place of those of another one."""
+    """A configuration in which all devices of a real configuration are replaced by emulated ones."""
 
     _real: DaemonConfig = PrivateAttr()
 
     def __init__(self, real: DaemonConfig, content: Mapping[str, Any]) -> None:
-        """Take the configuration of the real devices, and the content of the one that plays them."""
+        """`real` has the real devices; `content` is the configuration of the emulated ones."""
         super().__init__(**content)
         self._real = real
 

@@ -80,7 +80,7 @@ Model = TypeVar("Model", bound=ConfigModel)
 
 
 class FileKind(NamedTuple):
-    """A kind of file: what it is, where it belongs, and keys that show it."""
+    """A kind of file: its name, its proper use, and the keys by which it is recognised."""
 
     what: str
     cure: str

@@ -1,4 +1,4 @@
-"""The configuration's experiment: started by the operator, or by itself on an emulated rig, and followed to its end."""
+"""The configured experiment: the operator starts it, or `autostart` does on an emulated rig; followed to its end."""
 
 import asyncio
 from pathlib import Path

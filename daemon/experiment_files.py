@@ -1,10 +1,10 @@
-"""Experiments: read with every mistake at the desk, and at an operator's request in a thread and within bounds.
+"""Reads experiments: at the desk with every mistake; for an operator's request in a thread and within bounds.
 
-Every user of this machine may send `start` with the name of a file, and the daemon may be allowed to read more than
-they are. So a request names only files in the configured folders, and the reply names no content.
+Every user of this machine may send `start` with the name of a file. The daemon may have rights to read files that this
+user may not read. So a request may name only files in the configured folders, and the reply contains nothing of a file.
 
-A thread that parses a file takes the interpreter from the event loop, some ms at a time. So the files are small, and
-none is read for a request while something moves or is about to: `Rig.reading_refusal` says so.
+A thread that parses a file blocks the event loop for some ms at a time. So the files are small, and no file is read for
+a request during a motion or the start of one (`Rig.reading_refusal`).
 """
 
 import asyncio
@@ -35,14 +35,14 @@ from shearloop.yaml_files import Document
 
 # A file on a network drive may never answer.
 READ_WITHIN_S = 5.0
-# Those of the first folder have less than 2 kB.
+# The packaged experiments have less than 2 kB.
 MOST_BYTES = 1 << 15
-# Of a path, and of a mistake, in a message.
+# The longest path and the longest mistake in a message, in characters.
 _LONGEST_NAME = 300
 _LONGEST_MISTAKE = 500
-# Requests that may wait for the turn of their file: others of the command socket have room beside them.
+# So many requests may wait for their file, which leaves room for other requests of the command socket.
 _MOST_WAITING = 4
-# Files of a folder that are looked at for the list.
+# The number of a folder's files that the list examines.
 MOST_LISTED = 500
 Found = TypeVar("Found")
 
@@ -276,7 +276,7 @@ class ExperimentFiles:
                 f"{name} is not a valid experiment; the daemon's log names each mistake"
             ) from error
         if mistakes := document.located(self._mistakes(document)):
-            # The file is an experiment, whose plan `start` shows to every user: its first mistake may be named.
+            # The file is an experiment, and `start` shows its plan to every user, so the reply may name a mistake.
             structlog.get_logger().warning("the rig cannot run the experiment", mistakes="\n".join(mistakes))
             first = mistakes[0] if len(mistakes[0]) <= _LONGEST_MISTAKE else f"{mistakes[0][:_LONGEST_MISTAKE]} …"
             others = (

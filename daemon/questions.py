@@ -1,4 +1,4 @@
-"""The question before a motion: what a person confirms is what is carried out."""
+"""The question before a motion: only the motion that the operator confirmed is carried out."""
 
 import hashlib
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ class Question:
 
 
 class QuestionChangedError(UserError):
-    """What was confirmed is not what would be carried out; `question` is the present question."""
+    """The confirmed content differs from the present one; `question` is the present question."""
 
     def __init__(self, reason: str, question: Question) -> None:
         super().__init__(reason)

@@ -224,13 +224,13 @@ class Rig:
     token: str = field(default_factory=lambda: secrets.token_hex(8))
 
     def start_refusal(self) -> str | None:
-        """Return why no experiment at all can begin, or None."""
+        """Return why no experiment can begin, or None."""
         return self._start_under_way() or self.runner.start_refusal()
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
-        """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded.
+        """Return why no zero may be taken at present, or None; `confirmed`: by the operator, nothing is loaded.
 
-        The first step of an experiment that is about to begin may grip a tool, whose torque would become the zero.
+        If an experiment is starting, its first step may grip a tool, and the tool's torque would become the zero.
         """
         return self._start_under_way() or self.control_loop.operator.tare_refusal(confirmed=confirmed)
 

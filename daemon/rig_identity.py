@@ -1,6 +1,6 @@
-"""Which rig a commissioning's report is about: versions, the robot's serial number, and hashes of what was measured.
+"""Identifies the rig of a commissioning's report: versions, the robot's serial number, and hashes of its settings.
 
-What a single stage judges has a hash of its own: after a change of it only that stage has to be measured again.
+Keys and files that only some stages judge have separate hashes. After a change only those stages are measured again.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ _DEVICE_KEYS: Final[Any] = {
     "load_cell": {"device", "rate_hz"},
     "gripper": {"model", "socket", "modbus"},
 }
-# What only some stages judge, with the first figures of their names. Of a file its content counts, not its name.
+# Keys and files that only some stages judge, with the first figures of the stages. Of a file only the content counts.
 _JUDGED_BY: Final = {
     "gripper.calibration": "2",
     "reaction_s": "3",
@@ -115,7 +115,7 @@ def judged_sha256s(config: DaemonConfig) -> dict[str, str]:
 
 
 def judged_by(stage: str, hashes: Mapping[str, str]) -> dict[str, str]:
-    """Return those of the hashes that a stage, by the first figure of its name, judges."""
+    """Return the hashes of the keys and files that a stage judges."""
     return {name: own for name, own in hashes.items() if stage[0] in _JUDGED_BY[name]}
 
 

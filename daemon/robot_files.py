@@ -1,4 +1,4 @@
-"""The files of one robot, however its address is spelt: its state, and the lock that keeps other daemons away."""
+"""The files of one robot, for all spellings of its address: its state, and the lock against other daemons."""
 
 import contextlib
 import fcntl
@@ -31,11 +31,11 @@ class RobotFiles:
     names: tuple[str, ...] = ()
     # Other spellings that have files: their state is of this robot as well.
     others: tuple[str, ...] = ()
-    # Names that are not found at present, and had its addresses: what they have is of this robot, or of another one.
+    # Names that cannot be looked up at present, and had its addresses. Their state is of this robot or of another one.
     lapsed: tuple[str, ...] = ()
     # The addresses that its name had when its state was last written, if none of them is left.
     earlier: tuple[str, ...] = ()
-    # Whether it is known which robot the name means; it need not be an address of the present look-up.
+    # Whether it is known which robot the name means; an address of an earlier look-up is enough.
     known: bool = True
 
     @classmethod
@@ -65,7 +65,7 @@ class RobotFiles:
 
     @property
     def states(self) -> tuple[Path, ...]:
-        """The files of its state, which are written; that of a name is the latest of them."""
+        """The files of its state, which are written; the file of a name is written last."""
         return tuple(memory_path(spelling) for spelling in (*self.keys, *self.names))
 
     @property
@@ -95,7 +95,7 @@ class RobotFiles:
         return tuple(_file(spelling, ".lock") for spelling in sorted(spellings))
 
     def note_addresses(self) -> bool:
-        """Keep the addresses of its name, for a start without a network; return whether it has any now.
+        """Store the addresses of its name, for a start without a network; return whether it has any at present.
 
         A name whose addresses have changed keeps the earlier ones until the state is written under the new ones.
         """
@@ -103,7 +103,7 @@ class RobotFiles:
         if is_address(name):
             return True
         found = addresses_of((name,))[name] if not self.known else frozenset(self.keys)
-        # A folder that cannot be written keeps experiments from their start, and says so.
+        # In a folder that cannot be written no experiment starts, and the refusal says so.
         with contextlib.suppress(OSError):
             path = _file(name, ADDRESSES_SUFFIX)
             if found and found != _last_addresses(name):
@@ -157,10 +157,10 @@ def _last_addresses(name: str) -> frozenset[str]:
 def lock_robot(files: RobotFiles, commands: str = "", gripper: tuple[str, int] | None = None) -> Iterator[None]:
     """Keep other daemons of this user away from a robot and its gripper; raises UserError if one of them has either.
 
-    `commands` is the command address of this process, if it has one, which the sentence to another one names. `gripper`
-    has the address and port of its socket, which may be another robot's by mistake, and serves any number of programs.
-    Two daemons would share the robot's memory, and neither would know of the other's stops and grips. The lock ends
-    with the process, however that ends. Where the file cannot be made, no experiment starts, and nothing is locked.
+    `commands` is the command address of this process, if it has one; the error of another process names it. `gripper`
+    has the address and port of its socket. The socket may be another robot's by mistake, and serves any number of
+    programs. Two daemons would write the same state of the robot, and neither would know the other's stops and grips.
+    The lock ends with the process in any case. If the file cannot be made, no experiment starts, and nothing is locked.
     """
     with contextlib.ExitStack() as opened:
         for path in files.locks:

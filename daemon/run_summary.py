@@ -30,8 +30,8 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 # The name of the emulated tool's torque, which no sensor measures.
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
-# Emulated devices have these faults on command, or because their computer is too busy for them. A step's own time may
-# be too short for it, and a blocked robot names its reason: neither is blamed on the computer.
+# Emulated devices have these faults on command, or because the computer is too busy. A step's time limit and a blocked
+# robot are not among them, because they have other causes.
 _LATE_FAULTS = frozenset(
     code.text
     for code in (
@@ -45,7 +45,7 @@ _LATE_FAULTS = frozenset(
     )
 )
 _TOO_BUSY = "This computer was too busy for the emulated rig: close other programs and run it again."
-# Stops that a person asked for: they are no error, and need no cure.
+# Stops by an operator: they are not errors, and need no cure.
 _ASKED_FOR = frozenset((FaultCode.OPERATOR_STOP.text, FaultCode.DAEMON_ENDED.text))
 # The time of each disturbance in ns, and its description.
 _Events: TypeAlias = Sequence[tuple[int, str]]

@@ -1,4 +1,4 @@
-"""Tells systemd how the daemon is, by sd_notify(3)."""
+"""Reports the daemon's state to systemd, by sd_notify(3)."""
 
 import os
 import socket

@@ -133,5 +133,5 @@ def build_sensors(
 
 
 def _longest_tare_s(fingertip: FingertipConfig) -> float:
-    """Return the time within which a fingertip's tare must be complete: three times that of its frames."""
+    """Return the time within which a fingertip's tare must be complete: three times the time of its frames."""
     return max(LONGEST_TARE_S, 3.0 * fingertip.baseline_frames * fingertip.frame_period_s)

@@ -101,7 +101,7 @@ class LatestTorques:
         self._torques_nm: dict[str, float] = {}
 
     def on_link(self, _device: str, _sentence: str, *, up: bool) -> None:
-        """Forget all torques where a device is lost, `combined` among them: those of the others come again at once."""
+        """Forget all torques when a device is lost, also `combined`; the other devices send new ones at once."""
         if not up:
             self._torques_nm.clear()
 

@@ -1,6 +1,6 @@
 """The control loop: decides at every tick on robot and gripper, from experiment, controllers and safety table.
 
-A plain object without I/O or clock: inputs come in, `ControlOutput` go out, and events report their results.
+A plain object without I/O or clock: it takes inputs and events, and returns a `ControlOutput` at each tick.
 """
 
 from collections.abc import Mapping, Sequence
@@ -168,7 +168,7 @@ class ControlLoop:
             self.inputs.lost.pop(device, None)
         else:
             self.inputs.lost[device] = sentence
-            # What was unplugged or switched off may come back with another zero.
+            # A device that was unplugged or switched off may return with another zero.
             for name, source in self._sources.items():
                 if name == device or (source.from_robot and device == "robot"):
                     self.on_zero(name, known=False)
@@ -292,7 +292,7 @@ class ControlLoop:
         return self._run_step(running, decision, arm.wrist_rad, t_ns)
 
     def _watched_now(self, t_ns: int) -> Watched:
-        """Return what to watch for: the latest experiment's limits, and while it runs what its command needs."""
+        """Return the limits to watch: those of the latest experiment and, while it runs, of its command."""
         if self.experiment is None:
             return self._watched
         watched = replace(self._watched, limits=self.experiment.limits)

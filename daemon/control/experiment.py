@@ -140,7 +140,7 @@ class Experiment:
 
     @property
     def progress(self) -> float:
-        """The completed share, 0 to 1; a stopped experiment keeps that of its stop."""
+        """The completed fraction, 0 to 1; a stopped experiment keeps the fraction at its stop."""
         if self.phase is ExperimentPhase.DONE:
             return 1.0
         return max(0.0, 1.0 - self._left_s / max(sum(self._expected_s), 1e-9))

@@ -1,4 +1,4 @@
-"""When the fingers moved, by the commands to the gripper and by its states."""
+"""Records when the gripper's fingers moved, from the commands to the gripper and from its states."""
 
 from collections import deque
 from collections.abc import Iterator

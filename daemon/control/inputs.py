@@ -1,4 +1,4 @@
-"""What the control loop takes: the states of arm and gripper with times, and the latest of each input."""
+"""The inputs of the control loop: states of arm and gripper with their times, and the latest of each input."""
 
 from bisect import bisect_left
 from collections import deque
@@ -51,7 +51,7 @@ class GripperStatus:
 
     @property
     def fingers(self) -> str:
-        """What its fingers do, with their width."""
+        """A sentence on the motion and the width of its fingers."""
         width = f"{self.width_mm:.1f} mm"
         if self.holding:
             return f"its fingers hold something {width} wide"

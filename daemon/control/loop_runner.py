@@ -1,4 +1,4 @@
-"""The task that runs the control loop: robot states in, commands out, 125 times a second; and its messages."""
+"""The task that runs the control loop: it takes robot states, sends commands and publishes, 125 times a second."""
 
 import asyncio
 from collections.abc import Mapping
@@ -187,7 +187,7 @@ class ControlLoopRunner:
             return refusal
         if self.actions.unlocking:
             return UNLOCKING
-        # Its first step could grip a tool, whose torque becomes the zero.
+        # The first step could grip a tool, and the tool's torque would become the zero.
         if (refusal := self._taring()) is not None:
             return refusal
         now_ns = self._clock.now_ns()

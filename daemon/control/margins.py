@@ -234,9 +234,9 @@ def integral_gain(kp: float) -> float:
 def noise_share(kp: float, ki: float) -> float:
     """Return the standard deviation of the torque caused by measurement noise of standard deviation 1.
 
-    The stationary variance of the controller's filter d ← d + i + (kp + ki)·ν, i ← i + ki·ν, ν = noise − d: that of the
-    prediction of an α-β filter, α = kp and β = ki (Kalata 1984). It is exact if the wrist arrives within a period, and
-    slightly too large otherwise.
+    It is the square root of the stationary variance of the controller's filter d ← d + i + (kp + ki)·ν, i ← i + ki·ν,
+    ν = noise − d. This is the variance of the prediction of an α-β filter, α = kp and β = ki (Kalata 1984). It is exact
+    if the wrist arrives within a period, and slightly too large otherwise.
     """
     return math.sqrt((2.0 * kp * kp + kp * ki + 2.0 * ki) / (kp * (4.0 - 2.0 * kp - ki)))
 

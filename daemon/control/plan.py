@@ -18,8 +18,8 @@ from shearloop.drivers.ur.settings import UrLimits
 class StepPlan:
     """One step: its action in words, its largest values, and its limits, reversals and refusals.
 
-    `torque_nm` is None where the step turns the tool by an angle, and its torque is not known before. `reverses` says
-    whether it turns a held tool against the turn before, `turns_back` whether it turns both ways.
+    `torque_nm` is None if the step turns the tool by an angle, because its torque is not known before. `reverses` says
+    whether the step turns a held tool against the previous turn, `turns_back` whether it turns both ways.
     """
 
     number: int

@@ -1,7 +1,7 @@
 """The safety table: the response to each fault, and the sentence for the operator.
 
-A response is never weaker than the strongest row that applies. A fault without a row stops the robot as well: it kills
-the task that meets it, and `TASK_DIED` is a row.
+The response is at least the strongest one of all rows that apply. A fault without a row stops the robot too: it ends
+its task, and `TASK_DIED` is a row.
 """
 
 from collections.abc import Iterable, Mapping

@@ -86,7 +86,7 @@ class StatePublisher:
 
 
 class _LogKey(NamedTuple):
-    """What a line of the log tells: a new line follows a change of it, and not of a number within a sentence."""
+    """The facts of a line in the log: a change of them makes a new line, a changed number in a sentence does not."""
 
     phase: str
     run: int

@@ -1,27 +1,27 @@
 """The twist controller: late, noisy torque measurements become a wrist speed, up to 125 times a second.
 
-The tool in the grip is a torsion spring on a wrist with a known angle: torque = K·(θ − θ₀) + d. The offset d takes in
-all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). Only d is learnt from the torque sensor
-(`TorqueFilter`); the rest is known without delay.
+The tool in the grip is a torsion spring on a wrist with a known angle: torque = K·(θ − θ₀) + d. The offset d covers all
+that the spring does not explain (relaxation, hysteresis, slip, a wrong K). Only d is learnt from the torque sensor
+(`TorqueFilter`). The other terms are known without delay.
 
 - A measurement y belongs to a past time t_mid (an EIT frame: the middle of its acquisition). It is compared with the
-  torque expected *at that time*: ν = y − K·(mean of θ over the acquisition − θ₀) − d. It is the delay compensator, the
-  internal-model form of Smith's predictor (Smith 1957; Garcia & Morari, "Internal Model Control. 1", Ind. Eng. Chem.
-  Process Des. Dev. 21, 1982) with the *measured* angle, not a simulated one. Each measurement has its own delay,
+  torque expected *at that time*: ν = y − K·(mean of θ over the acquisition − θ₀) − d. This is the delay compensator,
+  the internal-model form of Smith's predictor (Smith 1957; Garcia & Morari, "Internal Model Control. 1", Ind. Eng.
+  Chem. Process Des. Dev. 21, 1982) with the *measured* angle, not a simulated one. Each measurement has its own delay,
   a dropped frame only postpones the next correction, and clipped commands or a slow wrist are no modelling error.
-- A PI controller in incremental form takes ν up into d: i ← i + ki·ν, d ← d + kp·ν + i. (An α-β filter, the steady
+- A PI controller in incremental form adds ν to d: i ← i + ki·ν, d ← d + kp·ν + i. (An α-β filter, the steady
   Kalman filter of a drifting offset: Kalata 1984.) i is the drift of the torque at a fixed angle.
-- kp is the least gain. Where the noise σ and the error of K (σ_K) allow more, the gain is the Kalman filter's,
+- kp is the minimum gain. If the noise σ and the error of K (σ_K) allow more, the gain is the Kalman filter's,
   s²/(s² + σ²), with s² = p·σ² + σ_K²·(θ − θ_d)². So d is a weighted mean of measurements: θ_d is the same mean of their
   angles, and p the sum of the squared weights. s² is the variance of the filtered torque at θ.
 - After a jump, which two CUSUM tests of ν detect, d restarts from the mean of the measurements since then. The jump
   began where its likelihood is greatest (Willsky & Jones, IEEE Trans. Automatic Control 21, 1976).
-- The wrist is driven to the angle where the expected torque equals the ramp r: speed = bandwidth·(r − torque)/K,
+- The wrist turns to the angle at which the expected torque equals the ramp r: speed = bandwidth·(r − torque)/K,
   with feed-forward of the ramp, ṙ/K.
 
 Wind-up: the expectation uses the measured angle, so d does not wind up while a command is clipped (the observer form of
-anti-windup: Åström & Wittenmark, Computer-Controlled Systems). The ramp moves no faster than the wrist was commanded to
-turn, and i stands still while less was sent than was wanted.
+anti-windup: Åström & Wittenmark, Computer-Controlled Systems). The ramp is no faster than the commanded turn of the
+wrist, and i does not change while the sent speed is below the wanted speed.
 """
 
 import math
@@ -301,8 +301,8 @@ class TorqueController:
     def set_point(self, torque_nm: float, settings: ControllerSettings | None = None) -> None:
         """Change the set point; the ramp continues, or begins at the present torque.
 
-        `settings` are those of this set point on, where its ramp or its limit differ. Raises UserError for a torque
-        beyond the limit.
+        `settings` count from this set point on, if its ramp or its limit differ. Raises UserError for a torque beyond
+        the limit.
         """
         self.settings = settings or self.settings
         limit = self.settings.torque_limit_nm

@@ -1,4 +1,4 @@
-"""The robot's wrench as a torque source: a mean over states, because one is known to 0.2 N·m only."""
+"""The robot's wrench as a torque source: a mean over states, because a single state is known only to 0.2 N·m."""
 
 from collections import deque
 

@@ -1,4 +1,4 @@
-"""The one limit of the speeds that the daemon forms; the worker and the script on the robot check what they get."""
+"""The limit of all speeds that the daemon forms; the worker and the script on the robot check the speeds again."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Bound sockets: which addresses may be bound, and with which options."""
+"""Binds sockets: the allowed addresses and the options of the sockets."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""Who sends a command, as the client says. It is not checked, so it serves only the log and the list of events."""
+"""The sender of a command, by the client's own words. Nothing checks it: it is only for the log and the events."""
 
 import os
 from collections.abc import Mapping

@@ -177,7 +177,7 @@ def check_allowed_clients(folder: Path) -> AllowedClients:
 
 
 class ClientAuthenticator:
-    """Admits new clients at a bounded rate, those of a network address by their keys (ZAP, ZeroMQ RFC 27).
+    """Admits new clients at a bounded rate; at a network address also by their keys (ZAP, ZeroMQ RFC 27).
 
     libzmq makes the event loop's thread work for each new client, but asks here first. It must exist before a socket
     is bound.

@@ -1,7 +1,7 @@
-"""Requests that have waited while the daemon's process stood still: when they were sent is not known.
+"""Refuses requests that waited while the daemon's process stood still, because their age is unknown.
 
-A client gives up after some seconds. Its request stays in the socket of a daemon that hangs, and would be carried out
-when the daemon returns, long after the person has walked up to the robot.
+A client gives up after some seconds. Its request stays in the socket of a daemon that hangs. The daemon would carry it
+out after the hang, when the operator may already stand at the robot.
 """
 
 from typing import Final
@@ -24,7 +24,7 @@ class LateRequests:
         self._until_ns = t_ns
 
     def alive(self, t_ns: int) -> None:
-        """Take note that the event loop runs."""
+        """Record that the event loop runs."""
         stood_s = (t_ns - self._alive_ns) / 1e9
         if stood_s > LONGEST_STANDSTILL_S:
             self._stood_s, self._until_ns = stood_s, t_ns + round(READ_WITHIN_S * 1e9)

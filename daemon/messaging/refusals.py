@@ -1,4 +1,4 @@
-"""What the sockets refuse: counts for `health` and the log, and the rate that they allow."""
+"""Refusals of the sockets: their counts for `health` and the log, and the allowed rate."""
 
 from collections import Counter
 from collections.abc import Mapping

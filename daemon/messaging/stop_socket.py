@@ -1,7 +1,7 @@
 """The stop socket: a Unix datagram socket that accepts `stop` and `status` from every user of this machine.
 
-A datagram needs no connection, so that the socket works when ZeroMQ's sockets are flooded. Its abstract name follows
-from the address of `commands`. Requests and replies are the command server's, one datagram each, without keys.
+A datagram needs no connection, so this socket works while ZeroMQ's sockets are flooded. Its abstract name follows from
+the address of `commands`. Requests and replies are as on the command server, one datagram each, without keys.
 """
 
 import asyncio

@@ -37,9 +37,9 @@ INPUT = "input"
 CLOCK_TOPIC = f"{INPUT}.clock"
 # MCAP metadata record of every recording: format, software, channel table.
 METADATA = "shearloop"
-# Its key of the offset: all Unix times of a daemon's recording minus CLOCK_MONOTONIC, in ns.
+# Its key for the offset: all Unix times of a daemon's recording minus CLOCK_MONOTONIC, in ns.
 CLOCK_OFFSET = "clock_offset_ns"
-# Its key of a rig whose devices were all emulated; absent from others.
+# Its key in a recording of an emulated rig; other recordings do not have it.
 EMULATED = "emulated"
 # One metadata record for each experiment, and one at the end of a closed recording.
 EXPERIMENT_METADATA = "shearloop.experiment"

@@ -103,7 +103,7 @@ class McapFile:
         self.partial = Path(os.fsdecode(file.name))
         self._file = file
         self._stream = _RetryStream(file)
-        # The MCAP writer calls only write, tell and flush.
+        # The MCAP writer calls only `write`, `tell` and `flush`.
         self._writer = new_writer(cast(IO[bytes], self._stream))
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}

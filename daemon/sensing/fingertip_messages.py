@@ -109,7 +109,7 @@ def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, n
 
 
 def moved_as_bytes(frame: int) -> bytes:
-    """Return the raw event's data: the frame during whose acquisition the fingers moved."""
+    """Return the raw event's data: a frame during which the gripper's fingers moved."""
     return str(frame).encode()
 
 

@@ -137,7 +137,7 @@ class FingertipTask:
     loop: SensorListener | None = None
     gripper: ToolHolder | None = None
     inputs: InputRecorder | None = None
-    # The longest time of a tare that nobody waits for.
+    # The longest time of a tare that no step of an experiment waits for.
     longest_tare_s: float = LONGEST_TARE_S
     count: int = 0
     _tare: _Tare = field(default_factory=_Tare)
@@ -218,7 +218,7 @@ class FingertipTask:
 
     def _is_of_held_tool(self) -> bool:
         """Return whether the idle frame is one of a held tool, as far as the gripper says."""
-        # A session of the paper's method begins with an idle frame that nobody asked for.
+        # A session of the paper's method begins with an idle frame, without a request.
         if self._unconfirmed is None:
             self._unconfirmed = self.session.taring
         holding = self.gripper.is_holding if self.gripper is not None else None

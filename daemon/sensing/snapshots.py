@@ -209,7 +209,7 @@ class _Decoder:
     def _object(self, kind: Any, attributes: Mapping[str, Any]) -> Any:
         if missing := [name for name in self._known.get(kind, ()) if name not in attributes]:
             raise SnapshotError(f"{kind.__name__} has no {', '.join(missing)}")
-        # A model cannot be copied without what pydantic keeps beside its attributes.
+        # A pydantic model also needs the values that pydantic keeps outside its attributes.
         is_model = issubclass(kind, BaseModel)
         made = self._meet(kind.model_construct() if is_model else kind.__new__(kind))
         for name, one in attributes.items():

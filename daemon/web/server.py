@@ -377,7 +377,7 @@ class _Page:
             if not (number.isascii() and number.isdecimal() and len(number) <= _MOST_DIGITS):
                 return self._refuse(400, f"`stop` is {number[:40]!r}, and has to be a whole number")
             arguments["stop"] = int(number)
-        # The first press asks, the second one confirms what was asked.
+        # The first press asks the question, the second press confirms it.
         if name in ASKED and "digest" not in arguments:
             arguments["ask"] = True
         elif name == "release" or (name in ASKED_IF_NEEDED and "digest" in arguments):

@@ -8,7 +8,7 @@ LOAD_CELL_RATE_HZ = 10.9
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # Its Primary Client Interface, which reports error codes.
 PRIMARY_PORT = 30001
-# What an emulated controller answers for its serial number: ur-rtde accepts digits alone, and no real one has so many.
+# The serial number of an emulated controller: ur-rtde accepts only digits, and no real number has so many.
 EMULATED_ANSWER = "0" * 16
 # The serial number that this stands for, in sentences and reports.
 EMULATED_SERIAL_NUMBER = "EMULATED"

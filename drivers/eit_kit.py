@@ -251,11 +251,11 @@ def slope_below(points: Iterable[tuple[int, int]]) -> float:
 
 
 class FrameParser:
-    """Turns bytes, however they are sliced, into frames; counts rejected lines by kind. No I/O.
+    """Turns chunks of bytes into frames; counts rejected lines by kind. No I/O.
 
-    `zero_slots` (v,) is true where the injection pattern makes the value 0. A line that was under way when the port was
-    opened is no error. `patience` is the factor on the pause after which the board counts as stopped; above 1 on an
-    emulated rig alone, whose boards a busy computer keeps waiting.
+    `zero_slots` (v,) is true where the injection pattern makes the value 0. A cut line at the opening of the
+    port is not an error. `patience` is the factor on the pause after which the board counts as stopped. It is above 1
+    only on an emulated rig, because a busy computer delays the emulated boards.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ SLEW_NM_PER_S = 2.0
 # A calibration with more raw units in the capacity than this is of converter counts: it has millions of them, and grams
 # would be five thousand.
 _MOST_UNITS = 10_000
-# Why a line's unit is not that of the calibration, and the cure.
+# Why a line has another unit than the calibration, and the cure.
 COUNTS_REASON = (
     "the board sends counts and has no calibration; run `shearloop calibrate load` and name its file as "
     "`load_cell.calibration`"

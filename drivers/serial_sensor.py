@@ -289,8 +289,8 @@ class SerialSensor(Generic[ValueT]):
     async def batches(self) -> AsyncGenerator[Sequence[ValueT]]:
         """Yield the values that each read completes, in order and without end; reconnects when the board disappears.
 
-        An empty batch means that all bytes so far are processed. One comes before a read of which a recording needs the
-        state before it. Nothing is lost while the receiver is busy: the bytes wait in the kernel, then on the board.
+        An empty batch means that all bytes so far are processed. It comes before a read if a recording needs the state
+        before that read. While the receiver is busy, nothing is lost: the bytes wait in the kernel, then on the board.
         Iterate within `contextlib.aclosing`, which closes the port at the end.
         """
         with self._link:

@@ -128,7 +128,7 @@ def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
 
 
 def _clear_grips(recording: FrameSeries, number: int, of: int) -> list[Grip]:
-    """Return the grips with enough frames; raises CalibrationError, naming the recording, where there is none."""
+    """Return the grips with enough frames; raises CalibrationError with the recording's name if it has none."""
     grips = find_grips(recording)
     few = [too_few_frames(one.idle.stop - one.idle.start, one.gripped.stop - one.gripped.start) for one in grips]
     if all(few):

@@ -1,8 +1,8 @@
 """Gain of a torque: how much it changes between recordings, and its correction by twists of known torque.
 
 The same twist moves the gel differently in another grip, so the estimates of a recording have an error in common that
-grows with the torque. Its size is a random effect: estimated where several recordings were given, with a prior that
-counts as some recordings more. A correction is a regression with that prior (empirical Bayes): one twist moves the
+grows with the torque. Its size is a random effect. Several recordings estimate it, and a prior counts as some more
+recordings. A correction is a regression with that prior (empirical Bayes): one twist moves the
 gain only as far as twists of one recording agree.
 """
 
@@ -22,12 +22,13 @@ from shearloop.estimation.confidence import TWO_SIDED_95
 # that it counts as. Cylinders and days recorded twice differ by factors of 0.44 to 1.4 for one fingertip, of 0.86 and
 # 1.2 for two (docs/decisions/0046).
 PRIOR_SPREADS, _PRIOR_RECORDINGS = {1: 0.28, 2: 0.16}, 3
-# The same of a calibration on fewer twists, where nothing shows that the torque repeats. Of two recordings with one
-# twist each the gains differ by factors of 3.0 (right), 2.2 (left) and 1.1 (both).
+# The same for a calibration on fewer twists, which do not show that the torque repeats. The gains of two recordings
+# with one twist each differ by factors of 3.0 (right), 2.2 (left) and 1.1 (both).
 _REPEATING_TWISTS, _UNREPEATED_SPREADS = 3, {1: 0.9, 2: 0.24}
-# The same of the first twist after a grip against the later ones, and the grips that its mean of 0 counts as.
+# The same for the first twist after a grip against the later ones, and the number of grips that its mean of 0 counts
+# as.
 FIRST_SPREAD, _PRIOR_GRIPS = 0.2, 1
-# The same of a tool that was not calibrated, against the law over the diameter: a factor of 4 either way.
+# The same for a tool that was not calibrated, against the law over the diameter: a factor of 4 either way.
 TOOL_SPREAD = 0.7
 # The minimum spread of a recording's twists: a few equal ones are chance.
 _LEAST_WITHIN = 0.05
@@ -35,7 +36,7 @@ _LEAST_NOISE, _LEAST_ZERO, _LEAST_CHANGE = 1e-3, 1e-6, 1e-3
 # The gain drifts while the gel settles, so successive twists deviate alike from the later ones, by this share of the
 # variance; more twists do not average it away.
 _ALIKE = 0.8
-# Twists change the gain where the square of their deviation, in standard errors, exceeds what one more unknown gains by
+# Twists change the gain if the square of their deviation, in standard errors, exceeds the gain of one more unknown by
 # chance (Akaike 1974).
 _BY_CHANCE = 2.0
 # Furthest diameter beyond the calibrated ones, as a ratio.
@@ -80,9 +81,9 @@ class GainSpread:
     ) -> Self:
         """Return the spread from (n,) predictions of left-out frames and their truth, in the order of time.
 
-        `grips` are the number of each one's grip, `is_first` whether it belongs to the grip's first twist, `left_out`
-        logarithms of the gains of grips that were left out of the fit, `halves` those of halves of a grip's twists. The
-        fingertips share the prior.
+        `grips` are the number of each frame's grip, `is_first` whether the frame belongs to the grip's first twist.
+        `left_out` are logarithms of the gains of grips that were left out of the fit, `halves` of the gains of the
+        halves of a grip's twists. The fingertips have one prior.
         """
         rows_of_grips = [np.flatnonzero(grips == grip) for grip in np.unique(grips)]
         found = [_GripGains.of(predicted[rows], truth[rows], is_first[rows]) for rows in rows_of_grips]
@@ -267,7 +268,7 @@ class GainSpread:
 class _GripGains:
     """The logarithms of the gains of a grip's twists, the first after the grip apart from the later ones.
 
-    `errors_nm` has one row for each twist: what its gain does not explain.
+    `errors_nm` has one row for each twist: the errors that its gain does not explain.
     """
 
     first: Sequence[float]
@@ -361,7 +362,7 @@ class _Equations:
             )
 
     def misfit(self, x: FloatArray) -> float:
-        """Return the sum of the squared residuals without those of the prior."""
+        """Return the sum of the squared residuals without the residuals of the prior."""
         known = self.residuals(x)[: -len(self.prior)]
         return float(known @ known)
 
@@ -387,8 +388,8 @@ class _Equations:
 class GainCorrection:
     """Factors (m,) on the torques of m fingertips with their standard errors, and the offset of their sum.
 
-    `spread` is the gain's spread that remains, `twists` their number. Where an estimator combines its fingertips
-    otherwise, m is 1.
+    `spread` is the remaining spread of the gain, `twists` the number of twists. If an estimator combines its fingertips
+    in another way, m is 1.
     """
 
     factors: FloatArray
@@ -515,7 +516,7 @@ def _least_squares(
 def _relative_error(covariance: FloatArray, parts: FloatArray, x: FloatArray) -> float:
     """Return the standard error of (n, m) corrected parts as a ratio of their sum, both as root mean squares.
 
-    `covariance` (m + 1, m + 1) is that of the unknowns x: the factors' logarithms, and the offset.
+    `covariance` (m + 1, m + 1) is the covariance of the unknowns x: the factors' logarithms, and the offset.
     """
     factors, offset_nm = np.exp(x[:-1]), float(x[-1])
     slopes = np.column_stack([parts * factors, np.ones(len(parts))])

@@ -1,8 +1,8 @@
-"""How strong a grip is against the grips of the calibration: beyond limits the calibration does not hold for it.
+"""The strength of a grip relative to the calibration's grips, and the limits beyond which the calibration is not valid.
 
-The same twist of a stronger grip moves the gel otherwise, by an unknown factor. Intervals expect another grip of about
-the same strength, so they miss the truth of a much stronger or weaker one. The strength is measured along the grip's
-discriminant, which ignores twists.
+In a stronger grip the same twist moves the gel differently, by an unknown factor. Intervals expect another grip of
+about the same strength, so they miss the truth in a much stronger or weaker grip. The strength is measured along the
+grip's discriminant, which ignores twists.
 """
 
 from collections import deque

@@ -1,7 +1,7 @@
-"""Where the fingertips are idle, gripped and released in a recording, found from the torque and the frames.
+"""Finds where the fingertips are idle, gripped and released in a recording, from the torque and the frames.
 
-A recording may hold several grips. Between two of them the fingers open: the frames become idle within a few frames
-and stay so for a while, at no torque.
+A recording may hold several grips. Between two grips the fingers open: within a few frames the frames become idle, and
+they stay idle for a while, without torque.
 """
 
 import itertools
@@ -26,12 +26,12 @@ _IDLE_SHARE, _MEDIAN_FRAMES = 0.45, 5
 _LEAST_LOADED = 3
 # Fewer frames after a step are still its transient.
 _LEAST_RELEASED = 10
-# Fewer idle frames between loads are no release: the shortest pause in which the fingers open and close.
+# The minimum of idle frames of a release: the shortest pause in which the fingers open and close.
 _LEAST_OPEN = 5
 
 
 class Grip(NamedTuple):
-    """The frames before a grip, in it, and after it; those of closing and opening belong to none."""
+    """The frames before a grip, in it, and after it; frames of the closing and the opening belong to none."""
 
     idle: slice
     gripped: slice
@@ -118,9 +118,9 @@ def _segment_one(channels: FloatArray, is_loaded: BoolArray, is_known: BoolArray
 def _find_openings(channels: FloatArray, is_loaded: BoolArray) -> list[int]:
     """Return the frames between grips at which (n, m, c) frames are cut, so that each part holds one grip.
 
-    Between two twists the frames may be like the first ones too, if the recording began gripped. But twisting is not as
-    sudden as opening and closing, and it moves the gel under load. At a release the frames are unlike the idle ones
-    without a load before the fingers open, or after they close.
+    If the recording began gripped, the frames between two twists may be like the first ones too. But a twist is slower
+    than an opening or a closing, and it moves the gel under load. At a release the frames differ from the idle ones
+    without a load, before the fingers open or after they close.
     """
     loaded = np.flatnonzero(is_loaded)
     span = slice(int(loaded[0]), int(loaded[-1]) + 1)

@@ -97,7 +97,7 @@ def fit_interval_regressor(
 
 
 def _inflation(rows: IntArray, left_out: LeftOut) -> float:
-    """Return the factor by which residuals of the left-out rows are widened."""
+    """Return the factor that widens the residuals of the left-out rows."""
     if left_out:
         return student_inflation(len(np.unique(rows)))
     return INFLATION

@@ -1,4 +1,4 @@
-"""The frames that a calibration has learned from, as digests: a frame that is used twice tells nothing new."""
+"""Digests of the frames that a calibration has learned from: a frame that is used twice adds nothing new."""
 
 import hashlib
 from collections.abc import Iterable
@@ -31,7 +31,7 @@ class LearnedFrames:
         return cls(np.zeros(0, dtype=np.int64)).with_frames(frames)
 
     def with_frames(self, frames: Iterable[FloatArray]) -> Self:
-        """Return these frames and those of further series of channels."""
+        """Return these frames and the frames of further series of channels."""
         every = [self.digests, *(frame_digests(channels).ravel() for channels in frames)]
         return type(self)(np.unique(np.concatenate(every))[:MOST_DIGESTS], self.complete)
 

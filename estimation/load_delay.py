@@ -194,9 +194,9 @@ def _lateness(series: FrameSeries, found: LoadDelay) -> float:
 def is_filtered(torque_nm: FloatArray) -> bool | None:
     """Return whether a load cell's noise is filtered, from the quietest quarter of (p,) readings; None if unclear.
 
-    Differences of independent readings correlate by −½ with the next one. Where a reading shares half of its time with
-    the one before, they correlate with the one after next. Recorded HX711s have −0.07 and −0.34, emulated ones, which
-    have no filter, −0.45 and 0.
+    Differences of independent readings correlate by −½ with the next difference. If each reading has half of its time
+    in common with the previous reading, they correlate with the difference after the next one. Recorded HX711s have
+    −0.07 and −0.34, emulated ones, which have no filter, −0.45 and 0.
     """
     differences = np.diff(torque_nm)
     stretches = differences[: len(differences) // _NOISE_READINGS * _NOISE_READINGS].reshape(-1, _NOISE_READINGS)

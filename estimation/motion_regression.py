@@ -1,9 +1,9 @@
 """The estimator of motion, the default: the gel's motion over the last seconds.
 
-Its features are how far the frame has moved since some frames ago, in a few directions per fingertip; older frames are
+Its features are the frame's motion since some earlier frames, in a few directions per fingertip. Older frames are
 averaged in growing steps. The gel creeps for seconds under a held twist, so its speed shows torque that its position
-does not, and slow drift of the baseline leaves no trace. Where the gel holds its position, that position is a feature
-too and shows a long twist. `motion_fit` chooses directions and memory.
+does not, and slow drift of the baseline leaves no trace. If the gel holds its position, the position is a feature too
+and shows a long twist. `motion_fit` chooses directions and memory.
 """
 
 import math

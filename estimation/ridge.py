@@ -66,7 +66,7 @@ class Ridge:
 class CensoredRidge(Ridge):
     """A ridge with readings of no load as upper bounds; `sign` is the direction of the lever's push.
 
-    It predicts a latent value along the sign. Where that is below zero, the lever does not touch: no torque.
+    It predicts a latent value along the sign. If the value is below zero, the lever does not touch: no torque.
     """
 
     sigma: float

@@ -1,4 +1,4 @@
-"""What the torque would be without any sensor: the mean twist of the calibration at the same phase of the motion.
+"""The torque without any sensor: the calibration's mean twist at the same phase of the motion.
 
 A program that repeats its twists predicts much of the torque from its clock alone. A sensor must beat that.
 The profile is given the moment of each judged twist, so it is a stopwatch that starts at the right time.

@@ -36,9 +36,9 @@ class FrameSeries:
     t_s (n,) is the middle of each acquisition in seconds; channels (n, m, c) in volts for m sides. torque_nm (p,)
     was measured at torque_t_s (p,) on the same clock. diameter_mm (n,) is NaN where unknown; gripper_mm is then the
     gripper's width, if there was a gripper. Diameters are not fitted to gripper_mm. first_frame is the first frame's
-    number in the whole recording, load_doubt why the torque's times may be wrong, left_out what is not among the frames
-    and torques, with its number. emulated says that every device was emulated. fingers_moved (n, m) says which frames
-    saw the fingers open or close, None where that is not known.
+    number in the whole recording. load_doubt says why the torque's times may be wrong. left_out names frames and
+    torques that were left out, with their number. emulated says that every device was emulated. fingers_moved (n, m)
+    says during which frames the gripper's fingers opened or closed; it is None if that is not known.
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 

@@ -193,8 +193,8 @@ class WidthCalibration(CalibrationModel):
 class RobotiqGripper:
     """One gripper: a connection, not yet open, and the meaning of its counts.
 
-    Commands and polling may come from different tasks. Each exchange with the gripper is whole, also when its caller
-    is cancelled. A lost connection raises DeviceLostError in the call that meets it; `latest` is None until the next
+    Commands and polling may come from different tasks. Each exchange with the gripper is completed, even if its caller
+    is cancelled. A lost connection raises DeviceLostError in the call that finds it; `latest` is None until the next
     read.
     """
 
@@ -249,11 +249,11 @@ class RobotiqGripper:
         return self.latest
 
     async def activate(self, *, operator_confirmed: bool = False, may_drop: bool = False) -> messages.GripperState:
-        """Return the state of the active gripper; one that is not active opens and closes its fingers once.
+        """Return the state of the active gripper; an inactive gripper opens and closes its fingers once.
 
         After a major fault the operator has to confirm that the fingers are clear. `operator_confirmed` activates in
-        any state. One that is too hot is activated only where what it holds `may_drop`. Raises GripperFaultError when
-        the activation is refused or fails, GripperTooHotError where that is why.
+        any state. A gripper that is too hot is activated only if a held object `may_drop`. Raises GripperFaultError if
+        the activation is refused or fails, GripperTooHotError if heat is the reason.
         """
         readout, t_ns = await self._recent()
         fault = messages.fault_of(readout.flt)

@@ -92,7 +92,7 @@ class ActivationStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Readout:
-    """The status registers of one exchange; `current` is None where the connection has none."""
+    """The status registers of one exchange; `current` is None if the connection does not report it."""
 
     act: bool
     gto: bool
@@ -141,8 +141,8 @@ class GripperState:
     """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were requested).
 
     width_mm ± width_std_mm is the width between the fingertips. `object` is MOVING until the gripper has taken up the
-    last command. `requested_counts` is the position that it was last asked for, by anybody, and `others_requests` how
-    many requests of other programs were seen since the process began.
+    last command. `requested_counts` is the position of the last request of any program. `others_requests` is the
+    number of requests of other programs since the process began.
     """
 
     t_ns: int

@@ -1,4 +1,4 @@
-"""Whose request the gripper carries out: ours or another program's, by its echo of the requested position (PRE)."""
+"""Distinguishes our requests from requests of other programs, by the gripper's echo of the position (PRE)."""
 
 from dataclasses import dataclass
 
@@ -37,7 +37,7 @@ class RequestWatch:
         self._awaits_echo, self._echo = False, None
 
     def on_connection(self) -> None:
-        """Take a new connection: what was sent over the one before may have been lost."""
+        """Take a new connection: requests over the earlier connection may have been lost."""
         if self._awaits_echo:
             self._echo = None
         self.sent, self._awaits_echo = None, False

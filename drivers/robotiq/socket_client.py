@@ -114,7 +114,7 @@ class SocketClient:
         self._deadline_s = reply_deadline_s
         self._connection: TcpPort | None = None
         self._received = b""
-        # The latest value of each variable, and the order in which those in turn come next.
+        # The latest value of each variable, and the order in which the client reads the variables that come in turn.
         self._values: dict[str, int | None] = {}
         self._turn = list(IN_TURN)
 
@@ -152,7 +152,7 @@ class SocketClient:
             self._values.clear()
         loop = asyncio.get_running_loop()
         until_s = loop.time() + IN_TURN_S
-        # What is unknown comes first.
+        # Unknown variables come first.
         for number, name in enumerate(sorted(self._turn, key=self._values.__contains__)):
             if number and name in self._values and loop.time() > until_s:
                 break

@@ -150,7 +150,7 @@ class PolledInstrument(ABC, Generic[ReadingT]):
                 await self._shut_down()
 
     async def batches(self) -> AsyncGenerator[Sequence[ReadingT]]:
-        """Yield each reading as a batch of its own, as a board yields those of a read."""
+        """Yield each reading as a separate batch; a board yields the readings of one read as a batch."""
         async with aclosing(self.readings()) as readings:
             async for reading in readings:
                 yield (reading,)

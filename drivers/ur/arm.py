@@ -185,10 +185,10 @@ class UrArm:
         return True
 
     def upload(self, *, held: bool = False) -> None:
-        """Send the control script; the program starts by itself, and ends when it receives nothing.
+        """Send the control script; the controller starts the program, which ends if it receives nothing.
 
-        An e-Series zeroes its wrench as a program starts. Where something is `held`, the zero from before is kept, also
-        where the first program that was sent has started without an answer.
+        An e-Series zeroes its wrench when a program starts. If the gripper holds something (`held`), the earlier zero
+        is kept, even if the first sent program has started without an answer.
 
         Raises:
             RobotLostError: the controller does not take the script.

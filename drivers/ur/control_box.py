@@ -87,7 +87,7 @@ _OFFSET_RISE = 1e-2
 
 @dataclass(frozen=True, slots=True)
 class ControllerInfo:
-    """A controller's mode. `remote` is None where the controller has no remote mode (CB series)."""
+    """A controller's mode. `remote` is None if the controller has no remote mode (CB series)."""
 
     version: str
     serial_number: str

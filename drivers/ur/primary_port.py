@@ -61,7 +61,7 @@ def _error_in(package: bytes) -> ControllerError | None:
 
 
 class PrimaryPort:
-    """A connection that only reads; `warning` says why there is none, and is empty with one."""
+    """A connection that only reads; `warning` says why it is missing, and is empty while it is open."""
 
     def __init__(self, host: str, timeout_s: float) -> None:
         """Connect; a controller that does not serve the port is no error."""

@@ -1,10 +1,10 @@
-"""The program for the robot: our control script behind the values of one rig's settings.
+"""Makes the program for the robot: our control script after the values of one rig's settings.
 
-`control.script` is the program's text. It answers the commands that `arm` sends through ur-rtde's client, in a protocol
-of registers that is private to each version. The client gives each motion a deadline, by the script's own clock, in a
-register that ur-rtde leaves free, and extends it. The script turns the wrist no further than the deadline, its range
-and its largest force and torque allow. It stops a straight move that its client does not stop, and ends. The watchdog
-is slower: a program that ends while the arm moves may end in a protective stop.
+`control.script` is the program's text. It answers the commands that `arm` sends through ur-rtde's client. Each version
+of the client has its own protocol of registers. The client gives each motion a deadline by the script's clock, in a
+register that ur-rtde does not use, and extends it. The script stops the wrist at the deadline, at the end of its range,
+and beyond the largest force and torque. It stops a straight move that its client does not stop, and ends. The watchdog
+is slower than these stops, because a program that ends while the arm moves may end in a protective stop.
 """
 
 import hashlib
@@ -19,15 +19,15 @@ from typing import Final
 
 from shearloop.drivers.ur.settings import GENERATIONS, MOVE_GRACE_S, GenerationFacts, Six, UrSettings
 
-# The only version of ur-rtde whose protocol the script speaks.
+# The script uses the protocol of this version of ur-rtde only.
 CLIENT_VERSION: Final = "1.6.5"
 
 
 @dataclass(frozen=True, slots=True)
 class ScriptRegisters:
-    """One half of the controller's registers: the script takes commands in the first ones, and deadlines in the last.
+    """One half of the controller's registers: commands are in the first ones, deadlines in the last.
 
-    RTDE guide: those from 24 on are for RTDE clients; fieldbuses and their URCaps use the lower half.
+    RTDE guide: registers from 24 on are for RTDE clients; fieldbuses and their URCaps use the lower half.
     """
 
     first: int
@@ -73,17 +73,17 @@ class ScriptRegisters:
 
 
 UPPER, LOWER = ScriptRegisters(24), ScriptRegisters(0)
-# The clock starts at 0: with this deadline no motion begins or goes on.
+# The clock starts at 0, so with this deadline no motion begins or continues.
 NO_MOTION_TICKS = -1
-# A deadline lies this much further ahead at most: a cycle of the slowest controller, for rounding.
+# The largest further distance of a deadline: a cycle of the slowest controller, for rounding.
 _SLACK_S = 0.008
 
 _CONTROL_SCRIPT: Final = Path(__file__).with_name("control.script")
-# In parts: a name that a controller does not know keeps a program from starting.
+# The text has parts, because a program with a name that a controller does not know does not start.
 _ZEROES = "  global can_zero_wrench = True\n  def zero_wrench():\n    zero_ftsensor()\n  end\n"
 _CANNOT_ZERO = "  global can_zero_wrench = False\n  def zero_wrench():\n    sync()\n  end\n"
 
-# What is sent before the script. The watchdog is armed first.
+# The text before the script. Its first statement starts the watchdog.
 _HEAD: Final = """\
 def shearloop_control():
   rtde_set_watchdog("{command_register}", {watchdog_hz}, "stop")
@@ -92,7 +92,7 @@ def shearloop_control():
   global load_before = {load_before}
 """
 
-# What the script takes from the settings, under its names.
+# The values that the script takes from the settings, by its names for them.
 _FROM_SETTINGS: Final[Mapping[str, Callable[[UrSettings], float]]] = {
     "longest_turn_s": lambda settings: settings.command_timeout_s + _SLACK_S,
     "longest_line_s": lambda settings: settings.silence_timeout_s + _SLACK_S,
@@ -110,7 +110,7 @@ _FROM_SETTINGS: Final[Mapping[str, Callable[[UrSettings], float]]] = {
     "hard_n": lambda settings: settings.limits.force_n.hard,
     "hard_nm": lambda settings: settings.limits.torque_nm.hard,
 }
-# In the place of each value that belongs to a rig.
+# Replaces each value of a rig in the hashed text.
 _NO_VALUE: Final = "?"
 
 
@@ -129,7 +129,7 @@ def why_other_client() -> str:
 
 
 def own_script_hash() -> str:
-    """Return the SHA-256 of what is sent to robots of both generations, but for each rig's values, in hex digits."""
+    """Return the SHA-256 of the programs for both generations without the values of a rig, in hex digits."""
     head = _HEAD.format_map(defaultdict(lambda: _NO_VALUE))
     settings = dict.fromkeys(_FROM_SETTINGS, _NO_VALUE)
     texts = [_program(head, settings, facts) for facts in GENERATIONS.values()]
@@ -139,11 +139,12 @@ def own_script_hash() -> str:
 def control_program(settings: UrSettings, registers: ScriptRegisters = UPPER, load: Six | None = None) -> str:
     """Return the program that a controller runs for these settings.
 
-    Its first statement arms the watchdog, by the register that the client writes: a program whose client dies later
-    ends. URScript manual, `rtde_set_watchdog`: a program's watchdogs end with it.
+    Its first statement starts the watchdog on the register that the client writes, so the program ends if its client
+    dies later. URScript manual, `rtde_set_watchdog`: a program's watchdogs end with it.
 
-    `load` is the wrench in N and N·m in the base's frame before the program's start, where the gripper holds something
-    and the controller zeroes its wrench then; turns about the tool's axis do not change what lies along that axis.
+    `load` is given if the gripper holds something and the controller zeroes its wrench at the start. It is the wrench
+    before the start, in N and N·m in the base's frame. Turns about the tool's axis do not change its part along that
+    axis.
     """
     head = _HEAD.format(
         command_register=registers.command,
@@ -169,7 +170,7 @@ def _generation(facts: GenerationFacts) -> str:
 
 
 def _float(value: float) -> str:
-    """Return a literal of URScript, without an exponent; a whole number has a point too, and so is no integer."""
+    """Return a literal of URScript without an exponent; a whole number has a point too, so it is not an integer."""
     if not math.isfinite(value):
         raise ValueError(f"{value} is no number for the robot's script")
     return f"{value:.6f}"

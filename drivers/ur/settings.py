@@ -18,23 +18,23 @@ from shearloop.drivers.hosts import is_loopback_host, why_no_host
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
 
-# The change of a speed over 0.04 s judges an acceleration: it needs two states.
+# An acceleration is the change of a speed over 0.04 s, which needs two states.
 _SLOWEST_HZ = 50.0
-# Two cycles of a CB3, and some rounding: a shorter deadline ends between two commands.
+# Two cycles of a CB3, and some rounding. A shorter deadline would end between two commands.
 _SHORTEST_DEADLINE_S = 0.02
 # The arm can move this long without its daemon.
 _Deadline = Annotated[float, Field(ge=_SHORTEST_DEADLINE_S, le=1)]
-# The connection asks several ports in turn, each for an eighth of the time at least.
+# The connection asks several ports in turn, each for at least an eighth of the time.
 _SHORTEST_CONNECT_S = 1.0
-# A busy computer pauses a process that long; the arm stands by then.
+# A busy computer can pause a process for so long; by then the arm stands.
 _SHORTEST_HANG_S = 0.3
 # A protective stop can be cleared after 5 s; power and brakes take some more.
 _SHORTEST_RECOVERY_S = 10.0
 # A controller takes a command in its next cycle, which takes 8 ms on a CB3, 2 ms on an e-Series.
 _SHORTEST_REACTION_S = 0.002
-# The noise of an arm that stands, whose speeds reach 0.003 rad/s: below it, an arm is never at rest.
+# The speeds of an arm at rest reach 0.003 rad/s by noise. With a lower threshold an arm is never at rest.
 _LEAST_REST_RAD_PER_S = 0.002
-# The oldest state that a robot elsewhere may be moved on.
+# The largest age of a state with which a robot on another computer may move.
 _LONGEST_STATE_S = 1.0
 # The wrist stands this long after the last decision (docs/safety.md).
 _PROMISED_S = 0.2
@@ -53,24 +53,24 @@ REST_RAD_PER_S = 0.01
 Generation = Literal["e-series", "cb3"]
 
 
-# A torque of the wrench is the mean of at least so many states.
+# A torque of the wrench is the mean of at least this number of states.
 WRENCH_STATES: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
 class GenerationFacts:
-    """What differs between UR's generations of controllers."""
+    """The differences between UR's generations of controllers."""
 
     name: str
     # PolyScope's major version.
     major: int
-    # The states per second that it can be asked for.
+    # The largest number of states per second.
     most_hz: float
     # The time of a cycle, in URScript.
     step: str
     # Whether the controller can zero its wrench: `zero_ftsensor` ends a CB3's program.
     zeroes_wrench: bool
-    # Whether it zeroes its wrench by itself as a program starts.
+    # Whether the controller zeroes its wrench when a program starts.
     zeroes_at_start: bool
     # The noise of the wrench: a CB3 estimates it from the joints' currents.
     noise_n: float
@@ -78,12 +78,12 @@ class GenerationFacts:
 
     @property
     def mean_noise_nm(self) -> float:
-        """How well the mean torque of `WRENCH_STATES` states is known, N·m: an estimate's error stays in a mean."""
+        """The uncertainty of the mean torque of `WRENCH_STATES` states, N·m; a mean keeps the error of an estimate."""
         return self.noise_nm / math.sqrt(WRENCH_STATES) if self.zeroes_wrench else self.noise_nm
 
     @property
     def estimated_nm(self) -> float:
-        """How well an estimated torque is known, N·m; 0 for a measured one, whose noise commissioning judges."""
+        """The uncertainty of an estimated torque, N·m; 0 for a measured one, whose noise the commissioning judges."""
         return 0.0 if self.zeroes_wrench else self.noise_nm
 
 
@@ -229,7 +229,7 @@ class Workspace(_Checked):
         return ""
 
 
-# An emulated arm stands in this box where the settings leave the workspace open; a real robot does not run then.
+# If the settings leave the workspace open, an emulated arm stands in this box, and a real robot does not run.
 _EMULATED_WORKSPACE = Workspace(lower_m=(-0.8, -0.8, 0.0), upper_m=(0.8, 0.8, 0.9), margin_m=0.02)
 
 
@@ -256,7 +256,7 @@ class UrLimits(_Checked):
 
     @property
     def box(self) -> Workspace:
-        """The workspace, or that of an emulated arm where it is left open."""
+        """The workspace; if it is left open, the workspace of an emulated arm."""
         return _EMULATED_WORKSPACE if self.workspace is None else self.workspace
 
 
@@ -346,7 +346,7 @@ class UrSettings(_Checked):
                 )
 
     def left_open(self) -> dict[str, str]:
-        """Return the parts that a real robot needs and that are not filled in, each with what to do."""
+        """Return the parts that a real robot needs and that are not filled in, each with its cure."""
         found = {}
         if self.limits.workspace is None:
             found["limits.workspace"] = "measure the free space of your cell, and enter lower_m, upper_m and margin_m"
@@ -356,7 +356,7 @@ class UrSettings(_Checked):
 
     @property
     def facts(self) -> GenerationFacts:
-        """The particular settings of a controller's generation."""
+        """The facts of the controller's generation."""
         return GENERATIONS[self.generation]
 
     @property
@@ -368,23 +368,23 @@ class UrSettings(_Checked):
 
     @property
     def lease_s(self) -> float:
-        """How long a straight move goes on after a cycle of the worker, if none follows.
+        """How long a straight move continues after a cycle of the worker, if no further cycle follows.
 
-        With the script's grace this is the longest silence: a worker that is late for less costs no program.
+        With the script's grace this is the longest silence. A worker that is late by less ends no program.
         """
         return max(_SHORTEST_LEASE * self.silence_timeout_s, self.silence_timeout_s - MOVE_GRACE_S - _CYCLES_S)
 
     @property
     def watchdog_hz(self) -> float:
-        """The robot ends its program when it receives nothing for one period of this.
+        """The robot ends its program if it receives nothing for one period of this frequency.
 
-        The arm then stands already: a program that ends while the arm moves may end in a protective stop.
+        By then the arm stands, because a program that ends while the arm moves may end in a protective stop.
         """
         return 1.0 / (_WATCHDOG_FACTOR * self.standstill_s)
 
     @property
     def why_too_slow(self) -> str:
-        """Why a robot elsewhere takes longer to stand than docs/safety.md promises, as a sentence, else empty."""
+        """Why a robot on another computer takes longer to stand than docs/safety.md promises; empty if it does not."""
         if self.standstill_s <= _PROMISED_S or is_loopback_host(self.host):
             return ""
         return (
@@ -398,8 +398,8 @@ def read_settings(path: Path) -> UrSettings:
     """Return the robot's settings from a YAML file.
 
     Raises:
-        DriverError: the file cannot be read, or settings are wrong; the message names every mistake. So it does for a
-            robot elsewhere that takes longer to stand than docs/safety.md promises.
+        DriverError: the file cannot be read, or settings are wrong, and the message names every mistake. A robot on
+            another computer that takes longer to stand than docs/safety.md promises is a mistake too.
     """
     from shearloop.yaml_files import load_model
 

@@ -1,1 +1,1 @@
-"""What the resistive shear skin needs at run time: measurement model, membrane, calibration."""
+"""The resistive shear skin at run time: measurement model, membrane, calibration."""

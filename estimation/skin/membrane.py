@@ -137,10 +137,10 @@ class Belt:
 
     It carries tension only: the compressed side buckles. Coulomb friction holds under the load, capstan friction along
     the arc. This is a hysteresis of two plays: the tension under the load follows the shear force within ±μF_n, and the
-    tension at a gauge follows that one within factors e^(±μφ). Slip starts at the load and runs outwards, so this is
-    the exact solution of the belt, not a time step.
+    tension at a gauge follows the tension under the load within factors e^(±μφ). Slip starts at the load and runs
+    outwards, so this is the exact solution of the belt, not a time step.
 
-    The load keeps its direction and moves with the skin. Where that has turned by α about the core, the load pulls
+    The load keeps its direction and moves with the skin. If the skin has turned by α about the core, the load pulls
     along it by F_t cos α + F_n sin α and presses by F_n cos α − F_t sin α. α and forces have the same sign.
     """
 

@@ -10,7 +10,7 @@ the contact conditions are
 
 Both are one piecewise linear equation Φ(λ) = 0 (Alart & Curnier 1991; Hüeber, Stadler & Wohlmuth, SIAM J. Sci. Comput.
 30 (2008)), solved by a semismooth Newton method: each step guesses which nodes are apart, stick or slip, and solves the
-linear system of that guess. Where that does not converge, Lemke's method solves the same conditions as a linear
+linear system of that guess. If this does not converge, Lemke's method solves the same conditions as a linear
 complementarity problem.
 """
 

@@ -11,8 +11,9 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import constants
-from scipy.spatial.transform import Rotation
+
+from shearloop.drivers.defaults import STANDARD_GRAVITY
+from shearloop.emulators.rotations import matrix_of, rotation_vector_of
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -53,13 +54,13 @@ def tool_frames(q_rad: Vector, tool: Matrix) -> list[Matrix]:
 def frame_of_pose(pose: Sequence[float] | Vector) -> Matrix:
     """Return the frame (4, 4) of a pose (6,): position and rotation vector."""
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = Rotation.from_rotvec(np.asarray(pose[3:])).as_matrix(), pose[:3]
+    frame[:3, :3], frame[:3, 3] = matrix_of(np.asarray(pose[3:])), pose[:3]
     return frame
 
 
 def _pose_of_frame(frame: Matrix) -> Vector:
     """Return the pose (6,) of a frame (4, 4)."""
-    return np.concatenate([frame[:3, 3], Rotation.from_matrix(frame[:3, :3]).as_rotvec()])
+    return np.concatenate([frame[:3, 3], rotation_vector_of(frame[:3, :3])])
 
 
 def joints_within(
@@ -138,7 +139,7 @@ class LinearMove:
     def __post_init__(self) -> None:
         """Compute the length; a move that only turns is measured in radians."""
         way_m = float(np.linalg.norm(self.target[:3, 3] - self.start[:3, 3]))
-        self._turn = Rotation.from_matrix(self.start[:3, :3].T @ self.target[:3, :3]).as_rotvec()
+        self._turn = rotation_vector_of(self.start[:3, :3].T @ self.target[:3, :3])
         self._length = self._end = way_m if way_m > 1e-6 else float(np.linalg.norm(self._turn))
         self._done = self._rate = 0.0
 
@@ -153,8 +154,8 @@ class LinearMove:
         frames = tool_frames(q_rad, self.tool)
         here = frames[-1]
         where = self.start[:3, 3] + share * (self.target[:3, 3] - self.start[:3, 3])
-        turned = self.start[:3, :3] @ Rotation.from_rotvec(share * self._turn).as_matrix()
-        turn = Rotation.from_matrix(turned @ here[:3, :3].T).as_rotvec()
+        turned = self.start[:3, :3] @ matrix_of(share * self._turn)
+        turn = rotation_vector_of(turned @ here[:3, :3].T)
         error = np.concatenate([where - here[:3, 3], turn])
         try:
             step = np.linalg.solve(jacobian(frames), error)
@@ -245,7 +246,7 @@ class Arm:
     @property
     def wrench(self) -> Vector:
         """Force and torque at the tool, relative to the zero."""
-        hung_n = np.array([0.0, 0.0, -constants.g * self.hung_kg])
+        hung_n = np.array([0.0, 0.0, -STANDARD_GRAVITY * self.hung_kg])
         apart = np.concatenate([self.bias_n + hung_n, np.zeros(3)])
         return np.asarray(self.load + self._noise - self._wrench_zero + apart)
 

@@ -36,8 +36,8 @@ _LEAST_NOISE, _LEAST_ZERO, _LEAST_CHANGE = 1e-3, 1e-6, 1e-3
 # The gain drifts while the gel settles, so successive twists deviate alike from the later ones, by this share of the
 # variance; more twists do not average it away.
 _ALIKE = 0.8
-# Twists change the gain if the square of their deviation, in standard errors, exceeds the gain of one more unknown by
-# chance (Akaike 1974).
+# Twists change the gain if the square of their deviation, in standard errors, exceeds this. One more unknown improves a
+# fit by so much by chance (Akaike 1974).
 _BY_CHANCE = 2.0
 # Furthest diameter beyond the calibrated ones, as a ratio.
 _REACH = 1.5

@@ -1,1 +1,1 @@
-"""What a person runs at the desk: recordings, calibrations, evaluation, checks."""
+"""The programs for the desk: recordings, calibrations, evaluation, checks."""

@@ -1,4 +1,4 @@
-"""Every frame of a series in order through a session, as live: an estimate for each, and the time that it took."""
+"""Sends every frame of a series through a session, as live: an estimate for each frame, and the time that it took."""
 
 import time
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ class EstimateTrack:
 
     @property
     def without_torque(self) -> int:
-        """The number of valid frames whose torque the held tool leaves out."""
+        """The number of valid frames without a torque because of the held tool."""
         return sum(one.valid and one.torque_nm is None for one in self.estimates) if self.why_no_torque else 0
 
 

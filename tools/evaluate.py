@@ -30,11 +30,11 @@ _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """The tracks of parts of recordings, the path of each, and what to know of the calibration and the recordings.
+    """The tracks of parts of recordings with their paths, and facts on the calibration and the recordings.
 
-    `title` describes the calibration, `assumptions` what the user guarantees. `draw` draws a track. With
-    `no_better_than_clock` guesses without a sensor err less. `left_out` is what of the recordings was not used;
-    `emulated` names those of emulated devices.
+    `title` describes the calibration, `assumptions` are the user's guarantees. `draw` draws a track. With
+    `no_better_than_clock`, guesses without a sensor have smaller errors. `left_out` names unused parts of the
+    recordings, `emulated` the recordings of emulated devices.
     """
 
     tracks: Sequence[EstimateTrack]
@@ -84,7 +84,7 @@ def evaluate_recordings(
 def known_data(learned: LearnedFrames, tracks: Sequence[EstimateTrack], paths: Sequence[Path]) -> list[str]:
     """Return a sentence for each track with judged frames that the calibration has learned from.
 
-    The first one says so where its file does not tell them.
+    If the file does not know its frames, the first sentence says so.
     """
     found = [] if learned.complete else [CANNOT_TELL_FRAMES]
     for track, path in zip(tracks, paths, strict=True):
@@ -128,7 +128,7 @@ def _joined(reasons: Sequence[str]) -> str:
 def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path: Path) -> None:
     """Write a CSV row for every frame of each named series; cells without a truth or an estimate are empty.
 
-    The reason is also that of a valid frame without a torque.
+    A valid frame without a torque has a reason too.
     """
     values = [f"{quantity}{end}_{unit}" for quantity, unit in UNITS.items() for end in ENDS]
     with replace_file(path) as binary, io.TextIOWrapper(binary, newline="", encoding="utf-8") as file:

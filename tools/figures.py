@@ -1,4 +1,4 @@
-"""The figures of estimates against the truth: errors, intervals, and guesses without a sensor beside them."""
+"""Computes figures of estimates against the truth: errors, intervals, and the errors of guesses without a sensor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -65,9 +65,9 @@ def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     """Return the figures of all frames, by the names that `shearloop evaluate` prints.
 
     Only valid frames with a known truth are judged; with fewer than two of them, errors are None. interval_nm is the
-    median width of the intervals. winkler_nm is their mean score. baseline_zero_rmse_nm is the error of always 0. Known
-    diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a torque, coverage_95 is of
-    the diameter.
+    median width of the intervals. winkler_nm is their mean score. baseline_zero_rmse_nm is the error of an estimate
+    that is always 0. Known diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a
+    torque, coverage_95 is the diameter's.
     """
     torque, diameter = (_compare(_known_frames(tracks, quantity), unit) for quantity, unit in UNITS.items())
     valid = [estimate.valid for track in tracks for estimate in track.estimates]

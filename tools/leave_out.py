@@ -1,7 +1,7 @@
 """Judges a recipe for a calibration by leave-one-out: each grip, twist or tool in turn.
 
-A recipe is fitted to the rest, and judged on the block that it has not seen. Neither frames nor torques of a block
-take part in its fit. Only the load cell's timing is measured on everything: it belongs to the load cell.
+The recipe is fitted to the other blocks, and judged on the block that is left out. Neither frames nor torques of a
+block take part in its fit. Only the load cell's timing is measured on everything: it belongs to the load cell.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,9 +54,9 @@ class Judge(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a calibration is made: estimator, files of bank and mesh, and the known facts of torques and their times.
+    """The recipe of a calibration: estimator, files of bank and mesh, and the known facts of torques and their times.
 
-    With `nested` each fit chooses its settings too; otherwise they are those of `shearloop calibrate`.
+    With `nested` each fit chooses its settings too. Otherwise it has the settings of `shearloop calibrate`.
     """
 
     estimator: EstimatorName
@@ -140,7 +140,7 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """What is fitted and judged: a recipe, recordings, and the blocks to leave out in turn.
+    """A plan of fits: a recipe, recordings, and the blocks to leave out in turn.
 
     `advice` returns a sentence on the tracks of the blocks. `clock` names the guess without a sensor.
     `without_rest` says why blocks have nothing left to be judged.
@@ -215,7 +215,7 @@ def _adapted(recipe: Recipe, recordings: Sequence[FrameSeries], block: Block, ca
 def advice_on(
     kind: Kind, recordings: Sequence[FrameSeries], tracks: Sequence[Sequence[EstimateTrack]], *, adapted: bool
 ) -> str:
-    """Return one sentence: what to do first for a better calibration, whose gain may be `adapted` to twists."""
+    """Return one sentence of advice for a better calibration; `adapted`: its gain was adapted to twists."""
     judged = [one for each in tracks for one in each]
     loaded = figures_by_load(judged)["loaded"]
     if loaded["baseline_ratio"] is None:

@@ -1,4 +1,4 @@
-"""What is left out of a fit: each grip, twist or tool in turn, as rows of the recordings."""
+"""The blocks that a fit leaves out: each grip, twist or tool in turn, as rows of the recordings."""
 
 import itertools
 from collections.abc import Sequence

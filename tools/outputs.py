@@ -1,4 +1,4 @@
-"""Files that a person names for a result, and the progress of what makes them."""
+"""Files that a person names for a result, and the progress of the command that writes them."""
 
 import codecs
 import contextlib

@@ -36,7 +36,7 @@ _SHORTEST_REACTION_S = 0.002
 _LEAST_REST_RAD_PER_S = 0.002
 # The largest age of a state with which a robot on another computer may move.
 _LONGEST_STATE_S = 1.0
-# The wrist stands this long after the last decision (docs/safety.md).
+# The longest time from the last decision until the wrist stands (docs/safety.md).
 _PROMISED_S = 0.2
 # A client has this time to stop a straight move after its deadline; then the script does.
 MOVE_GRACE_S = 0.05

@@ -1,6 +1,6 @@
-"""What a device has sent, and the waits for more: the one loop in which a commissioning measures.
+"""The items that a device has sent, and the wait for more: the only loop in which a commissioning measures.
 
-The clock is an argument. In a simulation a wait makes time pass.
+The clock is an argument. In a simulation a wait advances the time.
 """
 
 import math

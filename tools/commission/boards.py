@@ -116,7 +116,7 @@ def _clocks(
 def _press(
     context: Context, fingertips: Mapping[str, Arrivals[Frame]], load: Arrivals[LoadSample] | None
 ) -> list[Line]:
-    """Have the tool pressed once, and return the lines on the moments at which the devices saw it."""
+    """Ask for one press on the tool, and return the lines on the moments at which the devices saw it."""
     config = context.config
     slowest_s = max([own.frame_period_s for own in config.fingertips.values()], default=0.0)
     level_s = _LEVEL_S + _LEVEL_FRAMES * slowest_s

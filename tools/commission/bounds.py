@@ -15,7 +15,7 @@ BoundT = TypeVar("BoundT", bound=Bound)
 def bounded(settings: UrSettings, wrist_rad: float) -> UrSettings:
     """Return settings that keep the wrist within `LARGEST_RAD` of an angle, and speeds within the largest ones.
 
-    The worker and the script on the robot enforce them, whatever is asked.
+    The worker and the script on the robot enforce them for every request.
     """
     limits = settings.limits
     joints = limits.joints

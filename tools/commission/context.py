@@ -1,4 +1,4 @@
-"""What every stage of a commissioning works with."""
+"""The devices, settings and questions that every stage of a commissioning uses."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -85,9 +85,9 @@ class Context:
 
     @property
     def mover(self) -> Mover:
-        """What drives the robot, which is started when it is first needed.
+        """The process that drives the robot; it is started when it is first needed.
 
-        It stays near the confirmed pose; before the confirmation, near the pose in which it is started.
+        The robot stays near the confirmed pose. Before the confirmation it stays near the pose of the start.
         """
         if self._mover is None:
             about = self._confirmed or self.observer.latest()

@@ -1,4 +1,4 @@
-"""When a step came, in curves of any rate. Values and times in, times out."""
+"""Finds the time of a step in curves of any rate. Values and times in, times out."""
 
 import math
 from collections.abc import Sequence
@@ -49,10 +49,10 @@ def step_index(values: FloatArray) -> int | None:
 
 
 def step_s(curve: Curve, longest_rise_s: float) -> float | None:
-    """Return the middle in s of a curve's rise or fall from one level to another; None where noise explains all.
+    """Return the middle in s of a curve's rise or fall from one level to another; None if noise explains the curve.
 
-    The ramp that explains most of the curve's variance is the rise. It takes at most `longest_rise_s`, and so long is
-    each level seen at least.
+    The rise is the ramp that explains most of the curve's variance. It takes at most `longest_rise_s`, and the curve
+    shows each level for at least this time.
     """
     values = np.array([value for _, value in curve])
     split = step_index(values[:, None])

@@ -1,7 +1,7 @@
-"""The worker that fails on a signal while its process lives, so that the script on the robot alone stops the arm.
+"""A worker that fails on a signal while its process runs, so that only the script on the robot stops the arm.
 
-`python -m shearloop.tools.commission.failing_worker`, as the daemon's own. After `NO_DEADLINES` it goes on without
-writing a deadline; `CLOSE_RTDE` closes its RTDE connections.
+`python -m shearloop.tools.commission.failing_worker` runs it like the daemon's worker. After the signal `NO_DEADLINES`
+it continues without writing a deadline. `CLOSE_RTDE` closes its RTDE connections.
 """
 
 import os
@@ -36,7 +36,7 @@ class ForgetfulReceiver(RtdeReceiver):
 
 
 def close_rtde() -> None:
-    """Close every RTDE connection of this process, also those of ur-rtde."""
+    """Close every RTDE connection of this process, also the connections of ur-rtde."""
     for entry in Path("/proc/self/fd").iterdir():
         # A socket without a peer, or one that was closed meanwhile, does not belong to RTDE.
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""The stops of stage 4 that only a person can bring about: emergency stop, stop at the pendant, pulled cable."""
+"""The stops of stage 4 that a person makes by hand: emergency stop, stop at the pendant, pulled cable."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -15,28 +15,28 @@ from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.operator import NOTHING_TO_DO, Played
 from shearloop.tools.commission.report import judged
 
-# Where the wrist turns round, from the pose.
+# The wrist turns back at this angle from the pose.
 _TURNS_ROUND_RAD: Final = 0.5 * LARGEST_RAD
 _STARTS_WITHIN_S: Final = 5.0
 _RESTS_WITHIN_S: Final = 5.0
-# A stop that was brought about is seen by then, and the controller again after a pulled cable.
+# The longest time until a stop is seen, and until the controller is connected again after a pulled cable.
 _SEEN_WITHIN_S: Final = 5.0
 _CONNECTED_WITHIN_S: Final = 20.0
-# A mode that follows a stop has come by then.
+# The longest time until the safety mode that follows a stop.
 _MODE_AFTER_S: Final = 0.5
-# The connection was interrupted where no sample came for this time; the wrist has stopped long before.
+# After this time without a sample the connection was interrupted; the wrist has stopped long before.
 INTERRUPTED_NS: Final = 500_000_000
-# A wrist that turned until the stop was at half its speed within this time before: it stands while it turns round.
+# The wrist turned at the stop if it had half of its speed within this time before; at each end of its way it stands.
 _TURNED_WITHIN_NS: Final = 500_000_000
-# How often a stop that was not seen is asked for.
+# How often the operator is asked for a stop, if it is not seen.
 _TRIES: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What the observer saw of a stop: the last sample before it, and the first one at rest, if there is one.
+    """A stop as the observer saw it: the last sample before it, and the first sample at rest, if there is one.
 
-    `whole`: samples of the whole way were received, so that the time to rest is known too.
+    `whole`: samples of the whole way have arrived, so the time to rest is known too.
     """
 
     before: Seen
@@ -46,9 +46,9 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class HandStop:
-    """One stop: the speed that was asked for, the one before the stop, time and angle to rest, mode, why no recovery.
+    """One stop: the requested speed, the speed before the stop, time and angle to rest, mode, why no recovery.
 
-    The time is None where nothing was seen until rest, and infinite for an arm that did not come to rest.
+    The time is None if no sample came until rest, and infinite if the arm did not come to rest.
     """
 
     asked_rad_per_s: float
@@ -61,17 +61,17 @@ class HandStop:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """One way to stop the wrist by hand; `find` returns the stop, or None where it is not seen."""
+    """One way to stop the wrist by hand; `find` returns the stop, or None if it is not seen."""
 
     what: str
     action: str
     played: Played
     find: Callable[[Context, int], Found | None]
     unseen: str
-    # What the operator does before the recovery.
+    # The operator's action before the recovery.
     after: str = ""
     played_after: Played | None = None
-    # Whether the processes that drive the robot have lost it.
+    # Whether the processes that drive the robot have lost the connection.
     loses_robot: bool = False
 
 
@@ -94,7 +94,7 @@ def _program_stop(context: Context, asked_ns: int) -> Found | None:
 
 
 def _outage(context: Context, asked_ns: int) -> Found | None:
-    """Return the stop at an outage. Of a short one the samples may come late, and show the whole way."""
+    """Return the stop at an outage; the samples of a short outage may arrive late, and then show the whole way."""
     observer = context.observer
     gap = observer.interruption(asked_ns, INTERRUPTED_NS, _CONNECTED_WITHIN_S)
     if gap is None:
@@ -169,9 +169,9 @@ def stops_by_hand(context: Context, passed_rad_per_s: Sequence[float]) -> tuple[
 
 
 def _stop(context: Context, layer: Layer, speed: float, which: str, then: str) -> HandStop | None:
-    """Turn to and fro, have the operator stop that, and recover; return None where no stop is seen after some tries.
+    """Turn to and fro until the operator stops it, and recover; return None if no stop is seen after some tries.
 
-    `which` and `then` tell the operator of this stop, and of what follows the last word that is typed for it.
+    The question to the operator has `which` for this stop, and `then` for the motion after the last typed word.
     """
     for _ in range(_TRIES):
         asked_ns = _swing(context, speed)

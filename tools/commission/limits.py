@@ -1,4 +1,4 @@
-"""The limits on times, which a busy computer delays: of a real rig, and of an emulated one."""
+"""The limits on times, for a real rig and for an emulated one, whose busy computer delays them."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -7,7 +7,7 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.patience import is_patient
 from shearloop.drivers.ur.settings import UrSettings
 
-# The wrist stands this long after the last decision (docs/safety.md).
+# The longest time from the last decision until the wrist stands (docs/safety.md).
 PROMISED_S: Final = 0.2
 
 
@@ -23,9 +23,9 @@ class TimeLimits:
     script_tolerance: float
     # Of a board: the difference of its rate from the configured one, as a fraction.
     rate_tolerance: float
-    # Between the moments at which two devices see the same.
+    # The largest difference between the moments at which two devices see the same event.
     clocks_s: float
-    # How late the computer may be on top of what the settings promise; None: what docs/safety.md promises counts.
+    # How much later than the settings' times the computer may be; None: the promise of docs/safety.md counts.
     late_s: float | None = None
 
     def reaction_s(self, settings: UrSettings) -> float:

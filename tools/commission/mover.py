@@ -1,4 +1,4 @@
-"""The commissioning's end of what drives the robot: requests, events, and a clean start after each kill."""
+"""The commissioning's side of the process that drives the robot: requests, events, and a clean start after a kill."""
 
 import contextlib
 import json
@@ -36,7 +36,7 @@ class Mover(ABC):
     """Drives the robot by requests, which `shearloop.tools.commission.mover_process` carries out."""
 
     def __init__(self, settings: UrSettings, clock: Clock = REAL_CLOCK) -> None:
-        """Take the settings whose limits bound every motion; nothing is started yet."""
+        """`settings` have the limits of every motion; no process is started yet."""
         self.settings = settings
         # The module of the worker.
         self.worker = WORKER

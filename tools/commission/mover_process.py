@@ -1,8 +1,8 @@
-"""The process in the daemon's place: it drives the robot by the daemon's own client, and can be killed or stopped.
+"""A process that replaces the daemon: it drives the robot by the daemon's client, and can be killed or stopped.
 
-`python -m shearloop.tools.commission.mover_process [WORKER]`: the robot's settings in the first line of the input, then
-one request a line in JSON; events a line in JSON. At the end of the input it stops the arm and disconnects. WORKER is
-the module of the worker, by default the daemon's own.
+Run it as `python -m shearloop.tools.commission.mover_process [WORKER]`. The first line of its input has the robot's
+settings. Each further line is one request in JSON. Each line of its output is one event in JSON. At the end of the
+input it stops the arm and disconnects. WORKER is the module of the worker, by default the daemon's worker.
 """
 
 import asyncio
@@ -36,7 +36,7 @@ from shearloop.tools.commission.bounds import LARGEST_M
 from shearloop.tools.commission.failing_worker import CLOSE_RTDE, NO_DEADLINES
 from shearloop.tools.commission.mover import FAILING_WORKER
 
-# What a request may bring about at full speed: signals to the worker, then to this one.
+# The causes of a stop that a request may name: signals to the worker, then to this process.
 CAUSES: Final[Mapping[str, tuple[signal.Signals | None, signal.Signals | None]]] = {
     "worker killed": (signal.SIGKILL, None),
     "worker stopped": (signal.SIGSTOP, None),
@@ -46,18 +46,18 @@ CAUSES: Final[Mapping[str, tuple[signal.Signals | None, signal.Signals | None]]]
     "deadline not written": (NO_DEADLINES, None),
     "RTDE closed": (CLOSE_RTDE, None),
 }
-# The causes for which the worker has to be another one than the daemon's own.
+# The causes that need another worker than the daemon's.
 WORKERS: Final[Mapping[str, str]] = dict.fromkeys(("deadline not written", "RTDE closed"), FAILING_WORKER)
-# At this share of its speed a motion is at full speed.
+# At this fraction of its speed a motion counts as full speed.
 _FULL: Final = 0.95
-# A motion that has not ended by then is stopped.
+# A motion that takes longer than this is stopped.
 _LONGEST_S: Final = 30.0
 LINE_M_PER_S2: Final = 0.3
 _ROUNDING_M: Final = 1e-6
 
 
 class DrivenRobot(Protocol):
-    """The daemon's client of a robot, as far as requests need it."""
+    """The part of the daemon's client of a robot that requests need."""
 
     state: RobotState | None
 
@@ -68,27 +68,27 @@ class DrivenRobot(Protocol):
         """Send a command at once and return its reply."""
 
     def keep_moving(self) -> None:
-        """Let a straight move that is under way go on."""
+        """Let a running straight move continue."""
 
 
 class Surroundings(Protocol):
-    """What a driver needs beside the robot: the time, a place for its events, and what ends a motion."""
+    """The other needs of a driver: the time, a place for its events, and the causes that end a motion."""
 
     def now_ns(self) -> int:
         """Return the monotonic time in ns."""
 
     def report(self, event: str, **facts: object) -> None:
-        """Tell the commissioning of an event, with its time."""
+        """Report an event to the commissioning, with its time."""
 
     def bring_about(self, cause: str) -> None:
-        """Do what `CAUSES` says."""
+        """Cause a stop as `CAUSES` says."""
 
 
 class Driver:
     """Carries out one request after the other."""
 
     def __init__(self, settings: UrSettings, robot: DrivenRobot, around: Surroundings) -> None:
-        """Take the settings whose accelerations count, and the robot."""
+        """`settings` have the accelerations of all motions."""
         self._settings, self._robot, self._around = settings, robot, around
 
     @property
@@ -96,7 +96,7 @@ class Driver:
         return self._settings.limits.wrist_acceleration_rad_per_s2.inner
 
     async def handle(self, request: Mapping[str, Any]) -> None:
-        """Carry out one request, and report its end, also where it fails."""
+        """Carry out one request, and report its end, even if it fails."""
         try:
             reply = await self._carry_out(request)
         except Exception as error:  # noqa: BLE001 - reported to the commissioning, which decides

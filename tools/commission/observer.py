@@ -1,4 +1,4 @@
-"""An observer of the robot, apart from the processes that drive it: it measures what happens when these die."""
+"""An observer of the robot, outside the processes that drive it: it measures the stops when these processes die."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,9 +48,9 @@ class Observer(Arrivals[Seen]):
         super().__init__(attrgetter("made_ns"), clock)
 
     def interruption(self, since_ns: int, least_ns: int, within_s: float) -> tuple[Seen, Seen] | None:
-        """Return the samples before and after the first time without an arrival since a moment; None if there is none.
+        """Return the samples before and after the first pause of arrivals since a moment; None without a pause.
 
-        After a short one the controller may send what it has made meanwhile, so that no sample is missing.
+        After a short pause the controller may send the samples of the pause, so that none is missing.
         """
         before: list[Seen] = []
 
@@ -62,7 +62,7 @@ class Observer(Arrivals[Seen]):
         return (before[-2], after) if after is not None else None
 
     def rest_since(self, since_ns: int, rest_rad_per_s: float, within_s: float = 5.0) -> Seen | None:
-        """Return the first of some successive samples at rest since a moment, or None if there are none in time."""
+        """Return the first of some successive samples at rest since a moment, or None if they do not come in time."""
         run: list[Seen] = []
 
         def rests(seen: Seen) -> bool:
@@ -75,7 +75,7 @@ class Observer(Arrivals[Seen]):
         return run[0] if self.wait_for(rests, since_ns, within_s) is not None else None
 
     def comes_to_rest(self, rest_rad_per_s: float, within_s: float) -> Seen | None:
-        """Return the first sample at rest from the newest one on, or None if there is none in time."""
+        """Return the first sample at rest from the newest one on, or None if it does not come in time."""
         return self.rest_since(self.latest().made_ns, rest_rad_per_s, within_s)
 
 

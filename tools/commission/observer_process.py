@@ -1,4 +1,4 @@
-"""The observer's process, with an RTDE connection of its own, because a process cannot time its own death.
+"""The observer's process, with its own RTDE connection, because a killed process cannot measure its own stop.
 
 `python -m shearloop.tools.commission.observer_process HOST RATE_HZ REGISTER` prints each sample.
 """

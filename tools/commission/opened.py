@@ -1,4 +1,4 @@
-"""What is opened and closed: a context that leaves nothing open, also where opening fails."""
+"""A context for opened devices: it leaves none of them open, even if the opening of one fails."""
 
 from abc import ABC, abstractmethod
 from types import TracebackType

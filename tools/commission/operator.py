@@ -10,7 +10,7 @@ from shearloop.errors import UserError
 # The word that allows one motion or one action of the operator.
 WORD: Final = "move"
 DONE: Final = "done"
-# The word that takes note of something that is not as it was tried.
+# The word by which the operator accepts something that was not tried before.
 GO_ON: Final = "continue"
 # Answers that end the commissioning at once, an empty line among them.
 _NO: Final = ("", "no")

@@ -47,9 +47,9 @@ def commission(
 ) -> tuple[Report, Path]:
     """Run the stages that the report in `out` lacks, up to the first that fails; return the report and its page.
 
-    `only` names stages by their first figures, and runs these again. `rig` has the devices, by default those of the
-    configuration. The report is written after each stage. Raises UserError for what keeps a stage from being measured,
-    DriverError for a device that is not there.
+    `only` names stages by their first figures, and runs these again. `rig` has the devices, by default the devices of
+    the configuration. The report is written after each stage. Raises UserError if a stage cannot be measured,
+    DriverError for a missing device.
     """
     settings = open_settings(config)
     if settings is None:

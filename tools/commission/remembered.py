@@ -1,4 +1,4 @@
-"""What the last program left of a robot: a commissioning shows it, and begins once the operator has acknowledged it."""
+"""The robot's state from the last program: a commissioning shows it, and begins after the operator acknowledges it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,7 +26,7 @@ class HoldingOperator(Operator):
     held: str = ""
 
     def allow(self, motion: str) -> None:
-        """Show a motion with what is held, and return once the word was typed; raises DeclinedError."""
+        """Show a motion with the held object, and return after the operator types the word; raises DeclinedError."""
         Operator.allow(self, f"{motion}; {self.held}")
 
 
@@ -44,9 +44,9 @@ class LeftRobot:
 
     @classmethod
     def acknowledged(cls, config: DaemonConfig, files: RobotFiles, operator: Operator) -> Self:
-        """Show what is remembered, and return once it is acknowledged; nothing may move before.
+        """Show the stored state, and return after the operator acknowledges it; nothing may move before.
 
-        A grip is still remembered afterwards. Raises DeclinedError, and UserError where the state cannot be written.
+        A stored grip stays stored. Raises DeclinedError, and UserError if the state cannot be written.
         """
         left = cls(files, operator, config.gripper is not None, keeps_memory(config), Remembered())
         if not left.keeps:

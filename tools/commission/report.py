@@ -92,7 +92,7 @@ def earlier_report(path: Path) -> Report | None:
 def report_for(rig: RigIdentity, found: Report | None, path: Path) -> Report:
     """Return the report `found` in `path`, or a new one; UserError if it is of another rig or of other settings.
 
-    A report of other settings without a stage that passed is begun anew: they were changed to make it pass.
+    A report of other settings in which no stage passed is replaced by a new one: the settings were changed to pass.
     """
     if found is None:
         return Report(rig=rig)

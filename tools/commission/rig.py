@@ -1,4 +1,4 @@
-"""What a commissioning measures: the rig's devices, each opened where a stage needs it."""
+"""The rig's devices for a commissioning; each is opened when a stage needs it."""
 
 from collections.abc import AsyncGenerator
 from contextlib import AbstractContextManager, aclosing

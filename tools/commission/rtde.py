@@ -112,8 +112,8 @@ def _uploaded(started: int, context: Context, *reasons: str) -> Line:
 def judge_clock(samples: Sequence[Seen], tolerance: float = REAL.script_tolerance) -> Line:
     """Return the line on the clock of the script, by which deadlines end motions.
 
-    A clock that loses cycles by rounding always loses them, so that the closest window counts: a simulator that is late
-    for a moment is no such clock.
+    A clock that loses cycles by rounding loses them always, so the window with the smallest error counts. A simulator
+    that is late for a moment is not such a clock.
     """
     ratios: list[float] = []
     begin = 0

@@ -23,7 +23,7 @@ STAGE: Final = "4 stops"
 START_RAD: Final = 0.085
 # To the start of a turn.
 _SLOWLY_RAD_PER_S: Final = 0.2
-# A straight move of 20 mm takes a second: a watchdog ends it on the way.
+# A straight move of 20 mm at this speed takes a second, so the watchdog ends it during the move.
 _WATCHED_M_PER_S: Final = 0.02
 # The arm is at the pose within these.
 _AT_POSE_M: Final = 0.0005
@@ -134,7 +134,7 @@ class StraightMove:
 
 
 def rising_speeds(speeds_rad_per_s: Sequence[float], fastest_rad_per_s: float) -> list[float]:
-    """Return rising speeds within the robot's limit, which is the last where one is above it.
+    """Return rising speeds within the robot's limit; if a speed is above the limit, the limit is the last one.
 
     The report allows the largest speed at which every layer passed.
     """
@@ -289,7 +289,7 @@ def _watchdog_at_rest(context: Context) -> Line:
 
 
 def _watchdog_in_motion(context: Context) -> Line:
-    """Return the line on the watchdog alone during a straight move, whose deadline is too long to end it before."""
+    """Return the line on the watchdog alone during a straight move with a deadline too long to end the move first."""
     count, longest_s, rest_s = context.counts.stops, _watchdog_s(context), context.limits.rest_s(context.settings)
     motion = StraightMove(context, _WATCHED_M_PER_S, "")
     context.operator.allow(f"{motion.shown.format(count=count)}; each is ended by: the robot's watchdog alone")

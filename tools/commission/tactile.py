@@ -58,7 +58,7 @@ class TactileSensor:
         raise UserError(f"the idle frame of {self.name} could not be taken: {reason}")
 
     def torque_nm(self) -> float | None:
-        """Return the mean of the next torques, None where there are none."""
+        """Return the mean of the next torques, or None without torques."""
         # The first frame may have begun before now.
         self._next()
         torques_nm: list[float] = []

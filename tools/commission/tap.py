@@ -1,4 +1,4 @@
-"""The clocks of all devices by one press on the tool: each sees the same step of the torque."""
+"""Compares the clocks of all devices by one press on the tool: each device sees the same step of the torque."""
 
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -58,7 +58,7 @@ def judge_clocks(
 ) -> list[Line]:
     """Return the lines on the moments at which the devices saw a press, against that of a reference device.
 
-    A rate of 0 stands for no load cell.
+    A rate of 0 means that there is no load cell.
     """
     name, at_s = reference
     lines = [

@@ -1,4 +1,4 @@
-"""Stage 7: a tool on a known spring: signs, stiffness and delay, slip, and how well a grip repeats."""
+"""Stage 7: a tool on a known spring: signs, stiffness, delay, slip, and the repeatability of a grip."""
 
 import statistics
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from shearloop.tools.commission.wrench import read
 
 STAGE: Final = "7 tool and spring"
 STIFFNESS_TOLERANCE: Final = 0.1
-# What remains of the torque after the twists, as a fraction of the largest one.
+# The torque that remains after the twists, as a fraction of the largest torque.
 LARGEST_SLIP: Final = 0.15
 REPEATS_MM: Final = 1.0
 _SLOWLY_RAD_PER_S: Final = 0.1
@@ -37,7 +37,7 @@ _SETTLES_S: Final = 0.5
 class Held:
     """The wrist's angle, the load cell's torque, and the torque of the robot's wrench about the tool's axis.
 
-    `tactile_nm` are the torques of the calibrated fingertips, by their names, None where there was no estimate.
+    `tactile_nm` are the torques of the calibrated fingertips, by their names; None without an estimate.
     """
 
     wrist_rad: float
@@ -48,7 +48,7 @@ class Held:
 
 @dataclass(frozen=True, slots=True)
 class Sensors:
-    """What measures the torque of the tool."""
+    """The sensors of the tool's torque."""
 
     load: Arrivals[LoadSample]
     rate_hz: float
@@ -61,7 +61,7 @@ class Sensors:
 
 
 def measure(context: Context) -> Measured:
-    """Return the stage's lines and the largest torque that they cover, none without a load cell."""
+    """Return the stage's lines and the largest torque that they cover; no torque without a load cell."""
     cell = context.config.load_cell
     if cell is None:
         return Measured([Line(what="tool and spring", value="not measured: no load cell is configured")])
@@ -88,7 +88,7 @@ def measure(context: Context) -> Measured:
 
 
 def _tactile(context: Context, opened: ExitStack) -> list[TactileSensor]:
-    """Return the calibrated fingertips; without a gripper nobody shows them untouched, and there are none."""
+    """Return the calibrated fingertips; none without a gripper, because they are then never seen untouched."""
     config = context.config
     sessions = calibrated_sessions(config) if config.gripper is not None else {}
     boards = {
@@ -134,18 +134,18 @@ def _grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
 
 
 def _hold(context: Context, sensors: Sensors) -> Held:
-    """Return the measurements at a wrist that stands, without those of the fingertips."""
+    """Return the measurements while the wrist stands, without the fingertips."""
     load_nm = sensors.load_nm()
     outputs = context.observer.latest().outputs
     reading = read(context)
-    # The sign of the loop's torques: what the wrist puts into the tool.
+    # The loop's sign of a torque: the torque of the wrist on the tool.
     axis = tool_axis(outputs.tcp_pose)
     wrench_nm = -sum(one * other for one, other in zip(axis, reading.mean[3:], strict=True))
     return Held(context.observer.latest().wrist_rad, load_nm, wrench_nm)
 
 
 def _hold_and_feel(context: Context, sensors: Sensors) -> Held:
-    """Return the measurements at a wrist that stands."""
+    """Return the measurements while the wrist stands."""
     held = _hold(context, sensors)
     return replace(held, tactile_nm={sensor.name: sensor.torque_nm() for sensor in sensors.tactile})
 
@@ -179,7 +179,7 @@ def judge_signs(
 ) -> list[Line]:
     """Return the lines on a positive turn: command, wrist, load cell, wrench and estimates are positive.
 
-    A wrench that is known to `wrench_noise_nm` only shows the sign of a larger torque alone. A calibration on
+    A wrench that is known only to `wrench_noise_nm` shows only the sign of a larger torque. A calibration on
     recordings of real fingertips may refuse `emulated` frames.
     """
     lines: list[Line] = []
@@ -224,7 +224,7 @@ def _sign(change: float) -> str:
 
 
 def _twists(context: Context, sensors: Sensors) -> tuple[list[Held], list[float]]:
-    """Return what is held at the pose, at each twist's end and at the pose again, and each twist's delay in s."""
+    """Return the measurements at the pose, at each twist's end and at the pose again, and each twist's delay in s."""
     count = context.counts.twists
     context.operator.allow(
         f"wrist 3 turns the tool {count} times by {TURN_RAD:g} rad either way at {_SLOWLY_RAD_PER_S:g} rad/s"
@@ -248,7 +248,7 @@ def _middle_s(curve: Curve) -> float:
 
 
 def judge_twists(held: Sequence[Held], spring: float) -> list[Line]:
-    """Return the lines on stiffness and slip; the first and the last were held at the pose."""
+    """Return the lines on stiffness and slip; the first and the last measurements are at the pose."""
     first, *twisted, last = held
     stiffnesses = [
         (one.load_nm - before.load_nm) / (one.wrist_rad - before.wrist_rad)

@@ -1,6 +1,6 @@
-"""The worker with a long deadline for straight moves, so that the robot's watchdog alone ends one in time.
+"""A worker with a long deadline for straight moves, so that only the robot's watchdog ends a move in time.
 
-`python -m shearloop.tools.commission.watchdog_worker`, as the daemon's own. The move itself is slow and short.
+`python -m shearloop.tools.commission.watchdog_worker` runs it like the daemon's worker. The move is slow and short.
 """
 
 from dataclasses import dataclass, fields
@@ -15,7 +15,7 @@ _LONGEST_SILENCE_S: Final = 1.0
 
 @dataclass(frozen=True)
 class WatchdogAloneSettings(UrSettings):
-    """Settings whose watchdog does not follow from their deadlines."""
+    """Settings with a watchdog that does not follow from their deadlines."""
 
     rigs_watchdog_hz: float = 0.0
 
@@ -26,7 +26,7 @@ class WatchdogAloneSettings(UrSettings):
 
 
 def for_watchdog_alone(rig: UrSettings) -> WatchdogAloneSettings:
-    """Return a rig's settings, whose straight moves go on without daemon and worker until its watchdog ends them."""
+    """Return settings with which a straight move continues without daemon and worker until the watchdog ends it."""
     values = {field.name: getattr(rig, field.name) for field in fields(rig)}
     values["silence_timeout_s"] = _LONGEST_SILENCE_S
     return WatchdogAloneSettings(**values, rigs_watchdog_hz=rig.watchdog_hz)

@@ -146,7 +146,7 @@ def _hung_mass(context: Context) -> Line:
 
 
 def least_mass_kg(settings: UrSettings) -> float:
-    """Return the smallest mass whose weight a wrench that reads nothing cannot have: twice its noise."""
+    """Return the smallest mass that the wrench must notice: its weight is twice the noise of the wrench."""
     return math.ceil(20 * settings.facts.noise_n / constants.g) / 10
 
 

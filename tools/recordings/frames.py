@@ -1,4 +1,4 @@
-"""The frames, torques and tools of a recording as arrays, for whoever fits or judges an estimator."""
+"""The frames, torques and tools of a recording as arrays, to fit or judge an estimator."""
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping
@@ -58,7 +58,7 @@ class Recording:
     table: ChannelTable = PAPER_TABLE
     # Whether a daemon recorded it: frames and torques are then stamped on arrival by one clock.
     live: bool = False
-    # What is not in `sides` and `torque_nm`, with its number.
+    # Frames and torques that are not in `sides` and `torque_nm`, with their number.
     left_out: tuple[str, ...] = ()
     # Whether every device was emulated.
     emulated: bool = False
@@ -111,7 +111,7 @@ class _Messages:
             rows.append(_Row(t_ns, line, content.get("frame")))
 
     def add_input(self, side: str, t_ns: int, content: Mapping[str, Any]) -> None:
-        """Take what a side's estimator got besides frames."""
+        """Take the inputs of a side's estimator that are not frames."""
         if content["kind"] == InputKind.TOOL.value:
             self.tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
         elif content["kind"] == InputKind.MOVED.value:

@@ -1,7 +1,7 @@
 """Reads the intact part of a recording, closed or not: damage loses only the records that it hits.
 
-A chunk and an attachment carry a checksum. Where a record's own length is damaged, reading continues at the next place
-that the index names, or at the next chunk that has the form of one.
+Chunks and attachments have a checksum. If a record's own length is damaged, reading continues at the next place that
+the index names, or at the next bytes that have the form of a chunk.
 """
 
 import os
@@ -73,7 +73,7 @@ _KINDS: Mapping[int, Any] = MappingProxyType(
 # The name of a chunk's compression, with its length, and its place in the record.
 _COMPRESSIONS, _COMPRESSION_AT = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4"), 37
 _SEARCHED_BYTES = 1 << 20
-# So many records in a row are taken for what the file's writer wrote.
+# If this number of records follow each other, they count as written by the file's writer.
 _RECORDS_IN_A_ROW = 3
 
 

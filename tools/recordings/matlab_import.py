@@ -52,7 +52,7 @@ _SHORTEST_FRAME_S = 0.05
 _MOST_LATE = 0.1
 # A cable damages fewer values than this fraction: the two recorded cases are one load value in a hundred.
 _MOST_DAMAGED = 0.1
-# Damaged values are single ones. So many in a row are a twist, in another unit.
+# Damaged values occur singly. This number in a row is a twist, in another unit.
 _MOST_IN_A_ROW = 4
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
@@ -60,7 +60,7 @@ _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 _NEIGHBOURS = 12
 # Four frames. A board gives ten values a second, a loop of the paper's two.
 _LOAD_PAUSE_S = 2.0
-# Of one period: so much higher are the stamps after a frame that is missing. One that is late does not count.
+# After a missing frame the stamps are higher by this fraction of a period. A late frame does not count.
 _LEAST_MISSING = 0.8
 # Fewer frames after a gap, at the end, may all be late.
 _LEAST_AFTER = 4

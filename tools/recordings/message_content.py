@@ -1,8 +1,8 @@
 """The keys of a recorded message in the order of its topic's schema, each checked for its type.
 
-Exports, replay and `shearloop.read` take messages from here, so a value is always under its own name. What no recorder
-of this version writes is refused: an unknown or missing key, another type, integers beyond 64 bits, nested lists, a
-heatmap that is no rectangle.
+Exports, replay and `shearloop.read` take messages from here, so a value is always under its own name. Content that no
+recorder of this version writes is refused: an unknown or missing key, another type, integers beyond 64 bits, nested
+lists, a heatmap that is no rectangle.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The log times of a recording by its monotonic stamps plus one offset, however the wall clock was set meanwhile.
+"""The log times of a recording by its monotonic stamps plus one offset, even if the wall clock was set meanwhile.
 
 Recordings with schema.CLOCK_OFFSET have such log times. Others have log times of the wall clock as it was at each
 message, and `MonotonicTimes` corrects them. Imported messages have no monotonic stamp: their log times stay.

@@ -1,6 +1,6 @@
-"""Repairs recordings: copies what is intact into a new file with an index.
+"""Repairs recordings: copies the intact part into a new file with an index.
 
-A kill or a power loss leaves a file without the index that is written when a file is closed.
+The index is written when a file is closed, so a kill or a power loss leaves a file without it.
 """
 
 from dataclasses import dataclass

@@ -240,7 +240,7 @@ class ReplayComparison:
 
     @property
     def without_state(self) -> list[str]:
-        """The sources whose messages could not be compared, because the recording has no state of theirs."""
+        """The sources without a state in the recording, whose messages could not be compared."""
         return sorted({source for _, source in self.before_state if source in self.awaited})
 
     @property

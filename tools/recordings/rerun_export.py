@@ -33,10 +33,10 @@ _CHARTS = {"N·m": "torque (N·m)", "mm": "diameter (mm)", "N": "shear force (N)
 
 
 class _Copy(threading.Thread):
-    """Copies a pipe into a file to the pipe's end, which it reaches also where the file takes no more.
+    """Copies a pipe into a file, and reads the pipe to its end even if the file accepts no more.
 
-    The SDK writes files in a thread. One that meets a full disk ends, and whoever waits for it waits for ever; so it
-    gets a pipe.
+    The SDK writes files in a thread. On a full disk that thread ends, and a program that waits for it waits forever. So
+    the SDK writes to a pipe.
     """
 
     def __init__(self, pipe: int, out: IO[bytes]) -> None:

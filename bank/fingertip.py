@@ -29,7 +29,7 @@ _SAME_CM = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class ElectrodePlace:
-    """Where an electrode sits: its side of the rectangle, and the centre along that side (y or x), in cm."""
+    """The place of an electrode: its side of the rectangle, and the centre along that side (y or x), in cm."""
 
     side: Side
     centre_cm: float

@@ -1,8 +1,8 @@
-"""Runs the demo beside busy processes, again and again: whether it ends done, and how long it takes.
+"""Runs the demo many times while other processes are busy: whether it ends done, and how long it takes.
 
     python -m benchmarks.busy_demo --out run/busy_demo.json [--runs 10] [--busy 8]
 
-The first, unmeasured step makes the demo's bank and calibrations, as the first run of a person does.
+The first step makes the demo's bank and calibrations, like a user's first run. It is not measured.
 """
 
 import json

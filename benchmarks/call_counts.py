@@ -6,8 +6,8 @@
 A daemon runs in this process, with the default estimator. One frame is traced in all tasks and threads: from its first
 byte to the subscriber's receipt of the estimate. Then the daemon runs an experiment on the emulated rig. One estimate
 is traced from its arrival in the control loop to the speed that the worker gives to ur-rtde, with the
-decisions that lie between. Of several frames and estimates the one with the fewest functions counts: messages that a
-task publishes once a second do not belong to it. Generators count once, and comprehensions do not count.
+decisions that lie between. The frame and the estimate with the fewest functions count, because messages that a task
+publishes once a second do not belong to them. Generators count once, and comprehensions do not count.
 """
 
 import asyncio
@@ -44,7 +44,7 @@ from shearloop.tools.calibrate import calibrate
 
 SIDE = "right"
 TRACED = 5
-# Each stage ends after this time, whatever happens.
+# Each stage ends after this time in any case.
 LONGEST_S = 120
 LONGEST_FRAME_S = 5.0
 CALIBRATED_ON = ("rig-17.5mm.mcap", "rig-25mm.mcap", "rig-40mm.mcap")

@@ -23,7 +23,7 @@ READY_S = 30.0
 USB_PACKET_BYTES = 512
 # Idle frames to skip, and the number of frames until the default estimator is valid in the grip.
 FIRST_FRAME, FIRST_VALID_FRAME = 12, 28
-# Of a configuration whose boards a benchmark plays: calibrations of the emulated rig, and the deadlines of a real one.
+# Keys of a configuration with boards that a benchmark plays: emulated calibrations, and the deadlines of a real rig.
 PLAYED: dict[str, Any] = {"emulated": True, "emulated_deadlines": "real"}
 # Every process has an address of its own, so that several can run at once.
 HOST = f"127.{os.getpid() >> 14 & 63 | 192}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"

@@ -53,7 +53,7 @@ STREAMS = {
 }
 FINGERTIPS: tuple[tuple[str, ...], ...] = (("right",), ("left",), ("right", "left"))
 ESTIMATORS: tuple[EstimatorName, ...] = ("paper", "bank", "regression", DEFAULT, "reconstruction")
-# What was fitted to, the estimator, and the estimates that are judged, or why there are none.
+# The data of the fit, the estimator, and the judged estimates, or why there are none.
 Judged = tuple[str, EstimatorName, EstimateTrack | str]
 # Sets of cylinders to calibrate on, and the tools to judge.
 CYLINDERS_MM = [tuple(np.linspace(10.0, 40.0, n).tolist()) for n in (3, 4, 5, 7)]

@@ -71,7 +71,7 @@ def read_streams(recordings: Path, scratch: Path) -> dict[str, FrameSeries]:
 
 
 def pairs(streams: dict[str, FrameSeries]) -> Iterator[tuple[str, str, Calibration, FrameSeries]]:
-    """Yield what was fitted to, what is judged, the calibration, and the judged series, for every pair of one tool."""
+    """Yield both titles, the calibration and the judged series, for every pair of series of one tool."""
     for name, series in streams.items():
         for sides in (one for one in FINGERTIPS if set(one) <= set(series.sides)):
             chosen = [series.select_sides(sides)]

@@ -2,9 +2,10 @@
 
     python -m benchmarks.soak --out run/soak.json [--minutes 10] [--speed 30] [--seed 1]
 
-The real daemon and drivers on the emulated rig, whose boards, gel and fingers are `--speed` times as fast. Every
-experiment turns the tool until a device fails, in the random order of the seed; then the device works again. The daemon
-records all the time. Writes the memory and the descriptors of the daemon and of the worker before each fault.
+It runs the real daemon and drivers on the emulated rig, with boards, gel and fingers `--speed` times as fast. Every
+experiment turns the tool until a device fails, in the random order of the seed. Then the device works again. The daemon
+records all the time. The command writes the memory and the descriptors of the daemon and of the worker before each
+fault.
 """
 
 import random
@@ -34,7 +35,7 @@ def usage(rig: RunningRig) -> dict[str, float]:
 
 
 def soak(speed: int, seed: int, goes_on: Callable[[int], bool]) -> dict[str, Any]:
-    """Cause faults while `goes_on(number)`; return their counts, the usage before each, and what was recorded."""
+    """Cause faults while `goes_on(number)`; return their counts, the usage before each, and the recordings."""
     chosen, counts = random.Random(seed), Counter[str]()
     used: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
@@ -47,7 +48,8 @@ def soak(speed: int, seed: int, goes_on: Callable[[int], bool]) -> dict[str, Any
             rig.stood_ns(rig.cause(cause))
             rig.recover(cause)
             counts[cause.name] += 1
-        # A command to stop leaves a daemon running whose fingers hold a tool; the signal of a service's end does not.
+        # While the fingers hold a tool, a command `stop` does not end the daemon, but the signal of a service's end
+        # does.
         rig.daemon.terminate()
         rig.daemon.wait(DEADLINE_S)
         recordings = sorted((folder / "recordings").iterdir())

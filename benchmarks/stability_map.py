@@ -1,10 +1,11 @@
-"""Where the twist loop becomes unstable: gain over delay, computed and simulated, and over lost frames.
+"""Finds where the twist loop becomes unstable: gain over delay, computed and simulated, and over lost frames.
 
     python -m benchmarks.stability_map --out run/stability_map.json
 
 Three loops at the EIT's rate, without noise: one without a delay compensator, the twist controller with the right
-stiffness, and the twist controller with a tool twice as stiff as it believes. The simulated boundary is bisected with
-the real controller on the simulated plant. The computed one comes from the margins' equations, without lost frames.
+stiffness, and the twist controller with a tool twice as stiff as it assumes. The simulated boundary comes from a
+bisection with the real controller on the simulated plant. The computed boundary comes from the equations of the
+margins, without lost frames.
 """
 
 from collections.abc import Iterable, Mapping

@@ -116,7 +116,7 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
 
 
 def _acknowledged(loop: Mapping[str, Any]) -> dict[str, int]:
-    """Return which stop an unlock names, and say what it is."""
+    """Return the number of the stop that an unlock names, and print that stop."""
     if loop.get("stop_causes"):
         print(f"unlock acknowledges the stop: {loop['stop_causes']}.", file=sys.stderr)
     return {"stop": loop["stop"]} if "stop" in loop else {}
@@ -144,9 +144,9 @@ def _told(args: argparse.Namespace, reply: dict[str, Any]) -> int:
 
 
 def mistakes_of(experiment: Path) -> str:
-    """Return the mistakes of an experiment, as lines, which the daemon does not tell.
+    """Return the mistakes of an experiment as lines, because the daemon's reply does not contain them.
 
-    It may read files that this user may not. Empty if the file is on the daemon's computer only.
+    The daemon may read files that this user may not read. Empty if the file is only on the daemon's computer.
     """
     from shearloop.daemon.experiment_files import read_experiment
     from shearloop.errors import UserError

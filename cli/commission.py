@@ -87,7 +87,7 @@ def _emulated(
 
 
 class _Terminal:
-    """Where the operator reads and types; each line begins with `label`."""
+    """The operator's terminal; each line begins with `label`."""
 
     def __init__(self, said: TextIO, label: str) -> None:
         self._said, self._label = said, label

@@ -201,7 +201,7 @@ def _leave_out(args: argparse.Namespace) -> int:
 
 
 def _plan_recordings(args: argparse.Namespace, paths: "Sequence[Path]") -> "tuple[Plan, Sequence[str], Sequence[str]]":
-    """Return what is left out of recordings, doubts about the load cell, and what of the recordings is not used."""
+    """Return the plan of left-out blocks, doubts about the load cell, and the unused parts of the recordings."""
     from shearloop.tools.calibrate import read_parts
     from shearloop.tools.leave_out import Recipe, plan_left_out
 
@@ -219,7 +219,7 @@ def _plan_recordings(args: argparse.Namespace, paths: "Sequence[Path]") -> "tupl
 
 
 def _plan_slices(args: argparse.Namespace, paths: "Sequence[Path]") -> "tuple[Plan, Sequence[str], Sequence[str]]":
-    """Return what is left out of folders of slices, without doubts."""
+    """Return the plan of left-out blocks of folders of slices, without doubts."""
     from shearloop.studies.slices.leave_out import SliceRecipe, plan_levels
     from shearloop.studies.slices.series import read_parts
 

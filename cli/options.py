@@ -177,7 +177,7 @@ def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) 
 
 
 def with_connection(text: str, args: argparse.Namespace, default: str) -> str:
-    """Return a text whose `shearloop command …` have the options of the connection that this command was given."""
+    """Return a text in which each `shearloop command …` has this command's options of the connection."""
     connect = None if args.connect == default else args.connect
     given = {"--connect": connect, "--key": args.key, "--server-key": args.server_key}
     options = "".join(f" {name} {shlex.quote(str(value))}" for name, value in given.items() if value is not None)
@@ -257,7 +257,7 @@ def of_slices(recordings: "Sequence[Path]") -> bool:
 def judges_slices(path: Path, recordings: "Sequence[Path]") -> bool:
     """Return whether a file is a calibration of slices.
 
-    Raises UserError where the recordings are not of the same kind, and CalibrationError for a file that is none.
+    Raises UserError if the recordings are not of the same kind, and CalibrationError if the file is no calibration.
     """
     from shearloop.estimation.archive import kind_of
     from shearloop.studies.slices.calibration import KIND

@@ -185,7 +185,7 @@ def _lost_text(lost: Mapping[str, int]) -> str:
 
 
 def _destination(recording: Path, out: Path | None, form: str) -> Path:
-    """Return the file or the folder to write; a file has the ending by which programs know its format."""
+    """Return the file or the folder to write; a file has the usual ending of its format."""
     stem = recording.name.partition(".mcap")[0]
     if form not in _SINGLE_FILES:
         return out or recording.with_name(f"{stem}_{form}")
@@ -238,7 +238,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _others(written: Sequence[Path]) -> list[Path]:
-    """Return files of the same kinds next to those of an export, which look like its own."""
+    """Return files of the same kinds next to the files of an export, which look like a part of it."""
     kinds = {(path.parent, path.suffix) for path in written if path.is_file()}
     found = {path for folder, ending in kinds for path in folder.glob(f"*{ending}")}
     return sorted(found - {*written})

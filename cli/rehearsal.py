@@ -75,7 +75,7 @@ class _DeviceReplacer:
         self._folder = folder
         # As a file has it, to be checked again once every device is replaced.
         self._content: dict[str, Any] = config.model_dump()
-        # A report supplies what is not given.
+        # A report supplies values that are not given.
         self._content["loop"] = config.loop.model_dump(exclude_unset=True)
         self._emulators: list[dict[str, Any]] = []
         self._sentences = ["every device is played on this computer; none of the real ones is opened"]

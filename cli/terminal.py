@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 STDIN = 0
 READ_BYTES = 4096
-# The topics of the sensors whose readings become estimates.
+# The topics of the sensors that have estimates.
 ESTIMATES = ("eit.estimate", "skin.shear")
 
 
@@ -33,7 +33,7 @@ def print_result(result: object, sentences: Iterable[str], *, as_json: bool) -> 
 
 
 def shown_topics(config: "DaemonConfig") -> tuple[str, ...]:
-    """Return what is shown of a rig's sensors: estimates, or the readings of a load cell without another sensor."""
+    """Return the topics to show of a rig's sensors: estimates, or the load cell's readings if it is the only sensor."""
     return ESTIMATES if config.fingertips or config.skin is not None else ("load.torque",)
 
 

@@ -239,7 +239,7 @@ class Scene:
         self.twin = Twin(replace(self.twin.settings, joint=joint))
 
     def put_on_spring(self, nm_per_rad: float) -> None:
-        """Put the tool on a lever with which gel and joint together are as stiff as this."""
+        """Put the tool on a lever that gives gel and joint together this stiffness."""
         each = 2.0 * nm_per_rad
         self.twin = Twin(
             replace(

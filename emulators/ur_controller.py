@@ -66,7 +66,7 @@ class Controller:
         self._closed_ports = closed_ports
         self._rate_hz = rate_hz
         self._silent_until_s = self._held_until_s = 0.0
-        # What is held back for each client.
+        # The data that is held back for each client.
         self._held: dict[asyncio.StreamWriter, bytes] = {}
         self._rtde: dict[asyncio.StreamWriter, RtdeSession] = {}
         self._connections: Connections = {}

@@ -119,9 +119,9 @@ def _calibrate_slices(args: argparse.Namespace, physics: "Physics") -> tuple[dic
 
 @dataclass(frozen=True, slots=True)
 class _Trial:
-    """How a calibration is judged: the kind of blocks left out, their plan, and the tracks of the fit's own frames.
+    """The judgement of a calibration: the kind of left-out blocks, their plan, and the tracks of the fit's own frames.
 
-    `clock` names the guess without a sensor; `advice` is for a calibration of which no block can be left out.
+    `clock` names the guess without a sensor. `advice` is for a calibration without a block that can be left out.
     """
 
     kind: str

@@ -71,7 +71,8 @@ async def _print_port(name: str, appearances: "asyncio.Queue[str]") -> None:
 
 def add_seed_and_speed(parser: argparse._ActionsContainer, pace: str) -> None:
     """Add `--seed` and `--speed`, which multiplies `pace`."""
-    # The frames of two rigs differ, as those of real ones do: one recording can judge what another one has fitted.
+    # The frames of two emulated rigs differ, as the frames of real ones do. So one recording can judge a fit on
+    # another.
     text = "of all noise and garbage (default: another one at each start)"
     parser.add_argument("--seed", type=int, default=secrets.randbits(31), help=text)
     add_option(parser, "--speed", positive(), "N", f"times {pace} (default: 1)", default=1.0)

@@ -24,4 +24,4 @@ def missing(module: str | None, extra: str, what: str) -> UserError:
 
 
 class NotBegunError(ActionError):
-    """An action that was refused, and what it would have moved rests."""
+    """An action was refused, and nothing has moved."""

@@ -129,7 +129,8 @@ def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str,
 def open_file(path: Path) -> BinaryIO:
     """Open a file to read; raises OSError, also for a device or a pipe, which may have no end.
 
-    A file without a size is read as an empty one: so are files of the kernel, some of which, as /proc/kmsg, never end.
+    A file without a size is read as an empty one. This includes the kernel's files, because some of them never end,
+    such as /proc/kmsg.
     """
     # Opening a device can already change something.
     _refuse_device(path.stat())

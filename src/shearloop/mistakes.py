@@ -1,6 +1,6 @@
-"""Data from outside as pydantic models, and each of its mistakes as one line in plain words.
+"""Loads outside data into pydantic models, and describes each of its mistakes in one line of plain words.
 
-A line names the key, what stands there, what is allowed, and where it helps what was probably meant: `loop.kp: 'a' is
+A line names the key, the present value, the allowed values, and the probable intention if that helps: `loop.kp: 'a' is
 not a number; allowed: from 0 to 10`. With the nodes of a YAML file it begins with the file's line.
 """
 
@@ -24,7 +24,7 @@ _LONGEST_VALUE = 60
 # A decimal with a comma, as German and French have it, and the cure.
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
 _POINT = "; the decimal sign is a point: 0.1, not 0,1"
-# So many mistakes are shown of one file.
+# The largest number of mistakes that are shown for one file.
 _MOST_MISTAKES = 100
 
 # The library's words for frequent mistakes, and ours.

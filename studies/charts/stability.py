@@ -151,7 +151,7 @@ CALIBRATED_SHARES = (0.8, 0.65, 0.5, 0.4, 0.3)
 SMALLER = "calibrated on the smaller torques alone"
 LARGER = "calibrated on the larger torques alone"
 UNITS = {SMALLER: "largest torque calibrated on, N·m", LARGER: "smallest torque calibrated on, N·m"}
-# The torque in N·m up to which, or from which on, slices are calibrated on, and whether each (n,) is judged instead.
+# The limit of the calibrated torques in N·m, and whether each slice (n,) lies beyond it and is judged.
 CalibrationPart: TypeAlias = tuple[float, BoolArray]
 
 

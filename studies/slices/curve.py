@@ -124,7 +124,7 @@ class InverseCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CurveMean:
-    """The mean value of several curves: what they err by alone differs, between the levels of the values above all."""
+    """The mean value of several curves, whose single errors differ most between the levels of the values."""
 
     curves: tuple[InverseCalibration, ...]
 

@@ -1,7 +1,7 @@
-"""How each estimator reads slices: its features, its fits, and what it does with dead channels.
+"""Fits each estimator on slices: its features, its fits, and its treatment of dead channels.
 
-Regression, reconstruction, bank and paper read a difference as they do live. A slice has no motion: under the name of
-the estimator of motion stands a curve of frames over the value.
+Regression, reconstruction, bank and paper read a difference as they do live. A slice has no motion. So under the name
+of the estimator of motion there is a curve of frames over the value.
 """
 
 from typing import ClassVar

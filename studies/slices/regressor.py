@@ -104,7 +104,7 @@ def fit_slice_regressor(
 
 
 def _inflation(point: SlicePoint, rows: IntArray, left_out: LeftOut) -> float:
-    """Return the factor by which residuals of the left-out rows are widened."""
+    """Return the factor that widens the residuals of the left-out rows."""
     if left_out:
         return student_inflation(len(np.unique(rows)))
     return 1.0 if isinstance(point, CurveMean) else INFLATION

@@ -35,7 +35,7 @@ class SliceSeries(FrameSeries):
 
     @property
     def tool_mm(self) -> Measured | None:
-        """The tool's diameter, which slices do not tell: those of cylinders have one each."""
+        """None: slices have no common diameter, because slices of cylinders have one each."""
         return None
 
     @property

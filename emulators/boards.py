@@ -156,7 +156,7 @@ class EmulatedBoard:
 
 def format_line(values: NDArray[np.float64]) -> bytes:
     """Return the line of the EIT-kit for (v,) values in volts."""
-    return ("".join(f"{value:.4f}, " for value in values.tolist()) + "\n").encode()
+    return b"%.4f, " * len(values) % tuple(values.tolist()) + b"\n"
 
 
 class EitKitBoard(EmulatedBoard):

@@ -93,9 +93,12 @@ def joints_within(
 
 def jacobian(frames: list[Matrix]) -> Matrix:
     """Return the geometric Jacobian (6, 6): joint speeds to the tool's linear and angular velocity in the base."""
-    axes = np.array([frame[:3, 2] for frame in frames[:-1]])
-    arms = frames[-1][:3, 3] - np.array([frame[:3, 3] for frame in frames[:-1]])
-    return np.hstack([np.cross(axes, arms), axes]).T
+    joints = np.array(frames[:-1])
+    axes, arms = joints[:, :3, 2], frames[-1][:3, 3] - joints[:, :3, 3]
+    (x, y, z), (to_x, to_y, to_z) = axes.T, arms.T
+    # np.cross takes several times as long.
+    linear = (y * to_z - z * to_y, z * to_x - x * to_z, x * to_y - y * to_x)
+    return np.asfortranarray([*linear, x, y, z])
 
 
 # The arm after a cycle: joints (6,), speeds (6,), and whether the motion is over.

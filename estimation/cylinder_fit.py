@@ -30,13 +30,16 @@ def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> Inte
     Its interval is the error on cylinders left out.
     """
     diameters = np.array([one.diameter_mm[0] for one in grips])
-    line = fit_line(grips, table)
+    reduction = _reduction(grips, table)
+    reduced = [one.position @ reduction for one in grips]
+    line = _fit_reduced(grips, reduced, reduction)
     squares = []
     for one, diameter in zip(grips, diameters, strict=True):
         # Leave out all grips of this cylinder: another one would only confirm this diameter.
-        rest = [other for other in grips if other.diameter_mm[0] != diameter]
-        if len({float(other.diameter_mm[0]) for other in rest}) >= LEAST_LEFT:
-            squares.append(float(((fit_line(rest, table).predict(one.mean_position) - diameter) ** 2).mean()))
+        kept = np.flatnonzero(diameters != diameter).tolist()
+        if len(set(diameters[kept].tolist())) >= LEAST_LEFT:
+            rest = _fit_reduced([grips[i] for i in kept], [reduced[i] for i in kept], reduction)
+            squares.append(float(((rest.predict(one.mean_position) - diameter) ** 2).mean()))
     # Each recording counts once, which is too few for a quantile.
     half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
     low, high = float(diameters.min()), float(diameters.max())
@@ -53,10 +56,19 @@ def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
     differ without it (errors in variables, Fuller 1987). Averaging channels of one voltage and smoothing along
     neighbours, as the paper did with its cylinders, lowers the noise.
     """
-    diameters = np.array([one.diameter_mm[0] for one in grips])
+    reduction = _reduction(grips, table)
+    return _fit_reduced(grips, [one.position @ reduction for one in grips], reduction)
+
+
+def _reduction(grips: Sequence[CalibrationRows], table: ChannelTable) -> FloatArray:
+    """Return the (d, d) map that averages channels of one voltage and smooths along neighbours, on each side."""
     n_sides = grips[0].position.shape[1] // table.n_channels
-    reduction = np.kron(np.eye(n_sides), table.twin_means(smoothed_along_channels(np.eye(table.n_channels))))
-    frames = [one.position @ reduction for one in grips]
+    return np.kron(np.eye(n_sides), table.twin_means(smoothed_along_channels(np.eye(table.n_channels))))
+
+
+def _fit_reduced(grips: Sequence[CalibrationRows], frames: Sequence[FloatArray], reduction: FloatArray) -> Ridge:
+    """Return the line of `fit_line`; `frames` are the grips' positions times the reduction."""
+    diameters = np.array([one.diameter_mm[0] for one in grips])
     positions = np.array([one.mean(axis=0) for one in frames])
     moved = np.concatenate([one - position for one, position in zip(frames, positions, strict=True)])
     moved = moved[:: 1 + len(moved) // _MOST_FRAMES]

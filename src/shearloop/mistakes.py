@@ -6,8 +6,9 @@ not a number; allowed: from 0 to 10`. With the nodes of a YAML file it begins wi
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +27,9 @@ _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
 _POINT = "; the decimal sign is a point: 0.1, not 0,1"
 # The largest number of mistakes that are shown for one file.
 _MOST_MISTAKES = 100
+
+# To make an adapter takes longer than to read a file.
+_adapter_of: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
 
 # The library's words for frequent mistakes, and ours.
 _WRONG = (
@@ -62,7 +66,19 @@ def validated(content: object, model: type[Model], where: str, raises: type[Exce
 
 def as_model(content: object, model: type[Model], folder: Path | None = None) -> Model:
     """Return the content as a model; raises ValidationError. Its validators get the `folder`."""
-    return TypeAdapter(model).validate_python(content, context=folder and {"folder": folder})
+    adapter: TypeAdapter[Model] = _adapter_of(model)
+    return adapter.validate_python(content, context=folder and {"folder": folder})
+
+
+def first_key(model: type) -> str:
+    """Return the first key of a model, as an example."""
+    return next(iter(_schema_of(model)["properties"]), "key")
+
+
+@cache
+def _schema_of(model: type) -> dict[str, Any]:
+    """Return the JSON Schema of a model, which nobody changes."""
+    return _adapter_of(model).json_schema()
 
 
 def mistake_lines(
@@ -72,7 +88,7 @@ def mistake_lines(
 
     Only the first are shown of very many: each takes a search through the file.
     """
-    schema = TypeAdapter(model).json_schema()
+    schema = _schema_of(model)
     found: dict[str, int] = {}
     every = error.errors(include_url=False)
     first, more = every[:_MOST_MISTAKES], every[_MOST_MISTAKES:]

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, Self
 
 import yaml
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from shearloop.files import read_file, replace_file
-from shearloop.mistakes import Model, as_model, mistake_lines, place_of, shown
+from shearloop.mistakes import Model, as_model, first_key, mistake_lines, place_of, shown
 
 _SUFFIXES = (".yaml", ".yml")
 # Of Linux.
@@ -140,8 +140,7 @@ class Document:
     def model(self, model: type[Model]) -> Model:
         """Return the content as a pydantic model or dataclass; its validators get the file's `folder`."""
         if not isinstance(self.content, dict):
-            example = next(iter(TypeAdapter(model).json_schema()["properties"]), "key")
-            raise self.raises(f"{self.path}: expected keys and values such as `{example}: …`")
+            raise self.raises(f"{self.path}: expected keys and values such as `{first_key(model)}: …`")
         try:
             return as_model(self.content, model, self.path.resolve().parent)
         except ValidationError as error:

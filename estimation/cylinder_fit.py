@@ -63,7 +63,8 @@ def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
 def _reduction(grips: Sequence[CalibrationRows], table: ChannelTable) -> FloatArray:
     """Return the (d, d) map that averages channels of one voltage and smooths along neighbours, on each side."""
     n_sides = grips[0].position.shape[1] // table.n_channels
-    return np.kron(np.eye(n_sides), table.twin_means(smoothed_along_channels(np.eye(table.n_channels))))
+    one_side = table.twin_means(smoothed_along_channels(np.eye(table.n_channels)))
+    return np.asarray(np.kron(np.eye(n_sides), one_side))
 
 
 def _fit_reduced(grips: Sequence[CalibrationRows], frames: Sequence[FloatArray], reduction: FloatArray) -> Ridge:

@@ -128,6 +128,8 @@ class IdentifyStep(_Step):
 
     do: Literal["identify"]
     amplitude_rad: float = Field(0.2, gt=0, le=0.6, description="largest angle of the twists")
+    # Four frames of the EIT-kit and a half.
+    hold_s: float = Field(2.5, ge=0.1, le=60, description="time at each angle; 0.8 is enough for a load cell")
 
 
 class AdaptStep(_Step):
@@ -481,8 +483,9 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
         case TightenStep(until_torque_nm=torque_nm, until_angle_rad=angle_rad):
             speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
             return Demand(torque_nm, angle_rad, moves_s=angle_rad / speed_rad_per_s)
-        case IdentifyStep(amplitude_rad=angle_rad):
-            return Demand(angle_rad=angle_rad, moves_s=20.0)
+        case IdentifyStep(amplitude_rad=angle_rad, hold_s=hold_s):
+            # Two cycles at least; the first of their five rests is twice as long.
+            return Demand(angle_rad=angle_rad, stands_s=6.0 * hold_s, moves_s=5.0)
         case TwistStep(angles_rad=angles_rad):
             stands_s = step.hold_s * len(angles_rad) * step.repeats
             reach = [abs(angle_rad) for angle_rad in angles_rad]

@@ -256,8 +256,8 @@ class ExciteSettings:
 
     amplitude_rad: float
     torque_limit_nm: float
+    dwell_s: float
     stiffness_share: float = 0.03
-    dwell_s: float = 2.5
     most_cycles: int = 8
 
 

@@ -137,7 +137,9 @@ class WristController:
     def begin_identification(self, action: IdentifyStep, torque_limit_nm: float) -> None:
         """Begin the small twists that identify the tool."""
         self.reset()
-        settings = ExciteSettings(amplitude_rad=action.amplitude_rad, torque_limit_nm=torque_limit_nm)
+        settings = ExciteSettings(
+            amplitude_rad=action.amplitude_rad, torque_limit_nm=torque_limit_nm, dwell_s=action.hold_s
+        )
         self.excitation = StiffnessExcitation(settings, self.source, self._config)
 
     def identify(self, excitation: StiffnessExcitation, t_ns: int, wrist_rad: float) -> WristCommand:

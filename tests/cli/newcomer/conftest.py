@@ -1,7 +1,7 @@
 """A copy of the tree in which the tests here run the README's commands.
 
 Its `.venv` is the one that runs the tests. The demo is faster here: boards, fingers and gel run several times as
-fast, the bank is coarser and the hold shorter. Addresses are its own.
+fast, the bank is coarser and the holds are shorter. Addresses are its own.
 """
 
 import re
@@ -29,6 +29,8 @@ PROGRAM = ".venv/bin/shearloop"
 SPEED = 6
 # Of the held torque, in seconds; the README's demo holds for half a minute.
 HOLD_S = 2
+# At each angle of `identify`, for frames of the rated pace.
+IDENTIFY_HOLD_S = 2.5
 # As in tests/emulator_process.py: two runs of the tests at once need two addresses.
 HOST = own_address(0)
 # The emulated controller works at half its rate, and its steps of power take less than a real one's.
@@ -105,6 +107,8 @@ def tree(tmp_path) -> Iterator[Tree]:
 
     def experiment(content: Any) -> None:
         for step in content["steps"]:
+            if step["do"] == "identify":
+                step["hold_s"] = IDENTIFY_HOLD_S / SPEED
             if step["do"] == "hold_torque":
                 step |= {"hold_s": HOLD_S, "ramp_nm_per_s": 0.1}
 

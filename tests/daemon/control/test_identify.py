@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import (
     ExciteSettings,
     IdentifyError,
@@ -15,6 +16,7 @@ from shearloop.daemon.control.identification import (
     StiffnessExcitation,
     identify,
 )
+from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSource
 
@@ -129,7 +131,7 @@ def test_a_torque_that_is_no_springs_is_refused():
 
 # --- the step with its wrist programme
 
-SETTINGS = ExciteSettings(amplitude_rad=0.4, torque_limit_nm=0.15, stiffness_share=0.05)
+SETTINGS = ExciteSettings(amplitude_rad=0.4, torque_limit_nm=0.15, dwell_s=2.5, stiffness_share=0.05)
 SOURCE = TorqueSource(name="right", period_s=0.5, window_s=0.5)
 
 
@@ -162,6 +164,15 @@ def test_the_step_finds_the_tool_and_ends_where_it_began():
     assert max(map(abs, speeds)) <= 0.5
     gained = np.diff(np.abs(speeds))
     assert gained.max() <= 2.0 * 0.008 + 1e-9
+
+
+@pytest.mark.parametrize("hold_s", [2.5, 0.8])
+def test_the_step_rests_for_as_long_as_its_file_says(hold_s):
+    """The first rest is twice as long."""
+    wrist = WristController(SOURCE, LoopConfig())
+    wrist.begin_identification(IdentifyStep(do="identify", hold_s=hold_s), 0.5)
+    speeds = [wrist.excitation.command(number * 8_000_000, 0.0) for number in range(1000)]
+    assert np.flatnonzero(speeds)[0] * 0.008 == pytest.approx(2.0 * hold_s, abs=0.02)
 
 
 def test_the_first_swing_is_half_as_far_and_stops_at_the_torque_limit():

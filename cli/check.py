@@ -21,7 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     parser.epilog = (
         "Prints what an experiment does, step by step, and what is refused. Opens no device; `shearloop doctor CONFIG` "
-        "does. With --json, `torque_nm` is null where the tool turns by an angle, and its torque is not known before."
+        "does. With --json, `torque_nm` is null if the tool turns by an angle, and its torque is not known before."
     )
 
 

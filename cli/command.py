@@ -185,7 +185,7 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
             return ["stop: nothing was moving; the daemon has ended"]
         if reply.get("held"):
             return [
-                f"stop: nothing was moving, and {reply['held']}. The daemon goes on, so that "
+                f"stop: nothing was moving, and {reply['held']}. The daemon continues, so that "
                 "`shearloop command release` can open them. Ctrl-C in its terminal ends the daemon, or "
                 "`systemctl stop shearloop`."
             ]

@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     text = "log JSON lines (the default under systemd)"
     parser.add_argument("--json-log", action="store_true", default=None, help=text)
     choices = ("debug", "info", "warning", "error")
-    text = "log this and what is worse (default: info; on a terminal with --show: warning)"
+    text = "log this level and worse ones (default: info; on a terminal with --show: warning)"
     parser.add_argument("--log-level", choices=choices, metavar="LEVEL", help=f"{text}; one of {', '.join(choices)}")
     text = "replace a value of the configuration, e.g. loop.kp=0.5; repeatable"
     add_option(parser, "--set", _assignment, "KEY=VALUE", text, action="append", default=[])

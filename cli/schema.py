@@ -8,7 +8,7 @@ KINDS = ("configuration", "experiment", "robot", "bank", "fingertip")
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `schema`."""
     parser.add_argument("kind", choices=KINDS, help="the kind of file")
-    parser.epilog = "Editors check and complete a YAML file that names its schema; those of config/ do."
+    parser.epilog = "Editors check and complete a YAML file that names its schema, such as the files of config/."
 
 
 def run(args: argparse.Namespace) -> int:

@@ -149,7 +149,7 @@ class ExperimentFiles:
         async with _in_time("the folders of experiments"):
             reason = await self._refresh(reading_refusal)
         if self._latest is None:
-            raise UserError(f"{reason}, and no folder of experiments is read meanwhile; ask again afterwards")
+            raise UserError(f"{reason}, and no folder of experiments is read during that time; ask again afterwards")
         return self._latest
 
     async def _refresh(self, reading_refusal: Callable[[], str | None]) -> str | None:

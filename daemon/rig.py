@@ -264,8 +264,8 @@ class Rig:
         experiment = await self.experiments.read(path)
         if digest is not None and digest != (question := self._question_of(experiment)).digest:
             changed = (
-                "the file, or what its start does to a held tool, has changed since its plan was shown, or something "
-                "was stopped or run"
+                "since its plan was shown, the file or the effect of its start on a held tool has changed, or "
+                "something was stopped or run"
             )
             raise QuestionChangedError(f"{path}: {changed}; look at the plan again", question)
         try:

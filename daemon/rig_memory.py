@@ -287,7 +287,7 @@ def read_memory(path: Path) -> Remembered:
     except FileNotFoundError:
         return Remembered()
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        unreadable = f"what it left in {path} cannot be read: {error}"
+        unreadable = f"its state in {path} cannot be read: {error}"
         return Remembered(stop=((FaultCode.DAEMON_ENDED.name, unreadable),))
 
 
@@ -324,14 +324,14 @@ def _why_unsure(files: RobotFiles) -> str:
     """Return why it is not certain which robot a name means, or an empty string."""
     if not files.known:
         return (
-            f"what it left is kept under the robot's address, and the name {files.host!r} has none at present: see "
-            "that the name is right and the network is up"
+            f"its state is stored under the robot's address, and the name {files.host!r} has no address at present: "
+            "check the name and the network"
         )
     if files.earlier:
         before, present = (", ".join(addresses) for addresses in (files.earlier, files.keys))
         return (
-            f"the name {files.host!r} had the address {before} then and has {present} at present: see that this is the "
-            "same robot"
+            f"the name {files.host!r} had the address {before} then and has {present} at present: make sure that this "
+            "is the same robot"
         )
     return ""
 

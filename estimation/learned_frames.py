@@ -46,8 +46,8 @@ class LearnedFrames:
 
 
 CANNOT_TELL_FRAMES = (
-    "the calibration's file does not hold which frames it was made from, so nothing tells whether it has learned from "
-    "these; calibrate again to have it checked"
+    "the calibration's file does not list the frames of its fit, so it is not known whether it has learned from these; "
+    "calibrate again to have it checked"
 )
 # Of a file without digests.
 UNKNOWN_FRAMES = LearnedFrames(np.zeros(0, dtype=np.int64), complete=False)

@@ -289,7 +289,7 @@ def _few_tools(kind: str, recordings: Sequence[FrameSeries]) -> str:
     n_tools = len(tools_of(recordings))
     if kind != "tools" or n_tools >= _ENOUGH_TOOLS:
         return ""
-    return f"{counted(n_tools, 'tool')} only: record four, because three others tell the gain of one left out."
+    return f"{counted(n_tools, 'tool')} only: record four, because the gain of a left-out tool needs three others."
 
 
 def _lacks_torque(tracks: Sequence[EstimateTrack]) -> bool:

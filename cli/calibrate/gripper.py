@@ -92,7 +92,7 @@ async def _grip(
             for sentence in (*(fault.cause for fault in left.faults), left.held):
                 if sentence:
                     await operator.ask(f"From the last program: {sentence}. Look at the rig, then press Enter.")
-            warning = "The fingers will open and close. Keep clear, take out what they hold, then press Enter."
+            warning = "The fingers will open and close. Empty them, keep your hands clear, then press Enter."
             await operator.ask(warning)
             await gripper.activate(operator_confirmed=True)
             gauges: list[tuple[float, float]] = []

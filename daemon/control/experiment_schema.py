@@ -201,7 +201,7 @@ class TightenStep(_Step):
     until_torque_nm: ranges.TorqueLimit = Field(description="the turn ends at this torque")
     until_angle_rad: ranges.Turn = Field(description="the turn ends at this angle")
     speed_rad_per_s: ranges.WristSpeed = Field(0.05, description="speed of the wrist")
-    direction: Direction = Field(description="of the turn: the thread's, seen by an eye that faces the gripper")
+    direction: Direction = Field(description="of the turn: the thread's, as seen from in front of the gripper")
 
 
 class ReleaseStep(_Step):

@@ -82,7 +82,7 @@ def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_
         since = "its angle began to count" if clamped else "the grip"
         turned = f"turned by {watched.twisted_rad:+.3f} rad since {since}, the limit is {limit_rad:g} rad"
         if clamped:
-            turned += "; where another tool has been clamped, `shearloop command release --yes` lets it count from 0"
+            turned += "; if another tool has been clamped, `shearloop command release --yes` lets it count from 0"
         found.append(Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None))
     found += _device_faults(inputs, watched, t_ns)
     for name, reason in inputs.died.items():

@@ -254,7 +254,7 @@ class ControlLoopRunner:
         except (ActionError, DriverError) as error:
             return str(error)
         if another := self._control_loop.operator.why_another_stop(waiting):
-            return f"robot and gripper are unlocked, and meanwhile there was a stop; {another}; unlock it again"
+            return f"robot and gripper are unlocked, but there was another stop; {another}; unlock it again"
         self._control_loop.acknowledge()
         return None
 

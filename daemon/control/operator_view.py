@@ -158,7 +158,7 @@ class OperatorView:
         if not self.tool.has_gripper:
             turned = self._clamped_turn()
             from_zero = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
-            return f" At present the clamped tool's angle goes on: {turned}; {from_zero}." if turned else ""
+            return f" At present the clamped tool's angle continues: {turned}; {from_zero}." if turned else ""
         held, unknown, first = self.tool.held, self.tool.unknown_grip, first_gripper_step(file)
         # A `grip` only closes tighter on the held tool, so the angle stays unknown.
         turns = first_motion_before_grip(file) is not None
@@ -241,6 +241,6 @@ class OperatorView:
         command = "" if driving.from_robot else ", or send `shearloop command tare` with nothing gripped"
         tare = "a `release` and a `tare`" if self.tool.may_hold() else "a `tare`"
         return (
-            f"no zero of the {driving.name} is known since this daemon began, so that its torques and limits may be "
-            f"off by any load: put {tare} before step {number} ({file.steps[number - 1].do}){command}"
+            f"no zero of the {driving.name} is known since this daemon began, so its torques and limits may be off by "
+            f"any load: put {tare} before step {number} ({file.steps[number - 1].do}){command}"
         )

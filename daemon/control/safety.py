@@ -122,7 +122,7 @@ class FaultCode(Enum):
     GRIPPER_FAULT = Rule(
         _KEEP,
         "the gripper reports a fault: {detail}.",
-        "Clear the fault. `shearloop command unlock` then activates the gripper again, which opens its fingers: where "
+        "Clear the fault. `shearloop command unlock` then activates the gripper again, which opens its fingers. If "
         "they may hold a tool, it asks first.",
     )
     GRIPPER_COMMANDED = Rule(
@@ -209,12 +209,12 @@ class FaultCode(Enum):
     COMMAND_REFUSED = Rule(
         Response.NOTE,
         "a command was refused: {detail}.",
-        "A running experiment continues once commands are accepted. If this recurs, end other programs.",
+        "A running experiment continues when commands are accepted again. If this recurs, end other programs.",
     )
     COMMAND_UNANSWERED = Rule(
         Response.NOTE,
         "the robot's worker ended before it answered a command: {detail}.",
-        "It restarts automatically; once the robot is connected again, `shearloop command unlock`.",
+        "It restarts automatically. When the robot is connected again, send `shearloop command unlock`.",
     )
     STEP_OVERDUE = Rule(
         _KEEP,

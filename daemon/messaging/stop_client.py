@@ -94,7 +94,7 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
             if uid not in owners(address):
                 raise StopSocketTakenError(
                     f"the stop socket of {address} is held by the user {uid}, who does not run the daemon at this "
-                    "address: that it has stopped anything is not believed; give the daemon's address with --connect, "
+                    "address: its reply does not count as a stop; give the daemon's address with --connect, "
                     "or find the process with `sudo ss -xlp`, end it and restart the daemon"
                 )
     try:

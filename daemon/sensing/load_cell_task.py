@@ -153,7 +153,8 @@ class LoadCellTask:
         calibration = self._board.calibration
         changed_nm = abs(calibration.torque_nm(max(samples)) - calibration.torque_nm(min(samples)))
         if changed_nm > LOADED_NM:
-            return f"its torque changed by {changed_nm:.3f} N·m meanwhile; keep the load away and send the tare again"
+            cure = "keep the load away and send the tare again"
+            return f"its torque changed by {changed_nm:.3f} N·m during the tare; {cure}"
         if self._judged_by is None:
             self._judged_by = calibration
         loaded = loaded_sentence({LOAD_CELL: self._judged_by.torque_nm(raw)})

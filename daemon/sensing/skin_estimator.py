@@ -92,9 +92,9 @@ class SkinZeroTaker:
         seen = f"R₁ {r1_ohm:.2f} Ω and R₂ {r2_ohm:.2f} Ω"
         common = 0.5 * math.log(r1_ohm * r2_ohm / math.prod(self.rest_ohm))
         if abs(found + known) < min(MAX_CHANGE, abs(found - known)) and abs(common) < MAX_COMMON_CHANGE:
-            return f"{seen} are those of the calibration the other way round: the wires of the gauges are swapped"
+            return f"{seen} are the calibration's, but exchanged: the wires of the gauges are swapped"
         return (
-            f"{seen} are not those of the skin at rest: a shear force of about "
+            f"{seen} are not the skin's values at rest: a shear force of about "
             f"{(found - known) / self.slope_per_n:+.2f} N would look like that; take the load off, or calibrate again"
         )
 

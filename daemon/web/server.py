@@ -494,7 +494,7 @@ def _read_token(path: Path) -> str:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode) or status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
             raise UserError(
-                f"{path} must be a file of your own that nobody else may read; "
+                f"{path} must be a file of your own that no other user may read; "
                 "make a new token with --new-token, or name another file with --token-file"
             )
         text = file.read(TOKEN_LENGTHS.stop).strip()

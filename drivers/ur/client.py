@@ -229,7 +229,7 @@ class UrRobot:
             self.settings = settings
             raise RobotLostError(
                 "other-limits",
-                f"The controller at {settings.host} is not the one before, or not the one of the rig's report: the "
+                f"The controller at {settings.host} is another one than before, or than in the rig's report: the "
                 "robot's worker starts again with the limits for it.",
             )
 

@@ -50,7 +50,7 @@ NOT_STARTING = (
     "The controller took the control program and does not play it: look at the teach pendant for a message, for local "
     "control, and for the log's last lines. The robot's worker is started again with motion disabled."
 )
-LEAVING = "The daemon disconnects from the robot: start it again to go on."
+LEAVING = "The daemon disconnects from the robot: start it again to continue."
 
 
 class Recovery:

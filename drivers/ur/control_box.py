@@ -498,7 +498,7 @@ class RtdeReceiver:
             sample = self._receive()
             if sample is not None:
                 return sample
-        raise OSError("it closed the connection on which it was to send its state")
+        raise OSError("it closed the connection for its states")
 
     def latest(self) -> RtdeOutputs:
         """Return the newest sample received, without waiting."""

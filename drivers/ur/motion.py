@@ -431,7 +431,7 @@ def why_unfit(sample: RtdeSample, settings: UrSettings) -> str:
         return f"The arm is not powered and released (robot mode: {sample.robot_mode_name}): unlock to power it."
     if sample.program_paused:
         return (
-            "A program on the robot is paused, and goes on with what it did when it is resumed: stop it at the teach "
+            "A program on the robot is paused, and continues its motion if a person resumes it: stop it at the teach "
             "pendant, or unlock, which stops it and starts the control program."
         )
     if not sample.program_running:

@@ -276,7 +276,7 @@ async def test_no_file_is_read_for_a_question_or_the_list_while_something_moves(
         await answers_of(subject)["start"]({"experiment": str(path), "ask": True})
     # A page that opens meanwhile has the list that was read before.
     assert await answers_of(subject)["experiments"]({}) == known
-    with pytest.raises(CommandRefusedError, match="'three' is running, and no folder of experiments is read meanwhile"):
+    with pytest.raises(CommandRefusedError, match="'three' is running, and no folder of experiments is read during"):
         await answers_of(idle)["experiments"]({})
 
 
@@ -366,14 +366,14 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
     # The same name and the same sentences: only the bytes differ.
     for other in (before + b"# faster\n", write(path, {**VALID, "name": "two"}).read_bytes()):
         path.write_bytes(other)
-        with pytest.raises(CommandRefusedError, match="has changed since its plan was shown") as refused:
+        with pytest.raises(CommandRefusedError, match="since its plan was shown, the file or the effect") as refused:
             await start({"experiment": str(path), "digest": asked["digest"]})
         assert refused.value.facts == await start({"experiment": str(path), "ask": True})
     assert runner.started == []
     await start({"experiment": str(path), "digest": refused.value.facts["digest"]})
     path.write_bytes(before)
     subject.control_loop.operator.activation_note = lambda _: " Before step 1 the gripper is activated."
-    with pytest.raises(CommandRefusedError, match="what its start does to a held tool"):
+    with pytest.raises(CommandRefusedError, match="the effect of its start on a held tool has changed"):
         await start({"experiment": str(path), "digest": asked["digest"]})
     subject.control_loop.operator.activation_note = lambda _: ""
     subject.control_loop.tool.may_hold = lambda: True
@@ -385,7 +385,7 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
     subject.control_loop.tool.may_hold = lambda: False
     # Somebody has pressed STOP since.
     runner.stop_count = 1
-    with pytest.raises(CommandRefusedError, match="has changed since its plan was shown"):
+    with pytest.raises(CommandRefusedError, match="since its plan was shown, the file or the effect"):
         await start({"experiment": str(path), "digest": asked["digest"]})
     runner.stop_count = 0
     await start({"experiment": str(path), "digest": asked["digest"]})

@@ -71,7 +71,7 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
             "registers",
             "free" if seen.registers is not None else "in use",
             "free",
-            "nobody else commands the robot",
+            "no other program commands the robot",
             passed=seen.registers is not None,
         ),
         judged(

@@ -86,7 +86,7 @@ class Operator:
 
     def accept(self, warning: str) -> None:
         """Show a warning, a whole sentence, and return once the operator goes on; raises DeclinedError."""
-        self._confirm(f"{warning} Type `{GO_ON}` to go on with it:", GO_ON, f"not accepted: {warning}")
+        self._confirm(f"{warning} Type `{GO_ON}` to continue with it:", GO_ON, f"not accepted: {warning}")
 
     def act(self, action: str, played: Played = NOTHING_TO_DO) -> None:
         """Have the operator do something; raises DeclinedError where it is not done."""

@@ -94,7 +94,7 @@ def _without_changed(report: Report, config: DaemonConfig, operator: Operator) -
 def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> tuple[Report, Path]:
     operator = context.operator
     if context.config.emulated:
-        times = ", and its limits on times are those of a busy computer" if context.limits is EMULATED else ""
+        times = ", and its limits on times allow for a busy computer" if context.limits is EMULATED else ""
         operator.say(f"The report says EMULATED{times}.")
     name = operator.ask("Your name:")
     for stage, measure in STAGES.items():

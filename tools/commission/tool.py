@@ -66,7 +66,7 @@ def measure(context: Context) -> Measured:
     if cell is None:
         return Measured([Line(what="tool and spring", value="not measured: no load cell is configured")])
     spring = context.operator.number(
-        "Mount the tool on a spring of known stiffness; that of spring and pads together in N·m/rad",
+        "Mount the tool on a spring of known stiffness; stiffness of spring and pads together in N·m/rad",
         *(0.05, 50.0),
         Played(
             "it is mounted for you on a spring as stiff as you type, for instance 0.8",
@@ -163,11 +163,11 @@ def _signs(context: Context, sensors: Sensors) -> list[Line]:
     _turn(context, TURN_RAD)
     after = _hold_and_feel(context, sensors)
     said = context.operator.choose(
-        "Which way did the gripper turn, for an eye that faces it:",
+        "Which way did the gripper turn, seen from in front of it:",
         tuple(SIGNS),
         Played(
-            f"wrist 3 turned from {before.wrist_rad:.3f} to {after.wrist_rad:.3f} rad; where the angle grows, that eye "
-            "sees it turn counterclockwise"
+            f"wrist 3 turned from {before.wrist_rad:.3f} to {after.wrist_rad:.3f} rad; with a growing angle "
+            "it turns counterclockwise, seen from in front of it"
         ),
     )
     _turn(context, 0.0)

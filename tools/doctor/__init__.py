@@ -174,7 +174,7 @@ def _explain_hidden(board: HiddenBoard) -> Finding:
     found = f"likely the {board.likely}; it is plugged in and has no serial port"
     if has_brltty():
         means = "brltty, which serves Braille displays, takes boards with such a converter"
-        cure = "`sudo apt remove brltty` if nobody needs a Braille display here; then plug the board in again"
+        cure = "`sudo apt remove brltty` if this computer needs no Braille display; then plug the board in again"
         return trouble(subject, found, means, cure)
     means = "the kernel's driver for it is missing, or another program has taken the board"
     modules = "`sudo apt install linux-modules-extra-$(uname -r)`"
@@ -256,13 +256,13 @@ def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
     mode = path.stat().st_mode & 0o777
     if mode & 0o077:
         means = "a reader of this key can pose as the daemon"
-        cure = f"`chmod 600 {path}`; make new keys if somebody may have read it"
+        cure = f"`chmod 600 {path}`; make new keys if another user may have read it"
         return trouble("keys", f"others can read {path} (mode {mode:o})", means, cure)
     if clients.unusable:
         means = "its client cannot connect; the others can"
         return note("keys", "; ".join(clients.unusable), means, f"remove it from {curve.clients}")
     if not network:
-        means = "nobody else can connect"
+        means = "no other computer can connect"
         cure = "set `publish` and `commands` to tcp://0.0.0.0:PORT to let others connect"
         return note("keys", "there are keys, but every address is on this computer", means, cure)
     return good("keys", f"{', '.join(sorted(clients.names.values()))} may connect to {' and '.join(network.values())}")

@@ -189,7 +189,7 @@ def check_channels(name: str, channels: FloatArray, saturated: int, table: Chann
         return trouble(subject, found, means, cure)
     if dead.any():
         means = "an electrode without contact, or a broken wire; every estimate lacks these channels"
-        cure = "press the connector on, wet the gel, and look for a broken wire or a bridge at what is named"
+        cure = "press the connector on, wet the gel, and look for a broken wire or a bridge at the named places"
         return trouble(subject, found, means, cure if named else "press the connector on and wet the gel")
     if at_times.any():
         weak = f"{found}; {counted(int(at_times.sum()), 'channel reads', 'channels read')} 0 in some frames"

@@ -26,7 +26,7 @@ def check_robot_values(path: Path) -> Iterator[Finding]:
         yield trouble(_SUBJECT, f"{path}: {part} is not filled in", means, cure)
     if unchanged := unchanged_limits(settings.limits, initial.limits):
         found = f"{path}: as `init` wrote them: {', '.join(unchanged)}"
-        means = "they are careful values for first motions, and nobody has fitted them to your cell and your tool"
+        means = "they are careful values for first motions, and were not fitted to your cell and your tool"
         yield note(
             _SUBJECT, found, means, "compare each with your cell, and raise one at a time where the task needs it"
         )

@@ -366,7 +366,7 @@ def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | Non
             )
     load = streams.pop("load", None)
     if not streams:
-        raise UserError("the files hold no frames of a fingertip; name those of the right or left side as well")
+        raise UserError("the files hold no frames of a fingertip; name the files of the right or left side too")
     for side, stream in streams.items():
         _check_volts(paths[side], stream.values)
     if load is not None:

@@ -225,7 +225,7 @@ async def test_a_stop_during_an_unlocking_is_not_acknowledged_by_it():
         await cell.cycles(5)
         cell.gripper.there.set()
         await cell.cycles(3)
-        with pytest.raises(CommandRefusedError, match=r"meanwhile there was a stop; .* emergency stop is pressed"):
+        with pytest.raises(CommandRefusedError, match=r"but there was another stop; .* emergency stop is pressed"):
             await unlocking
         assert cell.control_loop.safety.waiting == 2
 

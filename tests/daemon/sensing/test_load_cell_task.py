@@ -235,7 +235,7 @@ async def test_a_load_that_comes_or_goes_while_a_zero_is_taken_refuses_it(confir
         await board.send(0.0, ZERO_SAMPLES // 2)
         await board.send(0.3, ZERO_SAMPLES - ZERO_SAMPLES // 2)
         assert board.tares == []
-        assert "was not taken: its torque changed by 0.300 N·m meanwhile" in task.diagnostics()["error"]
+        assert "was not taken: its torque changed by 0.300 N·m during the tare" in task.diagnostics()["error"]
         assert not task.taring
 
 

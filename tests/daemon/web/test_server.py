@@ -461,7 +461,7 @@ def test_readable_or_invalid_token_files_are_refused(tmp_path):
     path = tmp_path / "token"
     load_token(path)
     path.chmod(0o640)
-    with pytest.raises(UserError, match="nobody else may read"):
+    with pytest.raises(UserError, match="that no other user may read"):
         load_token(path)
     for content in ("", "short", "x" * 500, "a token with spaces in it, long enough as it is"):
         path.write_text(content)

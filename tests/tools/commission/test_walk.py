@@ -71,7 +71,7 @@ class Person:
             return str(SPRING_NM_PER_RAD)
         if named := re.search(r"Type `(\w+)`|for instance ([\d.]+)|the pendant shows (\w+)", question):
             return next(filter(None, named.groups()))
-        turned = re.search(r"turned from (\S+) to (\S+) rad; where the angle grows.* turn counterclockwise", question)
+        turned = re.search(r"turned from (\S+) to (\S+) rad; with a growing angle it turns counterclockwise", question)
         assert turned, f"nothing on the screen answers: {question}"
         return "counterclockwise" if float(turned[2]) > float(turned[1]) else "clockwise"
 

@@ -86,7 +86,7 @@ def test_twists_count_once_under_any_name_and_range(calibration, cylinder, tmp_p
 def test_a_calibration_without_its_frames_cannot_tell(calibration, cylinder, tmp_path, ran):
     older, recording, new = tmp_path / "older.cal", cylinder("30mm_2"), tmp_path / "new.cal"
     replace(Calibration.load(calibration), learned=UNKNOWN_FRAMES).save(older)
-    unknown = "Warning: the calibration's file does not hold which frames it was made from"
+    unknown = "Warning: the calibration's file does not list the frames of its fit"
     assert unknown in ran("adapt", older, recording, "--time-range", "0:0.38", "--out", new).err
     assert unknown in ran("evaluate", older, recording).err
     assert "which frames" not in ran("evaluate", calibration, recording).err

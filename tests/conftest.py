@@ -115,9 +115,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exempt all modules and tests from garbage collections, which otherwise take a quarter of a second each."""
+    """Exempt all modules and tests from garbage collections, which otherwise take a quarter of a second each.
+
+    What tests make is collected less often than by default, which saves a twentieth of their time.
+    """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, 50, 1000)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -106,6 +106,9 @@ class MotionExecutor:
         # How many samples at rest came last.
         self._at_rest = 0
         self._accelerations = Accelerations()
+        # The latest sample, and what it violates: each is asked about several times in a cycle.
+        self._judged: RtdeSample | None = None
+        self._beyond = ""
 
     @property
     def motion(self) -> MotionKind:
@@ -213,7 +216,9 @@ class MotionExecutor:
 
     def violation(self, sample: RtdeSample) -> str:
         """Return a sentence that names the limit that the sample or the present motion exceeds, or the empty string."""
-        beyond = violation(sample, self._settings)
+        if sample is not self._judged:
+            self._judged, self._beyond = sample, violation(sample, self._settings)
+        beyond = self._beyond
         if not beyond and isinstance(self._motion, WristSpeed | _Move):
             beyond = self._accelerations.violation(self._settings.limits)
         return beyond

@@ -1,10 +1,9 @@
 """A browser, a viewer as a process of its own, and a daemon's sockets before it, for the tests of the page."""
 
 import json
+import os
 import select
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from playwright.sync_api import Page, sync_playwright
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
+from tests.daemon.web.forked import Forks
 from tests.fixtures.daemons import DEADLINE_S
 
 CHROMIUM_ARGUMENTS = (
@@ -39,21 +39,23 @@ LAYOUT = """() => {
 class Killable:
     """A process that a test kills and starts again."""
 
-    _process: subprocess.Popen[bytes] | None = None
+    _pid: int | None = None
+
+    def __init__(self, folder: Path, forks: Forks) -> None:
+        self._folder, self._forks = folder, forks
 
     def kill(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            self._process = None
+        if self._pid is not None:
+            self._forks.kill(self._pid)
+            self._pid = None
 
 
 class FakeDaemon(Killable):
     """The sockets of a daemon, in a process that can be killed."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, forks: Forks) -> None:
+        super().__init__(folder, forks)
         self.publish, self.commands = f"ipc://{folder}/publish", f"ipc://{folder}/commands"
-        self._folder = folder
         self.forget()
 
     def say(
@@ -83,39 +85,32 @@ class FakeDaemon(Killable):
         (self._folder / "asked").write_text("")
 
     def start(self) -> None:
-        if self._process is None:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.daemon.web.fake_daemon", str(self._folder)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
+        if self._pid is None:
+            self._pid = self._forks.start("daemon", str(self._folder))
 
     def check(self) -> None:
-        assert self._process is None or self._process.poll() is None, "the daemon's sockets have died"
+        assert self._pid is None or self._forks.runs(self._pid), "the daemon's sockets have died"
 
 
 class Viewer(Killable):
     """`shearloop view` as a process of its own, on a port that it keeps when it is started again."""
 
-    def __init__(self, folder: Path, daemon: FakeDaemon) -> None:
-        self._folder, self._daemon = folder, daemon
+    def __init__(self, folder: Path, forks: Forks, daemon: FakeDaemon) -> None:
+        super().__init__(folder, forks)
+        self._daemon, self._said = daemon, folder / "said"
         self._port = 0
         self.url = self.url_with_token = ""
+        os.mkfifo(self._said)
 
     def start(self) -> None:
-        self._process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "shearloop", "view", "--json", "--port", str(self._port)),
+        # It says its address, in one line, and nothing else.
+        with open(os.open(self._said, os.O_RDONLY | os.O_NONBLOCK), "rb") as said:
+            self._pid = self._forks.start(
+                *("view", "--json", "--port", str(self._port)),
                 *("--connect", self._daemon.publish, "--commands", self._daemon.commands),
                 *("--token-file", str(self._folder / "token")),
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-        )
-        # It says its address, in one line, and nothing else.
-        with self._process.stdout as said:
+                output=self._said,
+            )
             ready, _, _ = select.select([said], [], [], DEADLINE_S)
             assert ready, f"the viewer has not said its address within {DEADLINE_S} s"
             line = said.readline()
@@ -198,8 +193,9 @@ def browsed(tmp_path_factory) -> Iterator[Browsed]:
     if chromium is None:
         pytest.skip("needs Debian's chromium: `make system-packages` installs it")
     folder = tmp_path_factory.mktemp("view")
-    daemon = FakeDaemon(folder)
-    viewer = Viewer(folder, daemon)
+    forks = Forks()
+    daemon = FakeDaemon(folder, forks)
+    viewer = Viewer(folder, forks, daemon)
     daemon.say()
     daemon.start()
     try:
@@ -216,5 +212,4 @@ def browsed(tmp_path_factory) -> Iterator[Browsed]:
             yield Browsed(context.pages[0], daemon, viewer)
             context.close()
     finally:
-        viewer.kill()
-        daemon.kill()
+        forks.close()

@@ -7,7 +7,6 @@ import asyncio
 import dataclasses
 import json
 import os
-import sys
 import threading
 import traceback
 from collections.abc import Callable, Mapping
@@ -139,7 +138,7 @@ async def serve(folder: Path) -> None:
         await CommandServer(context, f"ipc://{folder}/commands", handlers, Refusals()).run()
 
 
-if __name__ == "__main__":
-    place = Path(sys.argv[1])
-    threading.Thread(target=pump, args=(place,), daemon=True).start()
-    asyncio.run(serve(place))
+def run(folder: str) -> None:
+    """Say and answer until killed."""
+    threading.Thread(target=pump, args=(Path(folder),), daemon=True).start()
+    asyncio.run(serve(Path(folder)))

@@ -40,6 +40,16 @@ COVERED = """() => {
   return panels.map((panel) => area(panel.getBoundingClientRect())).reduce((a, b) => a + b)
     / area(document.querySelector('main').getBoundingClientRect());
 }"""
+# The page's timers of seconds run twenty times as fast, and are noted. The browser's driver has longer ones.
+LONG_TIMERS = """() => {
+  window.longTimers = [];
+  const real = window.setTimeout;
+  window.setTimeout = (call, ms) => {
+    if (!(ms >= 5000 && ms <= 15000)) return real(call, ms);
+    window.longTimers.push(ms);
+    return real(call, ms / 20);
+  };
+}"""
 
 TARED = "tare: the zero of right, load_cell is being taken; NOT of left, which is not connected"
 
@@ -220,9 +230,12 @@ def test_an_unlock_that_drops_a_tool_needs_a_confirmation(browsed):
 def test_a_refusal_goes_after_some_seconds(browsed):
     page = browsed.open(token=True)
     browsed.daemon.say(loop={"phase": "running"}, refusal="no experiment is running")
+    page.evaluate(LONG_TIMERS)
     page.click("[data-command=pause]:enabled")
     browsed.until("#answer", "pause was refused: no experiment is running")
     page.wait_for_function("() => document.querySelector('#answer').textContent === ''")
+    (shown_ms,) = page.evaluate("longTimers")
+    assert 5000 <= shown_ms <= 10_000
 
 
 @pytest.mark.parametrize("stopped", [False, True], ids=["running", "stopped"])

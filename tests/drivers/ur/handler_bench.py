@@ -1,5 +1,6 @@
 """A handler that drives a fake arm, cycle by cycle."""
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable
@@ -95,8 +96,7 @@ class FakeArm:
         step = self.acceleration * CYCLE_NS / 1e9
         now = speed + min(max(self.target - speed, -step), step)
         wrist += 0.5 * (now + speed) * CYCLE_NS / 1e9
-        self.reading = dataclasses.replace(
-            self.reading,
+        self.be(
             t_mono_ns=self.reading.t_mono_ns + CYCLE_NS,
             timestamp_s=self.reading.timestamp_s + CYCLE_NS / 1e9,
             q_rad=(*self.reading.q_rad[:5], wrist),
@@ -104,7 +104,10 @@ class FakeArm:
         )
 
     def be(self, **changes: object) -> None:
-        self.reading = dataclasses.replace(self.reading, **changes)
+        # As dataclasses.replace does, in a fraction of its time: it is called several times in a cycle.
+        assert changes.keys() <= vars(self.reading).keys()
+        self.reading = copy.copy(self.reading)
+        vars(self.reading).update(changes)
 
     def read(self) -> messages.RtdeSample:
         return self.reading

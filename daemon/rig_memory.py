@@ -174,12 +174,17 @@ class RigMemory:
         log = structlog.get_logger()
         self._judged = True
         if not why_another:
-            taken = {LOAD_CELL: True, WRENCH: self._wrench_tared}
-            for name in zeros:
-                if taken[name]:
-                    self.loop.on_restored_zero(name)
-            if zeros:
-                log.info("the zeros of the present grip are kept", of=zeros)
+            known = [name for name in zeros if name != WRENCH or self._wrench_tared]
+            for name in known:
+                self.loop.on_restored_zero(name)
+            if known:
+                log.info("the zeros of the present grip are kept", of=known)
+            if self._wrench_restored and not self._wrench_tared:
+                log.info(
+                    "the wrench has no known zero in the present grip, and its torques may be off by any load",
+                    reason="none was taken before the grip, or the last daemon ended while the robot's program started",
+                    cure="`shearloop command release --yes`, then `shearloop command tare`, before a step needs it",
+                )
             return
         log.warning(
             "the gripper does not have the grip of the last daemon, whose angle, force and zeros are not used",

@@ -42,7 +42,9 @@ class Turn(NamedTuple):
     """What a step turns: the direction of its first turn, and of its last one; None for none, or unknown.
 
     `loads` is the direction of the torque or the angle that it leaves, None where that is as before. `low_rad` and
-    `high_rad` bound the angle since the grip after the step; infinite where it is unknown.
+    `high_rad` bound the angle since the grip at the end of the step, and during an identification; infinite where it
+    is unknown. `by_angle`: it turns the tool by an angle, with a torque that is not known before. `way_unknown`: a tool
+    may be held, and is turned to an angle of the wrist joint from one that is not known before.
     """
 
     begins: Direction | None
@@ -50,6 +52,8 @@ class Turn(NamedTuple):
     loads: Direction | None
     low_rad: float
     high_rad: float
+    by_angle: bool
+    way_unknown: bool
 
 
 class _Bounds(NamedTuple):
@@ -82,10 +86,16 @@ def turns(file: ExperimentFile) -> Iterator[Turn]:
     angle_rad = torque_nm = _UNTURNED
     # Whether a tool may be held: a `grip` then closes tighter on it, and its angle goes on.
     held = False
+    # The angle of the wrist joint.
+    wrist_rad: float | None = None
     for step in file.steps:
         begins: Direction | None = None
         leaves: Direction | None = None
         loads: Direction | None = None
+        around_rad = 0.0
+        target_rad = _wrist_target(step) if held else None
+        way_unknown = target_rad is not None and wrist_rad is None
+        to_target = None if target_rad is None or wrist_rad is None else direction_of(target_rad - wrist_rad)
         match step:
             case GripStep() if held:
                 pass
@@ -113,17 +123,53 @@ def turns(file: ExperimentFile) -> Iterator[Turn]:
                         torque_nm = torque_nm.turned(begins if len(angles_rad) == 1 else None)
                     angle_rad = _Bounds(angles_rad[-1], angles_rad[-1])
             case TwistStep(return_to_start=True):
-                pass
+                begins = to_target
             case TwistStep(angles_rad=angles_rad):
-                leaves = _last_way(angles_rad)
+                begins, leaves = to_target, _last_way(angles_rad) or to_target
                 angle_rad = torque_nm = _UNKNOWN
             case TurnToStep():
+                begins = leaves = to_target
                 angle_rad = torque_nm = _UNKNOWN
-        if isinstance(step, GripStep | TwistingStep):
-            held = True
-        elif isinstance(step, ReleaseStep):
-            held = False
-        yield Turn(begins, leaves, loads, *angle_rad)
+            case IdentifyStep(amplitude_rad=around_rad):
+                pass
+        by_angle = isinstance(step, TwistStep | IdentifyStep) or target_rad is not None
+        low_rad, high_rad = angle_rad.low - around_rad, angle_rad.high + around_rad
+        yield Turn(begins, leaves, loads, low_rad, high_rad, by_angle, way_unknown)
+        held = _may_hold_after(step, held=held)
+        wrist_rad = _wrist_after(step, wrist_rad)
+
+
+def _may_hold_after(step: Step, *, held: bool) -> bool:
+    """Return whether a tool may be held after a step."""
+    if isinstance(step, GripStep | TwistingStep):
+        return True
+    return held and not isinstance(step, ReleaseStep)
+
+
+def _wrist_target(step: Step) -> float | None:
+    """Return the first angle of the wrist joint that a step turns to, None where its angles are not the joint's."""
+    match step:
+        case TurnToStep(angle_rad=angle_rad):
+            return angle_rad
+        case TwistStep(absolute=True, angles_rad=angles_rad):
+            return angles_rad[0]
+    return None
+
+
+def _wrist_after(step: Step, wrist_rad: float | None) -> float | None:
+    """Return the angle of the wrist joint after a step, from the one before; None where it is not known."""
+    match step:
+        case TurnToStep(angle_rad=angle_rad):
+            return angle_rad
+        case TwistStep(return_to_start=True):
+            return wrist_rad
+        case TwistStep(absolute=True, angles_rad=angles_rad):
+            return angles_rad[-1]
+        case TwistStep() | TightenStep() | HoldTorqueStep() | IdentifyStep():
+            return None
+        case ApproachStep(pose_m_rad=tuple()):
+            return None
+    return wrist_rad
 
 
 def _last_way(angles_rad: Sequence[float]) -> Direction | None:

@@ -1,7 +1,7 @@
 """The plan of an experiment: each step in words, with direction, angle, torque, force, duration and limits."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
@@ -19,7 +19,8 @@ class StepPlan:
     """One step: its action in words, its largest values, and its limits, reversals and refusals.
 
     `torque_nm` is None if the step turns the tool by an angle, because its torque is not known before. `reverses` says
-    whether the step turns a held tool against the previous turn, `turns_back` whether it turns both ways.
+    whether the step turns a held tool against the previous turn, `turns_back` whether it turns both ways, `way_unknown`
+    whether it may turn a held tool in a direction that is not known before.
     """
 
     number: int
@@ -33,6 +34,7 @@ class StepPlan:
     timeout_s: float | None = None
     reverses: bool = False
     turns_back: bool = False
+    way_unknown: bool = False
     notes: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
 
@@ -106,12 +108,18 @@ class Plan:
         )
         turned_back = sum(step.reverses for step in self.steps)
         yield f"  {turned_back or 'no'} reversal{'s' if turned_back != 1 else ''} of a held tool between steps"
-        both_ways = [f"{step.number} ({step.do})" for step in self.steps if step.turns_back]
-        if both_ways:
-            yield f"  turning back within themselves: step {', '.join(both_ways)}"
+        if either_way := _listed(step for step in self.steps if step.way_unknown):
+            yield f"  turning a held tool in a direction that is not known before: step {either_way}"
+        if both_ways := _listed(step for step in self.steps if step.turns_back):
+            yield f"  turning back within themselves: step {both_ways}"
         yield "  clockwise and counterclockwise are for an eye that faces the gripper"
         if self.unknown:
             yield f"  {self.unknown}"
+
+
+def _listed(some: Iterable[StepPlan]) -> str:
+    """Return steps with their numbers."""
+    return ", ".join(f"{step.number} ({step.do})" for step in some)
 
 
 def speeds_of(robot: UrLimits | None) -> Speeds:
@@ -149,6 +157,8 @@ def plan_of(
             notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques of the grip")
             duration_s += warm_up_s
             waits = False
+        if turn.way_unknown:
+            notes.append("a tool may be held, and turns too: which way, and how far, depends on where wrist 3 stands")
         if needs.begins_anywhere:
             notes.append("how long it takes depends on where the arm stands, and is a guess here")
         if step.timeout_s is not None and needs.takes_s > step.timeout_s:
@@ -167,12 +177,13 @@ def plan_of(
                 _words(step, gripper),
                 duration_s,
                 turn.begins or "",
-                None if isinstance(step, steps.TwistStep | steps.IdentifyStep) else needs.torque_nm,
+                None if turn.by_angle else needs.torque_nm,
                 _largest_angle(step, needs),
                 step.force_n if isinstance(step, steps.GripStep) else 0.0,
                 step.timeout_s,
                 number in back,
                 _turns_back(step, turn.begins),
+                turn.way_unknown,
                 tuple(notes),
                 (refused or {}).get(number - 1, ()),
             )

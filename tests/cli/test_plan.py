@@ -235,6 +235,45 @@ def test_the_duration_knows_what_the_steps_before_have_left():
     assert durations_s[6] == durations_s[3]
 
 
+GRIP = {"do": "grip", "width_mm": 5, "force_n": 60}
+TURN = {"do": "turn_to", "angle_rad": 0.25}
+
+
+@pytest.mark.parametrize(
+    ("steps", "by_angle", "unknown", "direction"),
+    [
+        ([TURN], False, False, ""),
+        ([GRIP, TURN], True, True, ""),
+        ([GRIP, {"do": "release"}, TURN], False, False, ""),
+        ([{"do": "turn_to", "angle_rad": 0.1}, GRIP, TURN], True, False, "counterclockwise"),
+        ([GRIP, {"do": "twist", "angles_rad": [0.1]}, TURN], True, True, ""),
+        ([{**TURN, "angle_rad": 0.4}, GRIP, TURN], True, False, "clockwise"),
+    ],
+)
+def test_a_turn_of_the_wrist_with_a_held_tool_twists_it(steps, by_angle, unknown, direction):
+    """By a torque that is not known before. Which way depends on where the wrist stands."""
+    plan = plan_of(ExperimentFile.model_validate({"name": "one", "steps": steps}))
+    last = plan.steps[-1]
+    assert (last.torque_nm is None, last.way_unknown, last.direction) == (by_angle, unknown, direction)
+    told = [line for line in plan.sentences() if "wrist 3 stands" in line or "not known before: step" in line]
+    assert len(told) == (2 if unknown else 0)
+
+
+def test_a_turn_of_the_wrist_against_the_last_one_is_a_reversal():
+    steps = [{**TURN, "angle_rad": 0.1}, GRIP, TURN, {**TURN, "angle_rad": 0.2}]
+    plan = plan_of(ExperimentFile.model_validate({"name": "one", "steps": steps}))
+    assert [step.reverses for step in plan.steps] == [False, False, False, True]
+
+
+def test_an_identification_reaches_further_than_the_twist_before_it():
+    """It turns to both sides of the angle at which it begins."""
+    twist = {"do": "twist", "angles_rad": [0.18], "return_to_start": False}
+    steps = [{"do": "grip", "width_mm": 5, "force_n": 60}, twist, {"do": "identify", "amplitude_rad": 0.1}]
+    content = {"name": "one", "steps": steps, "limits": {"torque_nm": 0.3, "angle_rad": 0.22}}
+    notes = [note for step in plan_of(ExperimentFile.model_validate(content)).steps for note in step.notes]
+    assert any("0.28 rad (16°) from the grip: the limit stops it at 0.22 rad" in note for note in notes)
+
+
 def test_the_duration_of_a_move_between_two_poses_counts_the_tools_turn():
     """A tool that turns by 90 degrees on 5 mm is slowed to the wrist's speed. The first move begins anywhere."""
     poses = [

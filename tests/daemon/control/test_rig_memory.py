@@ -173,6 +173,21 @@ def exchange(rig: Rig, how: str) -> None:
             rig.hand = replace(rig.hand, uncertain=True, requested_counts=0)
 
 
+@pytest.mark.parametrize("tared", [True, False])
+def test_the_log_calls_a_zero_kept_only_where_it_was_taken(tared, restarted, logged):
+    stored = read_memory(FILES.states[0])
+    write_memory(FILES.states[0], replace(stored, wrench_tared=tared))
+    rig = restarted.rig
+    again = Rig(new_loop())
+    again.wrist_rad, again.force_n, again.width_mm, again.hand = rig.wrist_rad, rig.force_n, rig.width_mm, rig.hand
+    RigMemory(FILES, again.control_loop, load_cell(), UrRobot(SETTINGS))
+    again.run(0.1)
+    (kept,) = (line["of"] for line in logged if line["event"] == "the zeros of the present grip are kept")
+    unknown = [line for line in logged if "the wrench has no known zero" in line["event"]]
+    assert (kept, len(unknown)) == ((["load_cell", "wrench"], 0) if tared else (["load_cell"], 1))
+    assert again.control_loop.has_zero("wrench") is tared
+
+
 @pytest.mark.parametrize("how", ["another width", "another request", "nothing held", "activated again"])
 def test_a_grip_that_changed_while_no_daemon_ran_is_one_that_nobody_knows(how, restarted, logged):
     rig = restarted.rig

@@ -91,7 +91,7 @@ Host = Annotated[str, AfterValidator(_valid_host)]
 class CurveConfig(ConfigModel):
     """Keys for addresses that are open to the network; made by `shearloop keys server`."""
 
-    server_key: Path = Field(description="the daemon's own .key_secret; under systemd its credential of this name")
+    server_key: Path = Field(description="the daemon's own .key_secret; under systemd the credential with this name")
     clients: Path = Field(description="the allow-list: a folder with the .key of each client")
 
 
@@ -115,13 +115,17 @@ class FingertipConfig(ConfigModel):
     """One EIT fingertip: its board, its bank and its calibration."""
 
     device: SerialDevice = Field(description="the board's serial port")
-    bank: Path | None = Field(None, description="of `shearloop bank build`; for k, sigma, heatmaps, estimator `paper`")
-    calibration: Path | None = Field(None, description="without one, k and sigma are published, but no torque")
-    estimator: EstimatorName | None = Field(None, description="default: the calibration's")
+    bank: Path | None = Field(
+        None, description="bank of `shearloop bank build`, for k, sigma, heatmaps and the estimator `paper`"
+    )
+    calibration: Path | None = Field(
+        None, description="calibration; without one the daemon publishes k and sigma, but no torque"
+    )
+    estimator: EstimatorName | None = Field(None, description="required estimator; default: the calibration's")
     matching: Literal["all_lags", "zero_lag"] = Field("all_lags", description="shifts of a frame to search")
     baseline_frames: int = Field(BASELINE_FRAMES, ge=2, le=1000, description="frames in the idle frame of a tare")
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
-    creep: CreepConfig | None = Field(None, description="of the gel; subtracted from the loop's torque")
+    creep: CreepConfig | None = Field(None, description="creep of the gel, which the loop subtracts from its torque")
     frame_period_s: float = Field(FRAME_PERIOD_S, gt=0, le=60, description="frame period before it is measured")
     heatmap: Literal["on_request", "always"] = Field("on_request", description="when to compute eit.heatmap")
 
@@ -130,15 +134,15 @@ class CombinedConfig(ConfigModel):
     """One estimate from several fingertips on one tool; their names are the sides of the calibration."""
 
     calibration: Path = Field(description="made by `shearloop calibrate` from recordings of all these sides")
-    estimator: EstimatorName | None = Field(None, description="default: the calibration's")
-    creep: CreepConfig | None = Field(None, description="of the gels, as for a single fingertip")
+    estimator: EstimatorName | None = Field(None, description="required estimator; default: the calibration's")
+    creep: CreepConfig | None = Field(None, description="creep of the gels, as for a single fingertip")
 
 
 class LoadCellConfig(ConfigModel):
     """The load cell on the lever."""
 
     device: SerialDevice = Field(description="the board's serial port")
-    calibration: Path | None = Field(None, description="default: the board sends torques in N·m")
+    calibration: Path | None = Field(None, description="calibration; default: the board sends torques in N·m")
     rate_hz: float = Field(LOAD_CELL_RATE_HZ, gt=0, le=1000, description="lines per second")
 
 
@@ -154,8 +158,10 @@ class SkinSourceConfig(ConfigModel):
 
     socket: InstrumentSocket | None = Field(None, description="its network address; else `serial`")
     serial: SerialDevice | None = Field(None, description="its RS-232 port; else `socket`")
-    baud: int = Field(SOURCE_BAUD, ge=300, le=57600, description="of the RS-232 interface, as set on the instrument")
-    current_ma: float = Field(SOURCE_CURRENT_MA, gt=0, le=20, description="through both gauges in series")
+    baud: int = Field(
+        SOURCE_BAUD, ge=300, le=57600, description="speed of the RS-232 interface, as set on the instrument"
+    )
+    current_ma: float = Field(SOURCE_CURRENT_MA, gt=0, le=20, description="current through both gauges in series")
     compliance_v: float = Field(SOURCE_COMPLIANCE_V, gt=0, le=5, description="largest voltage of the source")
 
     _one_way_in = either("socket", "serial")
@@ -165,8 +171,10 @@ class ScannerConfig(ConfigModel):
     """A scanning multimeter on a socket."""
 
     socket: InstrumentSocket = Field(description="its network address")
-    channels: tuple[Channel, Channel] = Field(SCANNER_CHANNELS, description="of gauge 1 and 2")
-    range_v: float = Field(SCANNER_RANGE_V, gt=0, le=300, description="measuring range, above each gauge's voltage")
+    channels: tuple[Channel, Channel] = Field(SCANNER_CHANNELS, description="channels of gauge 1 and 2")
+    range_v: float = Field(
+        SCANNER_RANGE_V, gt=0, le=300, description="measuring range, which must exceed each gauge's voltage"
+    )
 
     @model_validator(mode="after")
     def _two_channels(self) -> "ScannerConfig":
@@ -188,7 +196,9 @@ class SkinDaqConfig(ConfigModel):
     scanner: ScannerConfig | None = Field(None, description="a scanning multimeter; else `adc`")
     adc: AdcConfig | None = Field(None, description="a converter board; else `scanner`")
     rate_hz: float = Field(DAQ_RATE_HZ, ge=1, le=1000, description="readings of both gauges per second")
-    average_s: float = Field(0.0, ge=0, le=10, description="readings averaged into one sample; the paper's DAQ: 1")
+    average_s: float = Field(
+        0.0, ge=0, le=10, description="time of readings that are averaged into one sample; 1 as in the paper's DAQ"
+    )
 
     _one_way_in = either("scanner", "adc")
 
@@ -210,7 +220,9 @@ class SkinConfig(ConfigModel):
     daq: SkinDaqConfig = Field(description="the instrument that reads the voltages")
     calibration: Path = Field(description="made by `shearloop skin calibrate`")
     normal_n: float = Field(1.0, ge=0, le=100, description="normal force on the skin, for its friction")
-    tool_radius_mm: float | None = Field(None, gt=0, le=200, description="from wrist axis to skin, for torque")
+    tool_radius_mm: float | None = Field(
+        None, gt=0, le=200, description="distance from wrist axis to skin, for the torque"
+    )
     zero_samples: int = Field(20, ge=10, le=1000, description="readings averaged into the zero")
     drift_per_hour: float = Field(DRIFT_PER_HOUR, ge=0, le=1, description="95 % bound of the response's drift")
 
@@ -225,10 +237,12 @@ class GripperSocket(ConfigModel):
 class GripperConfig(ConfigModel):
     """The gripper, on a socket or on Modbus."""
 
-    model: ModelName = Field(DEFAULT_MODEL, description="sets stroke, speeds, forces and counts")
-    socket: GripperSocket | None = Field(None, description="through the robot's URCap; else `modbus`")
+    model: ModelName = Field(DEFAULT_MODEL, description="the model, which sets stroke, speeds, forces and counts")
+    socket: GripperSocket | None = Field(None, description="connection through the robot's URCap; else `modbus`")
     modbus: SerialDevice | None = Field(None, description="Modbus RTU by USB; else `socket`")
-    calibration: Path | None = Field(None, description="of `shearloop calibrate gripper`; default: the maker's data")
+    calibration: Path | None = Field(
+        None, description="calibration of `shearloop calibrate gripper`; default: the maker's data"
+    )
 
     _one_way_in = either("socket", "modbus")
 
@@ -236,7 +250,7 @@ class GripperConfig(ConfigModel):
 class RecordingConfig(ConfigModel):
     """Recordings of all messages and raw inputs, one file per experiment."""
 
-    folder: Path = Field(description="created if missing; a rig with one fingertip writes some 50 MB an hour")
+    folder: Path = Field(description="folder, created if missing; a rig with one fingertip writes some 50 MB an hour")
 
 
 class EventConfig(ConfigModel):
@@ -251,7 +265,7 @@ class EmulatorConfig(ConfigModel):
     """A device that is emulated by its own process, for demonstrations."""
 
     device: str = Field(description="a device of `shearloop emulate`")
-    arguments: tuple[str, ...] = Field((), description="of `shearloop emulate`; see its --help")
+    arguments: tuple[str, ...] = Field((), description="arguments of `shearloop emulate`; see its --help")
     synthetic: tuple[str, ...] = Field((), description="further arguments, unless a recording is played")
     events: tuple[EventConfig, ...] = Field((), description="commands to the device during an experiment")
 
@@ -268,7 +282,7 @@ class DaemonConfig(ConfigModel):
         *NAMED_FILES,
     )
 
-    name: str = Field("", max_length=60, description="name of the rig, for the page; default: that of this file")
+    name: str = Field("", max_length=60, description="name of the rig, for the page; default: the name of this file")
     publish: Address = Field(addresses.PUBLISH_ADDRESS, description="ZeroMQ address of the messages")
     commands: Address = Field(addresses.COMMAND_ADDRESS, description="ZeroMQ address of the commands")
     curve: CurveConfig | None = Field(None, description="keys for addresses that are open to the network")
@@ -279,22 +293,28 @@ class DaemonConfig(ConfigModel):
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
     gripper: GripperConfig | None = Field(None, description="the gripper; needs `robot`")
     commissioned: Path | None = Field(
-        None, description="report of `shearloop commission`; a real robot without one is slow and weak"
+        None, description="report of `shearloop commission`; without one a real robot is capped"
     )
     loop: LoopConfig = Field(LoopConfig(), description="settings of the closed loop")
     emulated: bool = Field(
         False, description="every device is emulated on this computer; real addresses and controllers are refused"
     )
     emulated_deadlines: Literal["patient", "real"] = Field(
-        "patient", description="of an emulated rig: longer, for a busy computer, or those of a real rig"
+        "patient", description="deadlines of an emulated rig: longer for a busy computer, or as on a real rig"
     )
-    experiment: Path | None = Field(None, description="what `shearloop command start` runs if it names no other")
-    autostart: bool = Field(False, description="start `experiment` once all devices are connected; needs `emulated`")
+    experiment: Path | None = Field(
+        None, description="the experiment that `shearloop command start` runs if it names no other one"
+    )
+    autostart: bool = Field(False, description="start `experiment` when all devices are connected; needs `emulated`")
     experiments: tuple[Path, ...] = Field(
-        (), validate_default=True, description="folders of the experiments that `start` may name; default: this file's"
+        (),
+        validate_default=True,
+        description="folders of the experiments that `start` may name; default: this file's folder",
     )
-    stop_when_done: bool = Field(False, description="the daemon ends with that experiment: status 0 if done, else 3")
-    recording: RecordingConfig | None = Field(None, description="default: no recording")
+    stop_when_done: bool = Field(
+        False, description="the daemon ends with the experiment: status 0 if done, else 3 or 4"
+    )
+    recording: RecordingConfig | None = Field(None, description="where to record; default: no recording")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
     emulators: tuple[EmulatorConfig, ...] = Field((), description="devices to emulate, for demonstrations")
 

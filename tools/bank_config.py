@@ -96,7 +96,9 @@ class FingertipGeometryConfig(ConfigModel):
     diameter_cm: Measure | None = Field(None, description="diameter of a disc")
     # 10 µm: narrower than any electrode, wider than two lines of the mesh that are one.
     electrode_width_cm: float = Field(ge=1e-3, le=100, description="width of each electrode")
-    contact_impedance: float = Field(gt=0, le=1000, description="of each contact, in cm over the conductivity")
+    contact_impedance: float = Field(
+        gt=0, le=1000, description="impedance of each contact, in cm over the conductivity"
+    )
     mesh_size_cm: MeshSize = Field(description="largest distance of mesh lines")
     injection: Injection = Field(INJECTION, description="the electrode that an injection's current comes from")
     electrodes: list[ElectrodeRunConfig] = Field(description="the electrodes in order")

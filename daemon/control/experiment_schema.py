@@ -70,7 +70,7 @@ class ExperimentLimits(ConfigModel):
 
     torque_nm: ranges.TorqueLimit = Field(default=CAPPED_NM, description="a larger torque stops the motion")
     angle_rad: ranges.Turn = Field(
-        default=3.2, description="from the angle at the grip, or at the first start with a clamped tool"
+        default=3.2, description="largest angle, from the angle at the grip or at the first start with a clamped tool"
     )
 
 
@@ -83,8 +83,10 @@ class ApproachStep(_Step):
     """Move the tool centre in a straight line, to a pose or by a distance along the tool's axis."""
 
     do: Literal["approach"]
-    pose_m_rad: ranges.Pose | None = Field(None, description="x, y, z and rotation vector; else `along_tool_m`")
-    along_tool_m: float | None = Field(None, ge=-0.5, le=0.5, description="along the tool's axis; else `pose_m_rad`")
+    pose_m_rad: ranges.Pose | None = Field(None, description="pose: x, y, z and rotation vector; else `along_tool_m`")
+    along_tool_m: float | None = Field(
+        None, ge=-0.5, le=0.5, description="distance along the tool's axis; else `pose_m_rad`"
+    )
     speed_m_per_s: float = Field(CAPPED_M_PER_S, gt=0, le=0.5, description="speed of the tool centre")
 
     _one_end = either("pose_m_rad", "along_tool_m")
@@ -103,7 +105,7 @@ class GripStep(_Step):
     width_mm: FingerWidth = Field(0.0, description="width to close to")
     speed_mm_per_s: FingerSpeed = Field(60.0, description="speed of the fingers")
     force_n: FingerForce = Field(20.0, description="largest force of the fingers")
-    expect_object: bool = Field(True, description="closing on nothing is an error")
+    expect_object: bool = Field(True, description="whether it is an error to close on nothing")
 
 
 class Opening(GripStep):
@@ -118,7 +120,7 @@ def opening(width_mm: float, speed_mm_per_s: float) -> Opening:
 
 
 class TareStep(_Step):
-    """Take the zero of every torque sensor, with the wrist standing still; of fingertips the idle frame."""
+    """Take the zero of every torque sensor, and the idle frame of fingertips, while the wrist stands still."""
 
     do: Literal["tare"]
 
@@ -145,7 +147,7 @@ class TwistStep(_Step):
 
     do: Literal["twist"]
     angles_rad: Angles
-    absolute: bool = Field(False, description="angles of the wrist joint, not from the angle at the grip")
+    absolute: bool = Field(False, description="true: angles of the wrist joint; false: from the angle at the grip")
     speed_rad_per_s: ranges.WristSpeed = Field(CAPPED_RAD_PER_S, description="speed of the wrist")
     hold_s: ranges.Seconds = Field(2.0, description="time at each angle")
     return_to_start: bool = Field(True, description="turn back after each angle")
@@ -178,7 +180,7 @@ class HoldTorqueStep(_Step):
 
     do: Literal["hold_torque"]
     torque_nm: ranges.TorqueSetpoint = Field(description="the set point; counterclockwise is positive")
-    direction: Direction | None = Field(None, description="of the torque, which then has no sign")
+    direction: Direction | None = Field(None, description="direction of the torque, which then has no sign")
     ramp_nm_per_s: float = Field(0.05, gt=0, le=1, description="rise of the set point")
     hold_s: ranges.Seconds = Field(10.0, description="time at the set point")
 
@@ -201,7 +203,9 @@ class TightenStep(_Step):
     until_torque_nm: ranges.TorqueLimit = Field(description="the turn ends at this torque")
     until_angle_rad: ranges.Turn = Field(description="the turn ends at this angle")
     speed_rad_per_s: ranges.WristSpeed = Field(0.05, description="speed of the wrist")
-    direction: Direction = Field(description="of the turn: the thread's, as seen from in front of the gripper")
+    direction: Direction = Field(
+        description="direction of the turn, as the thread's, seen from in front of the gripper"
+    )
 
 
 class ReleaseStep(_Step):
@@ -241,7 +245,7 @@ class ExperimentFile(ConfigModel):
         *NAMED_FILES,
     )
 
-    name: str = Field(min_length=1, max_length=80, description="shown in messages and recordings")
+    name: str = Field(min_length=1, max_length=80, description="name in messages and recordings")
     torque_source: Annotated[str, Field(min_length=1)] = Field(
         "right",
         description="torque that drives the loop: a fingertip's name, `combined`, `skin`, `load_cell` or `wrench`",

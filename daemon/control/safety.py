@@ -57,7 +57,7 @@ class FaultCode(Enum):
     ESTIMATE_STALE = Rule(
         _HOLD,
         "no new torque has arrived: {detail}.",
-        "Check the sensor's cable and its task in `shearloop listen health`. If the wrist stopped, then "
+        "Check the sensor's cable and its task in `shearloop listen health`. If the wrist stopped, send "
         "`shearloop command unlock`.",
         hold_at_most_s=5.0,
         timer="torque source",
@@ -65,58 +65,58 @@ class FaultCode(Enum):
     SENSOR_LOST = Rule(
         _HOLD,
         "a torque sensor is not connected: {detail}.",
-        "Connect it again; the daemon finds it by itself. If the wrist stopped, then `shearloop command unlock`.",
+        "Connect it again; the daemon finds it by itself. If the wrist stopped, send `shearloop command unlock`.",
         hold_at_most_s=5.0,
         timer="torque source",
     )
     ESTIMATE_INVALID = Rule(
         _HOLD,
         "the torque estimate is not valid: {detail}.",
-        "It resumes with the next valid torque; if it stopped, clear the cause, then `shearloop command unlock`.",
+        "It resumes with the next valid torque; if it stopped, clear the cause, then send `shearloop command unlock`.",
         hold_at_most_s=5.0,
     )
     ESTIMATE_JUMPED = Rule(
         _HOLD,
         "the torque jumped without a motion of the wrist: {detail}.",
-        "Check whether the tool slipped or the screw broke loose. If the wrist stopped, then "
+        "Check whether the tool slipped or the screw broke loose. If the wrist stopped, send "
         "`shearloop command unlock`.",
         hold_at_most_s=5.0,
     )
     NOT_FOLLOWING = Rule(
         _HOLD,
         "the torque no longer follows the wrist: {detail}.",
-        "The grip slips, or the screw broke loose or stripped: look at the tool, then `shearloop command unlock`. "
+        "The grip slips, or the screw broke loose or stripped: look at the tool, then send `shearloop command unlock`. "
         "`loop.max_offset_drift_nm` is the limit.",
         hold_at_most_s=5.0,
     )
     TORQUE_LIMIT = Rule(
         _RELEASE,
         "the torque is beyond its limit: {detail}.",
-        "Find the obstacle of the tool, then `shearloop command unlock`. A tool that is still held is let go by "
-        "`shearloop command release --yes`. Raise `limits.torque_nm` only if tool and gel bear it.",
+        "Find the obstacle at the tool, then send `shearloop command unlock`. `shearloop command release --yes` lets "
+        "go a tool that is still held. Raise `limits.torque_nm` only if tool and gel bear it.",
     )
     ANGLE_LIMIT = Rule(
         _KEEP,
         "the wrist has reached its angle limit: {detail}.",
-        "If the tool slips, grip it again, else widen `limits.angle_rad`; then `shearloop command unlock`.",
+        "If the tool slips, grip it again, else widen `limits.angle_rad`; then send `shearloop command unlock`.",
     )
     TORQUES_DISAGREE = Rule(
         _HOLD,
         "two torque measurements disagree: {detail}.",
-        "Tare both with nothing gripped; if they still disagree, calibrate again. If the wrist stopped, then "
+        "Tare both with nothing gripped; if they still disagree, calibrate again. If the wrist stopped, send "
         "`shearloop command unlock`.",
         hold_at_most_s=3.0,
     )
     PROTECTIVE_STOP = Rule(
         _KEEP,
         "the robot is in a protective stop: {detail}.",
-        "Clear what the robot touched, then `shearloop command unlock`.",
+        "Clear the obstacle that the robot touched, then send `shearloop command unlock`.",
         stops_at_rest=True,
     )
     EMERGENCY_STOP = Rule(
         _KEEP,
         "the robot's emergency stop is pressed: {detail}.",
-        "Release the button, power the arm on at the pendant, then `shearloop command unlock`.",
+        "Release the button, power the arm on at the pendant, then send `shearloop command unlock`.",
         stops_at_rest=True,
     )
     GRIPPER_FAULT = Rule(
@@ -128,23 +128,23 @@ class FaultCode(Enum):
     GRIPPER_COMMANDED = Rule(
         _KEEP,
         "another program, or the pendant, commands the gripper: {detail}.",
-        "Let nothing else command it, look at the tool, then `shearloop command unlock`.",
+        "Let no other program command it, look at the tool, then send `shearloop command unlock`.",
     )
     GRIP_LOST = Rule(
         _KEEP,
         "the gripper no longer holds an object: {detail}.",
-        "Put the tool back if it is not between the fingers, then `shearloop command unlock`.",
+        "Put the tool back if it is not between the fingers, then send `shearloop command unlock`.",
     )
     NOT_RELEASED = Rule(
         _KEEP,
         "the gripper did not open, the tool is still gripped: {detail}.",
-        "Open it by hand and clear the fault, then `shearloop command unlock`.",
+        "Open it by hand and clear the fault, then send `shearloop command unlock`.",
     )
     STATE_STALE = Rule(
         _HOLD,
         "a device's state is out of date: {detail}.",
         "It resumes with the next state; check the cable, and whether this computer is overloaded. If the wrist "
-        "stopped, then `shearloop command unlock`.",
+        "stopped, send `shearloop command unlock`.",
         hold_at_most_s=2.0,
     )
     DEVICE_AWAITED = Rule(
@@ -156,33 +156,34 @@ class FaultCode(Enum):
     DEVICE_LOST = Rule(
         _KEEP,
         "a device that the experiment needs is gone: {detail}.",
-        "Connect it again; the daemon finds it by itself. Then `shearloop command unlock`; the experiment can begin.",
+        "Connect it again; the daemon finds it by itself. Then send `shearloop command unlock`, and the experiment can "
+        "begin.",
     )
     ROBOT_LOST = Rule(
         _KEEP,
         "the robot, or the daemon's process that drives it, is gone: {detail}.",
-        "It reconnects automatically; then `shearloop command unlock`, and the experiment can begin.",
+        "It reconnects automatically; then send `shearloop command unlock`, and the experiment can begin.",
     )
     ROBOT_BLOCKED = Rule(
         _KEEP,
         "the robot does not move: {detail}.",
-        "Clear the cause and `shearloop command unlock`, then the experiment can begin.",
+        "Clear the cause and send `shearloop command unlock`. Then the experiment can begin.",
     )
     ROBOT_UNCONTROLLED = Rule(
         _KEEP,
         "the daemon has lost control of the robot: {detail}.",
-        "If no person stopped it at the pendant, check its cable, and whether this computer is overloaded; then "
+        "If no person stopped it at the pendant, check its cable, and whether this computer is overloaded; then send "
         "`shearloop command unlock`, and the experiment can begin.",
     )
     TASK_DIED = Rule(
         _KEEP,
         "a task of the daemon crashed and restarts: {detail}.",
-        "Read the log above this line, then `shearloop command unlock`. Report the crash if it recurs.",
+        "Read the log above this line, then send `shearloop command unlock`. Report the crash if it recurs.",
     )
     DAEMON_PAUSED = Rule(
         _KEEP,
         "the daemon itself was not running: {detail}.",
-        "Do not pause it (SIGSTOP, Ctrl-Z), nor suspend or overload the computer, while an experiment runs; then "
+        "Do not pause it (SIGSTOP, Ctrl-Z), nor suspend or overload the computer, while an experiment runs; then send "
         "`shearloop command unlock`.",
         is_past=True,
         explains=True,
@@ -190,7 +191,7 @@ class FaultCode(Enum):
     LOOP_LATE = Rule(
         _HOLD,
         "the daemon is too slow for its devices: {detail}.",
-        "End other programs on this computer, or see the service's real-time options. If the wrist stopped, then "
+        "End other programs on this computer, or see the service's real-time options. If the wrist stopped, send "
         "`shearloop command unlock`.",
         hold_at_most_s=5.0,
         is_past=True,
@@ -199,7 +200,7 @@ class FaultCode(Enum):
     HELD_TOO_LONG = Rule(
         _KEEP,
         "the wrist was held for too long by several faults: {detail}.",
-        "Clear the longest one first, then `shearloop command unlock`.",
+        "Clear the longest one first, then send `shearloop command unlock`.",
     )
     RECORDING_FAILED = Rule(
         Response.REFUSE_START,
@@ -219,10 +220,10 @@ class FaultCode(Enum):
     STEP_OVERDUE = Rule(
         _KEEP,
         "a step took longer than it may: {detail}.",
-        "Find the cause of the delay, or lengthen the step's `timeout_s`; then `shearloop command unlock`.",
+        "Find the cause of the delay, or lengthen the step's `timeout_s`; then send `shearloop command unlock`.",
     )
     STEP_FAILED = Rule(
-        _KEEP, "the experiment cannot continue: {detail}.", "Clear the cause, then `shearloop command unlock`."
+        _KEEP, "the experiment cannot continue: {detail}.", "Clear the cause, then send `shearloop command unlock`."
     )
     OPERATOR_STOP = Rule(
         _KEEP, "the operator stopped it: {detail}.", "Send `shearloop command unlock` before the next start."

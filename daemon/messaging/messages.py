@@ -67,10 +67,10 @@ class EitFrame(Message):
     channels: NDArray[np.floating] = column("V", "the channels in the order of the channel table")
     line: NDArray[np.floating] = column("V", "the values of the raw line")
     frame: int = column("", "number of the frame since the daemon began")
-    age_s: float = column("s", "from the middle of the acquisition to the arrival of the last byte")
+    age_s: float = column("s", "time from the middle of the acquisition to the arrival of the last byte")
     saturated: int = column("", "channels at the converter's full scale")
     dead: int = column("", "channels that read 0, or the same for 200 frames")
-    repeated: bool = column("", "whether the line equals the one before it exactly")
+    repeated: bool = column("", "whether the line is exactly equal to the previous line")
 
 
 @message("eit.estimate", rate_hz=1.85)
@@ -89,10 +89,10 @@ class EitEstimate(Message):
     sigma: float | None = column("cm", "σ of the best-matching cell")
     score: float | None = column("", "normalised cross-correlation of the best cell, 0 to 1")
     runner_up: float | None = column("", "score of the best cell away from the best one")
-    valid: bool = column("", "whether the estimate can be used; never of a frame that saw the fingers move")
+    valid: bool = column("", "whether the estimate can be used; false if the gripper's fingers moved during the frame")
     reason: str = column("", "why it is not valid, in sentences; empty when it is")
     frame: int = column("", "number of the frame")
-    latency_s: float = column("s", "from the arrival of the frame's last byte to this message")
+    latency_s: float = column("s", "time from the arrival of the frame's last byte to this message")
 
 
 @message("eit.adapted", rate_hz=None)
@@ -100,7 +100,7 @@ class EitAdapted(Message):
     """A correction of a fingertip's gain by a known torque, valid until the next grip or tare."""
 
     reference: str = column("", "source of the known torque: load_cell or wrench")
-    twists: int = column("", "twists since the grip that decided")
+    twists: int = column("", "number of twists since the grip that gave the correction")
     factor: tuple[float, ...] = column("", "factor on the torque of each fingertip of the calibration")
     factor_std: tuple[float, ...] = column("", "their standard errors")
     offset_nm: float = column("N·m", "the correction that is added to the torque")
@@ -133,7 +133,7 @@ class LoadTorque(Message):
     torque_nm: float = column("N·m", "torque on the lever, after tare and scale")
     raw: float = column("", "the number that the board sent")
     saturated: bool = column("", "whether the converter was at its full scale")
-    spike: bool = column("", "whether the reading is implausible after those before it")
+    spike: bool = column("", "whether the reading is implausible after the previous readings")
     valid: bool = column("", "whether the reading can be used")
     reason: str = column("", "why it is not valid, in a sentence; empty when it is")
 
@@ -142,8 +142,8 @@ class LoadTorque(Message):
 class SkinShear(Message):
     """One reading of the shear skin; the force and its interval are nil unless `valid` is true."""
 
-    shear_n: float | None = column("N", "shear force on the skin; positive where it stretches gauge 1")
-    shear_low_n: float | None = column("N", "lower end of the interval: 95 %, plus the range left open by friction")
+    shear_n: float | None = column("N", "shear force on the skin; positive if it stretches gauge 1")
+    shear_low_n: float | None = column("N", "lower end of the interval: 95 %, plus the range that friction leaves open")
     shear_high_n: float | None = column("N", "upper end of the interval")
     torque_nm: float | None = column("N·m", "shear force times the tool's radius; nil if that is not configured")
     response: float | None = column("", "normalised response: change of gauge 1 minus change of gauge 2")
@@ -157,7 +157,7 @@ class SkinShear(Message):
     reason: str = column("", "why it is not valid, in sentences; empty when it is")
     sample: int = column("", "number of the reading since the daemon started")
     missed: int = column("", "missing readings right before this one")
-    latency_s: float = column("s", "from the reading's arrival to this message")
+    latency_s: float = column("s", "time from the reading's arrival to this message")
 
 
 @message("robot.state", rate_hz=25.0)
@@ -175,14 +175,16 @@ class RobotStateMessage(Message):
     )
     robot_mode: int = column("", "the controller's robot mode, 7 when running")
     safety_mode: int = column("", "the controller's safety mode, 1 when normal")
-    speed_scaling: float = column("", "fraction of commanded speeds that is carried out: slider times own scaling")
-    payload_kg: float = column("kg", "payload that is set at the pendant; NaN before PolyScope 3.12 and 5.5.1")
+    speed_scaling: float = column(
+        "", "fraction of the commanded speed that the arm carries out: slider times the controller's own scaling"
+    )
+    payload_kg: float = column("kg", "payload at the pendant; NaN before PolyScope 3.12 and 5.5.1")
     payload_cog_m: tuple[float, ...] = column("m", "its centre of gravity from the flange")
-    tcp_offset: tuple[float, ...] = column("m, rad", "tool centre point that is set, from the flange")
+    tcp_offset: tuple[float, ...] = column("m, rad", "tool centre point at the pendant, from the flange")
     protective_stop: bool = column("", "whether it is in a protective stop")
     emergency_stop: bool = column("", "whether an emergency stop is pressed")
     blocked: str = column("", "why motion is refused at present; empty when it is allowed")
-    age_s: float = column("s", "since the controller made the sample, by its own clock against ours")
+    age_s: float = column("s", "age of the sample, by the controller's clock against ours")
 
 
 @message("gripper.state", rate_hz=10.0)
@@ -190,7 +192,7 @@ class GripperStateMessage(Message):
     """The state of the gripper; its width when it stops on an object is a diameter measurement."""
 
     width_mm: float = column("mm", "distance between the fingertips")
-    diameter_mm: float | None = column("mm", "the same while an object is held, else nil")
+    diameter_mm: float | None = column("mm", "the same distance while an object is held, else nil")
     diameter_std_mm: float | None = column("mm", "its standard deviation")
     tool_diameter_mm: float | None = column("mm", "diameter from gripper and fingertips, weighted by their variances")
     tool_diameter_std_mm: float | None = column("mm", "its standard deviation")
@@ -210,7 +212,7 @@ class LoopState(Message):
     step: int = column("", "number of the step, from 1")
     steps: int = column("", "number of steps")
     step_name: str = column("", "kind of the step, as the experiment names it")
-    hold: int = column("", "number of the angle or torque of the step that is held now, from 1; 0 while none is")
+    hold: int = column("", "number of the step's angle or torque that is held at present, from 1; 0 without one")
     slices: str = column(
         "", "kind of slice that `recording export` makes of a held angle: torque, diameter, or nothing"
     )
@@ -222,8 +224,8 @@ class LoopState(Message):
     torque_nm: float | None = column("N·m", "its latest valid value")
     torque_limit_nm: float | None = column("N·m", "the experiment stops beyond plus or minus this torque")
     set_point_nm: float | None = column("N·m", "the setpoint at the end of the ramp")
-    ramp_nm: float | None = column("N·m", "the setpoint now")
-    filtered_torque_nm: float | None = column("N·m", "the torque now, from measurements, wrist angle and stiffness")
+    ramp_nm: float | None = column("N·m", "the present setpoint")
+    filtered_torque_nm: float | None = column("N·m", "the present torque, from measurements, wrist angle and stiffness")
     filtered_torque_std_nm: float | None = column("N·m", "its standard deviation by noise and the stiffness's error")
     stiffness_nm_per_rad: float | None = column("N·m/rad", "the tool's identified stiffness")
     delay_s: float | None = column("s", "identified delay of the torque")
@@ -232,8 +234,8 @@ class LoopState(Message):
     speed_sent_rad_per_s: float = column("rad/s", "the wrist speed that was sent, after clipping")
     response: str = column("", "the safety response")
     stop: int = column("", "number of the stop that waits for `unlock`, larger after each further cause; 0 without one")
-    cause: str = column("", "the first of the reasons, which may have caused the others; empty without one")
-    faults: str = column("", "their codes, separated by commas, the cause's first; see faults.md")
+    cause: str = column("", "the first reason, which may have caused the others; empty without a reason")
+    faults: str = column("", "codes of the reasons, separated by commas, the cause's first; see faults.md")
     reasons: str = column("", "every reason for holding or stopping, in sentences")
 
 
@@ -246,18 +248,20 @@ class LoopStop(Message):
     cause: str = column("", "why it stopped, in sentences")
     faults: str = column("", "codes of the faults that stopped it, separated by commas, the cause's first")
     response: str = column("", "the safety response")
-    decided_after_s: float = column("s", "from the measurement or request that caused it to the decision")
-    sent_after_s: float | None = column("s", "until the robot's worker had sent the stop; nil if it did not answer")
-    stands_after_s: float | None = column("s", "until the robot measured a standstill; nil if it did not within 5 s")
+    decided_after_s: float = column("s", "time from the cause, a measurement or a request, to the decision")
+    sent_after_s: float | None = column(
+        "s", "time until the robot's worker had sent the stop; nil if it did not answer"
+    )
+    stands_after_s: float | None = column("s", "time until the robot measured a standstill; nil without one within 5 s")
     refusal: str = column("", "why the robot's worker did not send the stop, in sentences; empty when it did")
     blocked_after_s: float | None = column(
-        "s", "until the robot's state showed that it takes no command; nil unless the stop was refused"
+        "s", "time until the robot's state showed that it accepts no command; nil unless the stop was refused"
     )
 
 
 @message("daemon.command", rate_hz=None)
 class DaemonCommand(Message):
-    """A command that the daemon was sent, other than `status`, and its answer."""
+    """A command to the daemon, except `status`, and its answer."""
 
     command: str = column("", "name of the command")
     subject: str = column("", "file of the experiment, or the sensor; empty without one")
@@ -277,13 +281,13 @@ class Health(Message):
     process: int = column("", "number of the daemon's process; `status` has it too")
     rig: str = column("", "name of the rig: the configuration's `name`, else the name of its file")
     emulated: bool = column("", "whether every device is emulated, by `emulated: true` in the configuration")
-    cap: str = column("", "cap on a robot's speeds and torque, and why; empty where none holds")
-    tare_refusal: str = column("", "why `tare` is refused now, in a sentence; empty when it is not")
+    cap: str = column("", "cap on a robot's speeds and torque, and its reason; empty without a cap")
+    tare_refusal: str = column("", "why `tare` is refused at present, in a sentence; empty if it is not")
     start_refusal: str = column("", "why `start` is refused at present for every experiment; empty if it is not")
-    release_refusal: str = column("", "why `release` is refused now; empty when it is not")
-    loop_lag_s: float = column("s", "how late the event loop woke this message's task")
+    release_refusal: str = column("", "why `release` is refused at present; empty if it is not")
+    loop_lag_s: float = column("s", "the delay with which the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")
-    cpu_percent: float = column("%", "of one core since the previous message")
+    cpu_percent: float = column("%", "processor time since the previous message, in percent of one core")
 
 
 @message("daemon.end", rate_hz=None)

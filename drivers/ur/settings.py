@@ -136,7 +136,7 @@ class WristAccelerationBound(Bound):
     inner: ranges.WristAcceleration
     """Commands are clipped to it."""
     hard: ranges.WristAcceleration
-    """A larger measured value stops the motion; a stop brakes up to it, and no gentler than `inner`."""
+    """A larger measured value stops the motion; a stop brakes between `inner` and this value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +164,7 @@ class ForceBound(Bound):
     """Limits on the force on the tool."""
 
     inner: ranges.ToolForce
-    """From it on the wrist turns slower, and a straight move stops."""
+    """From this value on the wrist turns slower, and a straight move stops."""
     hard: ranges.ToolForce
     """A larger measured value stops the motion. The script on a CB3 does not subtract a tare."""
 
@@ -174,7 +174,7 @@ class TorqueBound(Bound):
     """Limits on the torque on the tool."""
 
     inner: ranges.ToolTorque
-    """From it on the wrist turns slower, and a straight move stops."""
+    """From this value on the wrist turns slower, and a straight move stops."""
     hard: ranges.ToolTorque
     """A larger measured value stops the motion. The script on a CB3 does not subtract a tare."""
 
@@ -271,7 +271,7 @@ class InstalledTool(_Checked):
     tcp_offset: ranges.ToolOffset | None = None
     """Tool centre point from the flange: position in m, rotation vector in rad."""
     reported: bool = True
-    """`false` for a controller below PolyScope 3.12 or 5.5.1, which reports none of them: nothing is compared."""
+    """`false` for a controller below PolyScope 3.12 or 5.5.1, which reports none of these values: none is compared."""
 
     def __post_init__(self) -> None:
         """Refuse values that no controller reports."""
@@ -299,7 +299,7 @@ class UrSettings(_Checked):
     generation: Generation = "e-series"
     """The controller's generation."""
     tool: InstalledTool = InstalledTool()
-    """What the pendant must have for motion."""
+    """Payload and tool centre point that the pendant must have for motion."""
     rate_hz: Annotated[float, Field(ge=_SLOWEST_HZ, le=500)] = 125.0
     """Robot states per second; up to 125 from a CB3."""
     command_timeout_s: _Deadline = 0.1
@@ -307,12 +307,12 @@ class UrSettings(_Checked):
     silence_timeout_s: _Deadline = 0.1
     """Other motion stops when the daemon sends nothing for this long."""
     state_timeout_s: Annotated[float, Field(ge=_SHORTEST_DEADLINE_S, le=10)] = 0.25
-    """An older state blocks motion; at three times this age the connection counts as lost. Above 1 s for an emulated
-    robot on this computer alone."""
+    """An older state blocks motion; at three times this age the connection counts as lost. More than 1 s
+    only for an emulated robot on this computer."""
     connect_timeout_s: Annotated[float, Field(ge=_SHORTEST_CONNECT_S, le=60)] = 10.0
     """Time for connecting."""
     hang_timeout_s: Annotated[float, Field(ge=_SHORTEST_HANG_S, le=10)] = 1.5
-    """A longer cycle is a hang, and the worker is ended: calls of ur-rtde block for up to 301 s."""
+    """A longer cycle is a hang and ends the worker, because calls of ur-rtde block for up to 301 s."""
     recover_timeout_s: Annotated[float, Field(ge=_SHORTEST_RECOVERY_S, le=300)] = 30.0
     """Time for one attempt to make the robot ready."""
     reaction_s: Annotated[float, Field(ge=_SHORTEST_REACTION_S, le=0.5)] = 0.04

@@ -127,7 +127,7 @@ async def test_a_robot_with_a_new_address_keeps_stop_crash_and_grip(names, has_o
 def test_a_new_address_with_nothing_to_remember_waits_for_the_operator(names):
     write_memories(RobotFiles.of("ur.lab"), Remembered())
     names["ur.lab"] = ["192.168.1.20"]
-    assert "see that this is the same robot" in read_memories(RobotFiles.of("ur.lab")).stop[0][1]
+    assert "make sure that this is the same robot" in read_memories(RobotFiles.of("ur.lab")).stop[0][1]
 
 
 def test_a_name_with_a_further_address_is_the_same_robot(names):
@@ -170,7 +170,7 @@ def test_a_stop_under_a_name_that_is_not_found_for_now_is_acknowledged_by_number
 async def test_a_name_that_was_never_found_waits_for_the_operator_until_it_was(names):
     names.clear()
     memory = RigMemory(RobotFiles.of("ur.lab"), loop := new_loop())
-    assert "the name 'ur.lab' has none at present" in loop.safety.stop_faults[0].sentence
+    assert "the name 'ur.lab' has no address at present" in loop.safety.stop_faults[0].sentence
     with lock_robot(memory.files), pytest.raises(UserError, match="driven by another program"):
         lock_robot(RobotFiles.of("UR.lab")).__enter__()
     loop.acknowledge()

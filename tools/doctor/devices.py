@@ -125,7 +125,7 @@ def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
     if seen.robot_mode == "RUNNING" and seen.safety_mode in ("NORMAL", "REDUCED"):
         yield good("robot's mode", mode)
     else:
-        cure = "make the cell safe, start the daemon, then `shearloop command unlock`"
+        cure = "make the cell safe, start the daemon, then send `shearloop command unlock`"
         yield note("robot's mode", mode, "the arm does not move in this mode", cure)
     if seen.registers is not None:
         halves = "free" if seen.registers is UPPER else "those from 24 on are in use, and the lower ones free"

@@ -48,10 +48,11 @@ demo: demo-python $(VENV)/.installed
 	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--play '$(RECORDING)') || case $$? in 4|130|143) ;; *) exit 1 ;; esac
 
 # Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot in real time run by
-# themselves, because a robot stops when its computer is busy. Status 5: no test was selected.
+# themselves, because a robot stops when its computer is busy. They mostly wait, so that more of them fit on two cores.
+# Status 5: no test was selected.
 PYTEST := $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 test: install-dev
-	$(PYTEST) -m real_time $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -n 4 -m real_time $(PYTEST_ARGS) || [ $$? -eq 5 ]
 	$(PYTEST) -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.

@@ -26,7 +26,12 @@ for _name in ("tests", "benchmarks"):
         sys.modules[_name] = _package
 
 # The fixtures that several rooms share.
-pytest_plugins = ["tests.fixtures.physics", "tests.fixtures.daemons", "tests.fixtures.recordings"]
+pytest_plugins = [
+    "tests.fixtures.physics",
+    "tests.fixtures.daemons",
+    "tests.fixtures.recordings",
+    "tests.fixtures.rigs",
+]
 
 # Before numpy is imported, as the command line and the Makefile do: threads that wait for a busy machine's other
 # processor make a calibration twenty times as slow.
@@ -46,10 +51,11 @@ LONGEST = (
     "test_skin_loop_chart.py", "test_under_systemd.py", "test_server.py", "test_finite_strain.py",
     "test_dead_channels.py", "test_skin_run.py", "test_replay.py", "test_skin.py", "test_flood.py", "test_emulate.py",
     "test_cylinders.py", "test_session.py", "test_cli.py", "test_cli_reproduce.py", "test_recorder.py",
-    "test_settings.py", "test_every_way_out.py", "test_fuzz.py", "test_rehearsal.py", "test_skin_replay.py",
+    "test_settings.py", "test_every_way_out.py", "test_fuzz.py", "test_skin_replay.py",
     "test_package.py", "test_device_paths.py", "test_bank_design.py",
-    "test_closed_loop.py", "test_own_calibration.py", "test_client.py", "test_adapt_in_loop.py", "test_replay_rig.py",
-    "test_soak.py", "test_stop_times.py",
+    "test_own_calibration.py", "test_restarts.py", "test_client.py", "test_soak.py", "test_replay_rig.py",
+    "test_stops_and_unlocking.py", "test_twist_and_hold.py", "test_adapt_in_loop.py", "test_rehearsal.py",
+    "test_doctor.py", "test_stop_times.py", "test_ends.py", "test_recorded_rig.py",
 )  # fmt: skip
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

@@ -10,10 +10,9 @@ import yaml
 
 from shearloop.studies.emulated_calibration import calibrate, record
 from tests.cli.emulate_rig.rig import write_rig_bank
-from tests.daemon.test_closed_loop import SPEED, Watcher, experiment, rig_config, running_rig, started
+from tests.fixtures.rigs import SPEED, Watcher, experiment, running_rig, started
 from tests.tools.recordings.test_replay import replayed
 
-__all__ = ["rig_config"]
 pytestmark = pytest.mark.real_time
 
 
@@ -50,7 +49,7 @@ async def test_adapt_corrects_a_wrong_gain_until_the_next_grip_and_is_replayed(r
     adapt = {"do": "adapt", "fingertip": "right"}
     steps = [twist, twist, adapt, twist, adapt | {"reference": "wrench"}, {"do": "release"}, grip, twist]
     async with running_rig(rig_config, bank, speed) as (_, watcher, _fault, command):
-        await started(command, experiment(tmp_path, *steps))
+        await started(watcher, command, experiment(tmp_path, *steps))
         state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
     assert state["phase"] == "done", state["activity"]
     adapted, again = watcher.seen["eit.adapted"]

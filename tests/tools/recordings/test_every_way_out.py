@@ -18,9 +18,9 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.cli.terminal import message_json, message_line
 from shearloop.daemon.messaging.messages import TOPICS, decode, encode
 from shearloop.daemon.web.message_store import MessageStore
-from tests.daemon.test_closed_loop import experiment, rig_config, running_rig, started
 from tests.emulator_process import own_address
 from tests.fixtures.daemons import free_port, robot_at, running_daemon
+from tests.fixtures.rigs import experiment, running_rig, started
 from tests.tools.recordings import test_skin_replay
 from tests.tools.recordings.every_message import (
     EIT,
@@ -36,7 +36,6 @@ from tests.tools.recordings.every_message import (
 from tests.tools.recordings.test_replay import replayed
 from tests.tools.recordings.watching import Watched, check_message, no_json, page_content, same, watching
 
-__all__ = ["rig_config"]
 pytestmark = pytest.mark.usefixtures("rerun_runtime")
 MONOTONIC = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
 SCALARS = ("number", "integer", "boolean")
@@ -356,7 +355,7 @@ async def twisted(config: Path, bank: Path, path: Path) -> tuple[Published, Watc
     """Return what the daemon of an emulated rig publishes during an experiment, and what is heard of it."""
     async with watching(config.parent) as watched:
         async with running_rig(config, bank) as (_, watcher, _fault, command):
-            await started(command, str(path))
+            await started(watcher, command, str(path))
             state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
             assert state["phase"] == "done", state["activity"]
         await watched.until_ended()

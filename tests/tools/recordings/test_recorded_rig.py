@@ -8,9 +8,8 @@ import yaml
 
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.tools.recordings.summary import summarise
-from tests.daemon.test_closed_loop import experiment, rig_config, running_rig, started
+from tests.fixtures.rigs import experiment, running_rig, started
 
-__all__ = ["rig_config"]
 pytestmark = pytest.mark.real_time
 TWIST = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.01, "hold_s": 60.0}
 
@@ -47,7 +46,7 @@ def check_recordings(disk: Path, torques: int) -> None:
 async def test_a_full_disk_refuses_only_the_next_experiment(recorded_rig, tiny_bank, tmp_path, small_disk):
     async with running_rig(recorded_rig, tiny_bank) as (_, watcher, _fault, command):
         path = experiment(tmp_path, TWIST)
-        await started(command, path)
+        await started(watcher, command, path)
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
         filler = fill(small_disk)
         health = await watcher.until("health", lambda health: bool(health["tasks"]["recording"]["error"]))

@@ -1,0 +1,96 @@
+"""Stops by the robot, the gripper and the pendant over real ports, and what an operator's unlocking does."""
+
+import pytest
+
+from shearloop.daemon.control.safety import FaultCode
+from tests.fixtures.rigs import SLOW_TWIST, experiment, pendant, running_rig, started
+
+pytestmark = pytest.mark.real_time
+
+
+async def test_a_protective_stop_ends_the_experiment_and_the_operator_unlocks_it(rig_config, tiny_bank, tmp_path):
+    async with running_rig(rig_config, tiny_bank) as (daemon, watcher, fault, command):
+        path = experiment(tmp_path, SLOW_TWIST)
+        await started(watcher, command, path)
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.01)
+        fault("protective-stop")
+        state = await watcher.until("loop.state", lambda state: state["phase"] == "stopped")
+        assert FaultCode.PROTECTIVE_STOP.text in state["faults"]
+        refused = await command("start", experiment=path)
+        assert not refused["ok"]
+        reply = await command("unlock")
+        while not reply["ok"]:
+            reply = await command("unlock")
+        await started(watcher, command, path)
+        assert (await command("pause"))["ok"]
+        assert (await command("resume"))["ok"]
+        turning = watcher.seen["robot.state"][-1]["seq"]
+        await watcher.until(
+            "robot.state", lambda state: state["seq"] > turning and state["wrist_speed_rad_per_s"] > 0.01
+        )
+        # As the page's stop: a second one leaves the daemon running.
+        assert (await command("stop", spare_daemon=True))["stopped"] == "test"
+        last = watcher.seen["robot.state"][-1]["seq"]
+        still = await watcher.until(
+            "robot.state", lambda state: state["seq"] > last and abs(state["wrist_speed_rad_per_s"]) < 1e-3
+        )
+        later = await watcher.until("robot.state", lambda state: state["seq"] > still["seq"] + 10)
+        assert later["wrist_rad"] == pytest.approx(still["wrist_rad"], abs=1e-3)
+        assert (await command("stop", spare_daemon=True))["stopped"] == ""
+        await watcher.until("robot.state", lambda state: state["seq"] > later["seq"])
+        assert not daemon.supervisor.records["loop"].restarts
+
+
+async def test_an_unlock_after_a_fault_of_the_gripper_asks_before_it_drops_the_tool(rig_config, tiny_bank, tmp_path):
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, fault, command):
+        await started(watcher, command, experiment(tmp_path, SLOW_TWIST))
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
+        fault("gripper fault 14")
+        await watcher.until("loop.state", lambda state: FaultCode.GRIPPER_FAULT.text in state["faults"])
+        held_mm = watcher.seen["gripper.state"][-1]["width_mm"]
+        refused = await command("unlock")
+        assert "which opens its fingers, and a tool in it drops; its fingers hold something" in refused["reason"]
+        assert "with at most 60 N" in refused["question"]
+        seen = len(watcher.seen["gripper.state"])
+        await watcher.until("gripper.state", lambda _: len(watcher.seen["gripper.state"]) > seen + 5)
+        assert watcher.seen["gripper.state"][-1]["width_mm"] == held_mm
+        reply = await command("unlock", confirmed=True, digest=refused["digest"])
+        while not reply["ok"]:
+            reply = await command("unlock", confirmed=True)
+        assert watcher.seen["gripper.state"][-1]["width_mm"] > held_mm + 50
+
+
+async def test_a_pendant_that_commands_the_gripper_stops_the_twist_and_its_grips_are_seen(
+    rig_config, tiny_bank, tmp_path
+):
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
+        await started(watcher, command, experiment(tmp_path, SLOW_TWIST))
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
+        await pendant("SET POS 250")
+        state = await watcher.until("loop.state", lambda state: state["phase"] == "stopped")
+        assert state["cause"].startswith(FaultCode.GRIPPER_COMMANDED.value.kind)
+        assert "nothing between them" not in state["reasons"]
+        await watcher.until("loop.state", lambda state: FaultCode.TOOL_GRIPPED.text in state["faults"])
+        stop = await watcher.until("loop.stop", lambda _: True)
+        # A frame during the motion has no estimate.
+        assert stop["faults"].split(", ")[0] == FaultCode.GRIPPER_COMMANDED.text
+        reply = await command("release", ask=True)
+        while not reply["ok"]:
+            reply = await command("release", ask=True)
+        question = reply["question"]
+        assert "its fingers hold something 19." in question or "its fingers hold something 20." in question
+        assert "with an unknown force" in question
+        assert (await command("unlock"))["ok"]
+        for position, status in ((0, "at target"), (240, "contact closing")):
+            last = watcher.seen["gripper.state"][-1]["seq"]
+            await pendant(f"SET POS {position}")
+            # The state after the request may be from before it.
+            moving = await watcher.until(
+                "gripper.state", lambda state, last=last: state["seq"] > last and state["object"] == "moving"
+            )
+            stands = await watcher.until(
+                "gripper.state", lambda state, last=moving["seq"]: state["seq"] > last and state["object"] != "moving"
+            )
+            assert stands["object"] == status
+        assert stands["diameter_mm"] == pytest.approx(20.0, abs=1.0)
+        assert "its fingers hold something" in (await command("tare", confirmed=True))["reason"]

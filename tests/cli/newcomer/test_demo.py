@@ -15,7 +15,7 @@ pytestmark = pytest.mark.timeout(240)
 FIGURES = re.compile(r"run/(\S+): root mean square errors (\S+) N·m .*; (\d+)% of .*, (\d+)% of torques lie")
 
 
-def test_the_demo_prepares_all_that_its_configuration_names(tree):
+def test_the_demo_prepares_all_that_its_configuration_names(tree, ran, monkeypatch):
     printed = tree.shell(f"{PROGRAM} demo --folder . --prepare").stdout
     figures = {name: list(map(float, values)) for name, *values in FIGURES.findall(printed)}
     assert set(figures) == {"rig.cal", "rig-right.cal", "rig-left.cal"}
@@ -24,8 +24,9 @@ def test_the_demo_prepares_all_that_its_configuration_names(tree):
         assert valid > 70
         assert covered > 85
     assert figures["rig.cal"][0] < 0.01
-    assert "config/demo.yaml is in order" in tree.shell(f"{PROGRAM} check config/demo.yaml").stdout
-    assert not tree.shell(f"{PROGRAM} demo --folder . --prepare").stdout, "what is there is kept"
+    monkeypatch.chdir(tree.root)
+    assert "config/demo.yaml is in order" in ran("check", "config/demo.yaml").out
+    assert not ran("demo", "--folder", ".", "--prepare").out, "what is there is kept"
 
 
 async def seen_on_the_page(address: str, topics: set[str]) -> dict[str, Any]:

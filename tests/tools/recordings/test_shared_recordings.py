@@ -66,6 +66,13 @@ def twists(twists_file) -> FrameSeries:
 
 
 @pytest.fixture(scope="module")
+def stream(shared, tmp_path_factory) -> Callable[[str], FrameSeries]:
+    """Return another day's stream by its name; each is imported once."""
+    out = tmp_path_factory.mktemp("streams")
+    return cache(lambda name: imported(out / f"{name}.mcap", shared / "recordings/streams" / name))
+
+
+@pytest.fixture(scope="module")
 def slices(shared) -> SliceSeries:
     """The forty-nine torque slices."""
     (series,) = read_slices(shared / "recordings/torque_slices")
@@ -345,27 +352,25 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
 
 
 @pytest.mark.parametrize("name", ["20241202_171704", "glitch_20241202_173837"])
-def test_nothing_is_said_of_the_times_of_a_recording_that_does_not_show_them(shared, tmp_path, name):
-    found = find_load_delay(imported(tmp_path / "other.mcap", shared / "recordings/streams" / name))
+def test_nothing_is_said_of_the_times_of_a_recording_that_does_not_show_them(stream, name):
+    found = find_load_delay(stream(name))
     assert found is None or found.few_frames
 
 
-def test_a_load_that_one_loop_stamped_early_is_put_right(shared, tmp_path):
-    series = imported(tmp_path / "other.mcap", shared / "recordings/streams/20241202_153632")
+def test_a_load_that_one_loop_stamped_early_is_put_right(stream):
+    series = stream("20241202_153632")
     assert load_delay_warning(series) == ""
     early = replace(series, torque_t_s=series.torque_t_s - 2.36)
     warning = r"the frames move 2\.\d+ ± 0\.\d+ s after the load .*though 5\d gripped frames are too few to be sure"
     assert re.match(warning, load_delay_warning(early))
     assert re.match(warning, measure_timing([early]).warnings[0])
     # One twist of an afternoon, judged on one of an hour and a half later: r, and intervals that say something.
-    other = imported(tmp_path / "third.mcap", shared / "recordings/streams/20241202_171704")
+    other = stream("20241202_171704")
     calibration = fit("motion_regression", [series], "one twist")
     clocks_s = np.linspace(-0.2, 0.2, 5)
-    found = [
-        figures_by_load([estimate_series(calibration, replace(other, torque_t_s=other.torque_t_s + shift))])["loaded"]
-        | {"r": figures_of([estimate_series(calibration, replace(other, torque_t_s=other.torque_t_s + shift))])["r"]}
-        for shift in clocks_s.tolist()
-    ]
+    shifted = [replace(other, torque_t_s=other.torque_t_s + shift) for shift in clocks_s.tolist()]
+    tracks = [[estimate_series(calibration, one)] for one in shifted]
+    found = [figures_by_load(one)["loaded"] | {"r": figures_of(one)["r"]} for one in tracks]
     assert np.mean([one["r"] for one in found]) >= 0.95
     assert min(one["coverage_95"] for one in found) >= 0.9
     assert max(one["winkler_nm"] for one in found) <= 0.045
@@ -374,11 +379,8 @@ def test_a_load_that_one_loop_stamped_early_is_put_right(shared, tmp_path):
 
 
 @pytest.mark.parametrize("moved_s", [-0.34, 0.3])
-def test_a_delay_that_stays_unsure_widens_the_intervals(shared, tmp_path, moved_s):
-    one, other = (
-        imported(tmp_path / f"{name}.mcap", shared / "recordings/streams" / name)
-        for name in ("20241202_153632", "20241202_171704")
-    )
+def test_a_delay_that_stays_unsure_widens_the_intervals(stream, moved_s):
+    one, other = stream("20241202_153632"), stream("20241202_171704")
     moved = replace(one, torque_t_s=one.torque_t_s + moved_s)
     timing = measure_timing([moved])
     assert timing.uncertainty_s > abs(moved_s)

@@ -167,7 +167,10 @@ class RobotStateMessage(Message):
     joints_rad: tuple[float, ...] = column("rad", "the six joint angles, base to wrist 3")
     tcp_pose: tuple[float, ...] = column("m, rad", "position and rotation vector of the tool centre in the base frame")
     tcp_speed_m_per_s: float = column("m/s", "speed of the tool centre")
-    wrench: tuple[float, ...] = column("N, N·m", "force and torque at the tool centre")
+    wrench: tuple[float, ...] = column(
+        "N, N·m",
+        "force and torque at the tool centre, relative to its last zero; without a tare it may be off by any load",
+    )
     wrist_rad: float = column("rad", "angle of wrist 3, about which the tool twists")
     wrist_speed_rad_per_s: float = column("rad/s", "its speed")
     wrist_torque_nm: float = column(

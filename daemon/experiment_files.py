@@ -30,6 +30,7 @@ from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.errors import UserError
 from shearloop.files import read_file
 from shearloop.mistakes import shown
+from shearloop.timeouts import timeout
 from shearloop.words import counted
 from shearloop.yaml_files import Document
 
@@ -290,7 +291,7 @@ class ExperimentFiles:
 async def _in_time(what: str) -> AsyncIterator[None]:
     """Raise UserError in time for who waits for a thread."""
     try:
-        async with asyncio.timeout(READ_WITHIN_S):
+        async with timeout(READ_WITHIN_S):
             yield
     except TimeoutError as error:
         cure = "try again on a less busy computer; from a network drive, copy it to a local one"

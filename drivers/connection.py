@@ -19,6 +19,7 @@ import serial
 from serial.tools import list_ports
 
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError, DriverError
+from shearloop.timeouts import timeout
 
 DEFAULT_BAUD = 115_200
 # The kernel keeps 4 kB for a pseudo-terminal and up to 64 kB for a USB port.
@@ -151,7 +152,7 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
     async def write(self, data: bytes) -> None:
         """Write all of `data`; DeviceLostError if the port is gone or accepts nothing for a second."""
         try:
-            async with asyncio.timeout(WRITE_TIMEOUT_S):
+            async with timeout(WRITE_TIMEOUT_S):
                 while data:
                     try:
                         data = data[os.write(self._descriptor, data) :]
@@ -188,7 +189,7 @@ class TcpPort:
     @classmethod
     async def connect(cls, host: str, port: int) -> Self:
         """Return a new connection; OSError, also for a timeout, where nothing answers."""
-        async with asyncio.timeout(CONNECT_TIMEOUT_S):
+        async with timeout(CONNECT_TIMEOUT_S):
             reader, writer = await asyncio.open_connection(host, port)
         return cls(f"{host}:{port}", reader, writer)
 
@@ -197,7 +198,7 @@ class TcpPort:
         for left_s in (timeout_s, 0.0):
             # Twice: when this process was paused, bytes may have arrived together with the deadline.
             try:
-                async with asyncio.timeout(left_s):
+                async with timeout(left_s):
                     data = await self._reader.read(READ_BYTES)
                     break
             except TimeoutError:
@@ -213,7 +214,7 @@ class TcpPort:
     async def write(self, data: bytes) -> None:
         """Write all of `data`; DeviceLostError if the other side is gone or accepts nothing for a second."""
         try:
-            async with asyncio.timeout(WRITE_TIMEOUT_S):
+            async with timeout(WRITE_TIMEOUT_S):
                 self._writer.write(data)
                 await self._writer.drain()
         except TimeoutError as error:

@@ -15,6 +15,7 @@ from shearloop.emulators.ports import Connections, accepting
 from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, Robot, RobotEvent
 from shearloop.emulators.ur_rtde import RtdeSession
 from shearloop.emulators.urscript import translate
+from shearloop.timeouts import timeout
 
 # A control script closes its outermost block in the first column.
 SCRIPT_END = b"\nend\n"
@@ -213,7 +214,7 @@ class Controller:
                 await asyncio.sleep(1.0 / _STATES_HZ[major])
                 continue
             try:
-                async with asyncio.timeout(1.0 / _STATES_HZ[major]):
+                async with timeout(1.0 / _STATES_HZ[major]):
                     data = await reader.read(65536)
             except TimeoutError:
                 continue

@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing import active_children, get_context
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from shearloop.errors import UserError, missing
 
@@ -54,9 +54,11 @@ class ProcessExecutor:
         """Yield the results; end the processes at once if they are no longer wanted."""
         others, wanted = active_children(), True
         count = min(self.count, max(len(items), 1))
-        pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_ignore_terminal)
+        # Each process gets the shared value once, as it starts, and not with each item. Before Python 3.11.5 a pool
+        # hangs that ends while it sends an item that is larger than a pipe.
+        pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_begin, initargs=(shared,))
         try:
-            yield from pool.map(partial(function, shared), items)
+            yield from pool.map(partial(_with_shared, function), items)
             wanted = False
         except BrokenProcessPool as error:
             raise UserError("a process was killed, perhaps for lack of memory; run again with fewer --jobs") from error
@@ -68,10 +70,20 @@ class ProcessExecutor:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _ignore_terminal() -> None:
-    """Leave Ctrl-C and a closed terminal to the parent process."""
+# What all tasks of this process share.
+_shared: list[Any] = []
+
+
+def _begin(shared: object) -> None:
+    """Keep what all tasks of this process share, and leave Ctrl-C and a closed terminal to the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    _shared.append(shared)
+
+
+def _with_shared(function: Callable[[Any, T], R], item: T) -> R:
+    """Return function(shared, item)."""
+    return function(_shared[0], item)
 
 
 class DaskExecutor:

@@ -29,13 +29,15 @@ def run(args: argparse.Namespace) -> int:
     """
     try:
         asyncio.run(args.play(args))
-    except* OSError as errors:
+    except (OSError, BaseExceptionGroup) as errors:
         error: BaseException = errors
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]
-        where, reason = getattr(error, "filename", None), getattr(error, "strerror", None) or error
+        if not isinstance(error, OSError):
+            raise
+        where = f"{error.filename}: " if error.filename else ""
         cure = "choose another address, port or path, or end what uses it"
-        raise UserError(f"{args.device} cannot be played: {f'{where}: ' if where else ''}{reason}; {cure}") from None
+        raise UserError(f"{args.device} cannot be played: {where}{error.strerror or error}; {cure}") from None
     return 0
 
 

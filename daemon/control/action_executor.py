@@ -29,6 +29,7 @@ from shearloop.drivers.ur.messages import (
 )
 from shearloop.drivers.ur.settings import Six
 from shearloop.errors import ActionError, NotBegunError
+from shearloop.timeouts import timeout
 
 # A release is tried for 5 s and takes up to 2 s; systemd kills a service 10 s after it asked for the end.
 RELEASED_WITHIN_S = 7.0
@@ -229,7 +230,7 @@ class ActionExecutor:
         """
         sender = self.sender
         try:
-            async with asyncio.timeout(COMES_TO_REST_S):
+            async with timeout(COMES_TO_REST_S):
                 state = await self.robot.next_state()
                 while sender.sent_rad_per_s or sender.unanswered or state.motion != "idle" or not state.rests:
                     state = await self.robot.next_state()

@@ -1,6 +1,5 @@
 """The task that runs the control loop: it takes robot states, sends commands and publishes, 125 times a second."""
 
-import asyncio
 from collections.abc import Mapping
 from contextlib import suppress
 
@@ -26,6 +25,7 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState
 from shearloop.errors import ActionError
+from shearloop.timeouts import timeout
 
 # Without a new state the loop decides after this time, half of the time after which the arm's state is stale.
 LONGEST_SILENCE_S = 0.5 * ARM_STALE_S
@@ -80,7 +80,7 @@ class ControlLoopRunner:
                 # Without a state the loop decides all the same.
                 with suppress(TimeoutError):
                     longest_s = LONGEST_REST_S if self._stopped else LONGEST_TICK_S
-                    async with asyncio.timeout(max(longest_s, LONGEST_SILENCE_S)):
+                    async with timeout(max(longest_s, LONGEST_SILENCE_S)):
                         await self._robot.next_state()
                     # After a pause of this process several states arrive at once; only the newest one counts.
                     if self._robot.state is not None:
@@ -203,7 +203,7 @@ class ControlLoopRunner:
         if not reply.accepted:
             return reply.refusal
         with suppress(TimeoutError):
-            async with asyncio.timeout(ENABLED_WITHIN_S):
+            async with timeout(ENABLED_WITHIN_S):
                 while (state := await self._robot.next_state()).blocked:
                     pass
                 self._take_state(state)
@@ -227,7 +227,7 @@ class ControlLoopRunner:
             self.actions.cancel()
         await self.actions.wait_for_final_action()
         with suppress(TimeoutError):
-            async with asyncio.timeout(BRAKE_S):
+            async with timeout(BRAKE_S):
                 while self._running and self._timeline.pending:
                     await self.states.changed.wait()
 
@@ -357,7 +357,7 @@ class ControlLoopRunner:
         """Stop the arm, including a straight move."""
         self._stopped = False
         try:
-            async with asyncio.timeout(BRAKE_S):
+            async with timeout(BRAKE_S):
                 await self._robot.send(self._sender.stop_command)
         except Exception:  # noqa: BLE001 - the loop's own error is raised
             structlog.get_logger().exception("the arm could not be stopped")

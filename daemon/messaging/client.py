@@ -13,6 +13,7 @@ from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
 from shearloop.daemon.messaging.stop_client import foreign_reply
 from shearloop.errors import UserError
+from shearloop.timeouts import timeout
 
 TopicContent: TypeAlias = tuple[str, dict[str, Any]]
 # A running daemon sends `health` every second.
@@ -135,7 +136,7 @@ async def ask(
         connect(socket, address, keys)
         sent = False
         try:
-            async with asyncio.timeout(timeout_s):
+            async with timeout(timeout_s):
                 await socket.send(encode(content))
                 sent = True
                 return decode(await socket.recv())

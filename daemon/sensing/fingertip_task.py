@@ -25,6 +25,7 @@ from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.errors import ActionError
 from shearloop.estimation import Estimate, Measured, Session, TactileFrame, torque_at
+from shearloop.timeouts import timeout
 from shearloop.words import counted
 
 # A correction of the gain begins with a frame.
@@ -237,7 +238,7 @@ class FingertipTask:
         """Take a new idle frame and wait until it is complete; return None, or why it is not."""
         self._tare.begin(self.clock.now_ns(), within_s)
         try:
-            async with asyncio.timeout(within_s):
+            async with timeout(within_s):
                 await self._tare.done.wait()
         except TimeoutError:
             what = f"the idle frame of {self.name} could not be taken within {within_s:.3g} s"
@@ -252,7 +253,7 @@ class FingertipTask:
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._adapting = reference, ended
         try:
-            async with asyncio.timeout(_LONGEST_WAIT_S):
+            async with timeout(_LONGEST_WAIT_S):
                 await ended
         except TimeoutError:
             raise ActionError(f"{self.name} sent no frame within {_LONGEST_WAIT_S:g} s; check its board") from None

@@ -12,6 +12,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.torques import CONFIRM_TARE, LOAD_CELL, LOADED_NM, SensorListener, TorqueSample, loaded_sentence
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
+from shearloop.timeouts import timeout
 
 # Two seconds at 10.9 Hz.
 ZERO_SAMPLES = 22
@@ -90,7 +91,7 @@ class LoadCellTask:
         self.tare()
         own, within_s = self._zeroing, min(self._timeout_s, within_s)
         try:
-            async with asyncio.timeout(within_s):
+            async with timeout(within_s):
                 # A later tare is awaited too.
                 while self._zeroing is not None:
                     await self._sampled.wait()

@@ -37,6 +37,7 @@ from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, S
 from shearloop.errors import UserError
 from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
 from shearloop.estimation.skin.membrane import joule_heating_k
+from shearloop.timeouts import timeout
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.
@@ -133,7 +134,7 @@ class SkinTask:
         self.tare()
         within_s = min(self._zero_timeout_s, within_s)
         try:
-            async with asyncio.timeout(within_s):
+            async with timeout(within_s):
                 while self._estimator.zero is None and not self._estimator.refused:
                     await self._sampled.wait()
         except TimeoutError:

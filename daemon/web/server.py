@@ -36,6 +36,7 @@ from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.message_store import MessageStore
 from shearloop.errors import UserError
+from shearloop.timeouts import timeout
 
 HOST = "127.0.0.1"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
@@ -420,7 +421,7 @@ class _Page:
                     text = latest.batch(sent, now_s, first=first, now=time.time(), history=history)
                     sent, first, sent_s = latest.number, False, now_s
                     try:
-                        async with asyncio.timeout(SEND_TIMEOUT_S):
+                        async with timeout(SEND_TIMEOUT_S):
                             await socket.send_str(text)
                     except (TimeoutError, ConnectionError):
                         structlog.get_logger().warning("a page accepts no data and is disconnected")

@@ -20,6 +20,7 @@ from shearloop.drivers.errors import DeviceCalibrationError, DriverError
 from shearloop.drivers.robotiq import messages
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel, ModelName
 from shearloop.drivers.robotiq.requests import RequestWatch
+from shearloop.timeouts import timeout
 
 if TYPE_CHECKING:
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
@@ -399,7 +400,7 @@ class RobotiqGripper:
     async def _readout_after(self, since_ns: int) -> tuple[messages.Readout, int]:
         """Return a readout of `states` that began at `since_ns` or later; one of its own where none comes."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_POLLS_WAITED * self.poll_s):
+            async with timeout(_POLLS_WAITED * self.poll_s):
                 while self._latest is None or self._latest[1] < since_ns:
                     await self._news.wait()
                 return self._latest

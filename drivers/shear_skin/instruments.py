@@ -34,6 +34,7 @@ from shearloop.drivers.serial_sensor import (
     SerialSensor,
     TimedLine,
 )
+from shearloop.timeouts import timeout
 
 # A reading of five elements is 70 characters long.
 MAX_REPLY_BYTES = 512
@@ -333,7 +334,7 @@ class Keithley6430(PolledInstrument[SourceReading]):
         try:
             # Twice: an interrupted command may have left its beginning on the line.
             await self._send(":OUTP OFF", ":OUTP OFF")
-            async with asyncio.timeout(SWITCH_OFF_S):
+            async with timeout(SWITCH_OFF_S):
                 # The first answer can belong to a reading in progress.
                 while (await self.ask(OUTPUT)).text != "0":
                     pass

@@ -22,6 +22,7 @@ from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.script import CLIENT_VERSION, why_other_client
 from shearloop.drivers.ur.settings import Six, UrSettings
+from shearloop.timeouts import timeout
 
 # The settings for a controller, by its version and its serial number.
 SettingsFor: TypeAlias = Callable[[str, str], UrSettings]
@@ -303,7 +304,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
                 self._kill()
                 raise RobotLostError("hung", self._hung_sentence(self._timeout_s))
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(WATCH_S):
+                async with timeout(WATCH_S):
                     await self._closed.wait()
         raise self._error or self._died()
 
@@ -316,7 +317,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         # The end of the worker's input disconnects it too.
         self._stdin.close()
         try:
-            async with asyncio.timeout(EXIT_S):
+            async with timeout(EXIT_S):
                 await self._ended.wait()
         except TimeoutError:
             self._kill()

@@ -2,11 +2,12 @@
 
 import asyncio
 import os
+import resource
 import socket
 import subprocess
 import sys
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack, asynccontextmanager, closing, suppress
 
 import pytest
@@ -28,7 +29,7 @@ from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_client import StopSocketTakenError, owners, send_to_stop_socket
 from shearloop.daemon.messaging.stop_socket import StopSocket
-from shearloop.daemon.process import MAX_DESCRIPTORS
+from shearloop.daemon.process import MAX_DESCRIPTORS, raise_descriptor_limit
 from shearloop.daemon.supervisor import resident_memory_mb
 from shearloop.errors import UserError
 from tests.fixtures.daemons import DEADLINE_S, free_port
@@ -47,6 +48,16 @@ def test_the_limit_of_descriptors_is_raised_as_far_as_the_system_allows():
         assert int(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout) == raised
 
 
+@pytest.fixture
+def descriptors() -> Iterator[None]:
+    """Let this process have the descriptors of all connections: a user has 1024 at first."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    raise_descriptor_limit()
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+@pytest.mark.usefixtures("descriptors")
 @pytest.mark.parametrize("key", ["publish", "commands"])
 async def test_stop_is_fast_in_a_flood_of_idle_connections(key, config):
     """Also when the connections take every descriptor that the daemon may have."""

@@ -178,6 +178,7 @@ def test_a_systemd_credential_replaces_the_key_file(keys, tmp_path, monkeypatch)
     (handed / secret.name).write_text(secret.read_text())
     (handed / secret.name).chmod(0o400)
     assert load_server_keys(Path("/etc/shearloop/keys/server.key_secret")) == load_key_pair(secret)
+    (handed / secret.name).chmod(0o600)
     (handed / secret.name).write_text("none")
     with pytest.raises(UserError, match="run `sudo shearloop keys server`"):
         load_server_keys(Path("/etc/shearloop/keys/server.key_secret"))

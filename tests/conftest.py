@@ -105,9 +105,16 @@ def tiny_bank(tmp_path_factory) -> Path:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """For `-m real_time` do not import the nine files of ten that have no such test, in each worker."""
-    wanted = config.getoption("markexpr") == "real_time" and collection_path.match("test_*.py")
-    return True if wanted and "real_time" not in collection_path.read_text(encoding="utf-8") else None
+    """For `-m real_time` do not import the files and the folders that have no such test, in each worker."""
+    if config.getoption("markexpr") != "real_time":
+        return None
+    if collection_path.is_dir():
+        files = [*collection_path.rglob("test_*.py")]
+    elif collection_path.match("test_*.py"):
+        files = [collection_path]
+    else:
+        return None
+    return None if any("real_time" in file.read_text(encoding="utf-8") for file in files) else True
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

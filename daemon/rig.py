@@ -225,7 +225,8 @@ class Rig:
 
     def start_refusal(self) -> str | None:
         """Return why no experiment can begin, or None."""
-        return self._start_under_way() or self.runner.start_refusal()
+        unkept = self.memory.error if self.memory is not None else ""
+        return self._start_under_way() or self.runner.start_refusal() or unkept or None
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken at present, or None; `confirmed`: by the operator, nothing is loaded.

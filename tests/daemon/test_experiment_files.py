@@ -256,6 +256,15 @@ def rig(folder: Path, runner: Runner) -> Rig:
     )
 
 
+async def test_a_state_that_cannot_be_kept_refuses_every_start_before_its_question(folder):
+    one = rig(folder, Runner())
+    assert one.start_refusal() is None
+    one.memory = SimpleNamespace(error="the disk is full")
+    assert one.start_refusal() == "the disk is full"
+    with pytest.raises(UserError, match="the disk is full"):
+        await one.start_question(write(folder / "one.yaml", VALID))
+
+
 async def test_no_file_is_read_while_none_can_start(folder, monkeypatch):
     monkeypatch.setattr(experiment_files, "read_file", lambda *_: pytest.fail("it is read"))
     path = write(folder / "one.yaml", VALID)

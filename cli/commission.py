@@ -56,7 +56,9 @@ def run(args: argparse.Namespace) -> int:
         if args.emulate:
             config, devices = emulating.enter_context(_emulated(config, args.config, terminal))
             order = devices.order
-        operator = Operator(terminal.answer, terminal.say, order)
+        # A script may answer for emulated devices.
+        allows = config.emulated or sys.stdin.isatty()
+        operator = Operator(terminal.answer, terminal.say, order, allows)
         report, page = commission(config, args.config, args.out, operator, counts, args.stages)
         sentences = [f"{label}{args.out} and {page} are written."]
         settings = open_settings(config)
@@ -97,7 +99,10 @@ class _Terminal:
         print(f"{self._label}{line}", file=self._said, flush=True)
 
     def answer(self, question: str) -> str:
-        """Return the operator's line; raises UserError at the end of the input."""
+        """Return the line that the operator types after the question; raises UserError at the end of the input."""
+        from shearloop.cli.terminal import STDIN, forget_typed_ahead
+
+        forget_typed_ahead(STDIN)
         self.say(question)
         line = sys.stdin.readline()
         if not line:

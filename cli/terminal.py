@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import sys
+import termios
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
@@ -124,6 +125,17 @@ def stdin_lines(on_line: Callable[[str | None], None]) -> Iterator[None]:
         loop.remove_reader(STDIN)
 
 
+def forget_typed_ahead(descriptor: int) -> bool:
+    """Drop what was typed at a terminal before the question that it would answer; return whether this is a terminal.
+
+    What a pipe or a file holds is a script, and stays.
+    """
+    if not os.isatty(descriptor):
+        return False
+    termios.tcflush(descriptor, termios.TCIFLUSH)
+    return True
+
+
 class Operator:
     """The person at the terminal, as a context within an event loop; a pipe or a file works too."""
 
@@ -150,9 +162,19 @@ class Operator:
 
     async def ask(self, prompt: str) -> None:
         """Print the prompt and wait for the next line; raise UserError at the end of the input."""
+        if forget_typed_ahead(STDIN):
+            self._forget_lines()
         self.say(prompt)
         if await self._lines.get() is None:
             raise UserError("the input ended before all was measured; press Enter after each step")
+
+    def _forget_lines(self) -> None:
+        """Drop the lines that were read before a question; the end of the input stays."""
+        ended = False
+        while not self._lines.empty():
+            ended |= self._lines.get_nowait() is None
+        if ended:
+            self._lines.put_nowait(None)
 
     def say(self, sentence: str) -> None:
         """Print a sentence."""

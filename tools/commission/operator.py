@@ -48,12 +48,14 @@ class Play(Protocol):
 class Operator:
     """Asks and tells; `answer` returns the line that is typed after a question.
 
-    `play` is of devices that are emulated for this commissioning, and None for others.
+    `play` is of devices that are emulated for this commissioning, and None for others. `allows`: who answers may allow
+    a motion, as a person at a terminal and any script for emulated devices.
     """
 
     answer: Callable[[str], str]
     say: Callable[[str], None]
     play: Play | None = None
+    allows: bool = True
 
     def ask(self, question: str, played: Played | None = None) -> str:
         """Return the answer, without blanks around it."""
@@ -80,7 +82,15 @@ class Operator:
         raise UserError(f"neither {' nor '.join(choices)} was given: {question}")
 
     def allow(self, motion: str) -> None:
-        """Show a motion with its speed and travel, and return once the word was typed; raises DeclinedError."""
+        """Show a motion with its speed and travel, and return once the word was typed; raises DeclinedError.
+
+        Raises UserError where the answers are a script, and no person sees the motion before.
+        """
+        if not self.allows:
+            raise UserError(
+                f"the answers do not come from a terminal, and a person has to allow this motion: {motion}. Run it in "
+                "a terminal, without a pipe or a file before it"
+            )
         question = f"MOTION: {motion}. Keep clear, one hand at the emergency stop. Type `{WORD}` to allow it:"
         self._confirm(question, WORD, f"not allowed: {motion}")
 

@@ -94,7 +94,8 @@ class LeftRobot:
             held = ""
         if not held:
             return self.operator
-        return HoldingOperator(self.operator.answer, self.operator.say, self.operator.play, held)
+        asked = self.operator
+        return HoldingOperator(asked.answer, asked.say, asked.play, asked.allows, held)
 
     def _keep(self, state: Remembered) -> None:
         try:

@@ -80,3 +80,11 @@ def test_a_pose_that_changes_while_it_is_asked_for_is_asked_for_again():
     assert ["stands at 0.300" in asked[0], "stands at 0.500" in asked[1]] == [True, True]
     assert context.pose_rad == 0.5
     assert len(asked) == 2, "a confirmed pose is asked for once"
+
+
+def test_a_script_allows_no_motion():
+    said: list[str] = []
+    operator = Operator(lambda question: said.append(question) or WORD, said.append, allows=False)
+    with pytest.raises(UserError, match="do not come from a terminal"):
+        operator.allow("the fingers close")
+    assert said == []

@@ -90,13 +90,18 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
         taken.append(legend.get_window_extent().padded(_GAP_PX))
     inside = axes.get_window_extent()
     for point in sorted(points):
-        notes = [_note(axes, point, offset) for offset in _BESIDE]
-        # The text's own extent is without the line.
-        boxes = [Text.get_window_extent(note) for note in notes]
-        costs = [
-            sum(_common_px(box, other) for other in taken) + 10 * (_common_px(box, box) - _common_px(box, inside))
-            for box in boxes
-        ]
+        notes: list[Annotation] = []
+        boxes: list[Bbox] = []
+        costs: list[float] = []
+        for offset in _BESIDE:
+            notes.append(_note(axes, point, offset))
+            # The text's own extent is without the line.
+            boxes.append(box := Text.get_window_extent(notes[-1]))
+            outside = _common_px(box, box) - _common_px(box, inside)
+            costs.append(sum(_common_px(box, other) for other in taken) + 10 * outside)
+            if costs[-1] == 0:
+                # No later place is better, and each takes a while to measure.
+                break
         best = costs.index(min(costs))
         taken.append(boxes[best].padded(_GAP_PX))
         for note in notes[:best] + notes[best + 1 :]:

@@ -52,7 +52,7 @@ demo: demo-python $(VENV)/.installed
 # Status 5: no test was selected.
 PYTEST := $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 test: install-dev
-	$(PYTEST) -n 4 -m real_time $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -n 5 -m real_time $(PYTEST_ARGS) || [ $$? -eq 5 ]
 	$(PYTEST) -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.

@@ -44,15 +44,13 @@ hypothesis.settings.load_profile("shearloop")
 # Files of more than some five seconds, the longest first (`make test PYTEST_ARGS=--durations=60` shows them), and those
 # with tests in real time.
 LONGEST = (
-    "test_shared_recordings.py", "test_page_controls.py", "test_run.py", "test_cli_recordings.py", "test_adapt.py",
-    "test_page.py", "test_calibrate.py", "test_parallel.py", "test_plane_strain.py", "test_demo.py",
-    "test_speed_accuracy_chart.py", "test_procedure.py", "test_boards.py", "test_runner_any_order.py",
-    "test_leave_out.py", "test_pruned_matching.py", "test_other_fingertips.py", "test_docs.py",
-    "test_skin_loop_chart.py", "test_under_systemd.py", "test_server.py", "test_finite_strain.py",
-    "test_dead_channels.py", "test_skin_run.py", "test_replay.py", "test_skin.py", "test_flood.py", "test_emulate.py",
-    "test_cylinders.py", "test_session.py", "test_cli.py", "test_cli_reproduce.py", "test_recorder.py",
-    "test_settings.py", "test_every_way_out.py", "test_fuzz.py", "test_skin_replay.py",
-    "test_package.py", "test_device_paths.py", "test_bank_design.py",
+    "test_run.py", "test_page_controls.py", "test_shared_recordings.py", "test_page.py", "test_calibrate.py",
+    "test_procedure.py", "test_boards.py", "test_other_fingertips.py", "test_replay.py", "test_demo.py",
+    "test_docs.py", "test_parallel.py", "test_runner_any_order.py", "test_under_systemd.py", "test_server.py",
+    "test_flood.py", "test_finite_strain.py", "test_leave_out.py", "test_skin_run.py", "test_adapt.py",
+    "test_cli_reproduce.py", "test_plane_strain.py", "test_session.py", "test_dead_channels.py",
+    "test_pruned_matching.py", "test_control_loop.py", "test_recorder.py", "test_set_clock.py", "test_mad_client.py",
+    "test_walk.py", "test_skin_replay.py", "test_emulate.py", "test_speed_accuracy_chart.py", "test_every_way_out.py",
     "test_own_calibration.py", "test_restarts.py", "test_client.py", "test_soak.py", "test_replay_rig.py",
     "test_stops_and_unlocking.py", "test_twist_and_hold.py", "test_adapt_in_loop.py", "test_rehearsal.py",
     "test_doctor.py", "test_stop_times.py", "test_ends.py", "test_recorded_rig.py",

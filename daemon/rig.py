@@ -340,7 +340,7 @@ def build_rig(
         gripper = make_gripper(config.gripper, loop, publisher, clock, patience_of(config), supplied)
     sensors = build_sensors(config, publisher, clock, recorder, sessions, loop, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), settings_for=commissioning.on_controller)
-    robot.holds = loop.tool.may_hold
+    robot.holds = loop.tool.may_be_loaded
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
     experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning)
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}

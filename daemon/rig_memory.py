@@ -152,8 +152,9 @@ class RigMemory:
         elsewhere = (*files.other_states, *files.lapsed_states)
         if len(files.states) == 1 and not any(path.exists() for path in elsewhere):
             self._written = remembered
-        if not self.loop.tool.has_gripper:
-            # Only a grip keeps its zeros.
+        clamped = not self.loop.tool.has_gripper
+        if clamped and remembered.force_n is not None:
+            # They are of a grip, and the configuration does not name that gripper any more.
             return
         # Until the gripper answers, its grip counts as the earlier one.
         cell, zero = self.load_cell, remembered.load_zero
@@ -163,6 +164,9 @@ class RigMemory:
         if self.robot is not None and remembered.wrench_zero is not None:
             self._wrench_restored, self._wrench_tared = True, remembered.wrench_tared
             self.robot.restore_wrench_zero(remembered.wrench_zero)
+        if clamped:
+            # Nothing shows whether it is another tool: the operator says so with `release`.
+            self._on_judged("")
 
     def _on_judged(self, why_another: str) -> None:
         """Keep the zeros of the earlier grip, or remove them if the gripper does not have that grip any more."""
@@ -178,10 +182,10 @@ class RigMemory:
             for name in known:
                 self.loop.on_restored_zero(name)
             if known:
-                log.info("the zeros of the present grip are kept", of=known)
+                log.info("the zeros of the present tool are kept", of=known)
             if self._wrench_restored and not self._wrench_tared:
                 log.info(
-                    "the wrench has no known zero in the present grip, and its torques may be off by any load",
+                    "the wrench has no known zero with the present tool, and its torques may be off by any load",
                     reason="none was taken before the grip, or the last daemon ended while the robot's program started",
                     cure="`shearloop command release --yes`, then `shearloop command tare`, before a step needs it",
                 )
@@ -229,10 +233,10 @@ class RigMemory:
         self._watch_wrench()
         state = Remembered.of(self.loop)
         state = replace(state, running=state.running or self.starting)
-        if self.load_cell is not None and self.loop.tool.may_hold() and self._knows_load_zero:
+        if self.load_cell is not None and self.loop.tool.may_be_loaded() and self._knows_load_zero:
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)
-        if self.robot is not None and self.loop.tool.may_hold():
+        if self.robot is not None and self.loop.tool.may_be_loaded():
             state = replace(state, wrench_zero=self.robot.wrench_zero, wrench_tared=self._knows_wrench_zero)
         await self.save(state)
 

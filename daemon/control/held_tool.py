@@ -197,6 +197,10 @@ class HeldTool:
             return self._on_judged is not None or self.grip.force_n is not None
         return gripper.holding or gripper.moving or gripper.uncertain
 
+    def may_be_loaded(self) -> bool:
+        """Return whether a tool may load the sensors: a held one, or a clamped one whose angle counts."""
+        return self.may_hold() if self.has_gripper else self.grip.origin_rad is not None
+
     @property
     def awaits_judgement(self) -> bool:
         """Whether the gripper has not shown yet that it still has the grip of an earlier process, or not."""

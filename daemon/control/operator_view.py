@@ -17,7 +17,10 @@ from shearloop.daemon.control.experiment_schema import (
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
 from shearloop.daemon.control.safety import SafetyMonitor
-from shearloop.daemon.torques import CONFIRM_TARE, TorqueSource, loaded_sentence
+from shearloop.daemon.torques import CONFIRM_TARE, LOADED_NM, TorqueSource, loaded_sentence
+
+# A clamped tool that was turned by less is back at the angle of its zero.
+UNTURNED_RAD = 0.02
 
 
 def activation_sentence(what: str) -> str:
@@ -83,6 +86,9 @@ class OperatorView:
         if loaded := self._loaded():
             cure = "if nothing is loaded, `shearloop command tare --yes` takes the zero before the start"
             return f"{loaded}, which would become the zero; take the load off ({cure})"
+        if loaded := self._clamped_load():
+            cure = "if nothing loads it, `shearloop command release --yes` lets its angle count from 0"
+            return f"{loaded}, and its load would become the zero of the wrench; turn it back or take it out ({cure})"
         return None
 
     def _loaded(self) -> str:
@@ -95,6 +101,22 @@ class OperatorView:
             if not self.sources[name].from_robot and not (empty and self.sources[name].warm_up_s)
         }
         return loaded_sentence(judged)
+
+    def _clamped_load(self) -> str:
+        """Return how the wrench, or the angle where the wrench has no zero, shows a load on a clamped tool."""
+        if self.tool.has_gripper:
+            return ""
+        for name, source in self.sources.items():
+            latest = self.inputs.torques.get(name)
+            if not source.from_robot or latest is None:
+                continue
+            if not self.zero_known.get(name):
+                angle_rad = self.tool.twisted_rad
+                turned = f"the clamped tool is turned by {angle_rad:+.3f} rad, and no zero of the {name} is known"
+                return turned if abs(angle_rad) > UNTURNED_RAD else ""
+            if latest.torque_nm is not None and abs(latest.torque_nm) > LOADED_NM + source.noise_nm:
+                return f"{name} measures {latest.torque_nm:+.3f} N·m on the clamped tool"
+        return ""
 
     def release_refusal(self) -> str | None:
         """Return why the operator cannot open the gripper at present, or None; the state of the arm does not count."""

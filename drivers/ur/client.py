@@ -82,7 +82,7 @@ class UrRobot:
         self.losses: Counter[str] = Counter()
         # The number of states that have arrived.
         self.states = 0
-        # Whether the gripper holds something, or may hold it. Then a new program keeps the zero of the wrench.
+        # Whether a tool may load the wrench. Then a new program keeps the zero of the wrench.
         self.holds: Callable[[], bool] = lambda: False
         self._told_held = False
         self._wrench_zero: Six = (0.0,) * 6

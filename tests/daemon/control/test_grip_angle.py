@@ -9,11 +9,15 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import Grip
+from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.rig_memory import RigMemory
 from shearloop.daemon.robot_files import RobotFiles
+from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
+from shearloop.drivers.ur.client import UrRobot
 from tests.daemon.control.cell import TWIST, driven
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
+from tests.drivers.ur.handler_bench import SETTINGS
 
 TWIST_AGAIN = {"do": "twist", "angles_rad": [0.25], "return_to_start": False, "speed_rad_per_s": 0.2, "hold_s": 0.1}
 TWISTED = {"limits": {"angle_rad": 0.3, "torque_nm": 0.5}, "torque_source": "load_cell"}
@@ -188,6 +192,67 @@ async def test_a_daemon_that_has_lost_its_gripper_keeps_the_angle_and_none_of_th
     RigMemory(FILES, after.control_loop, cell)
     assert cell.calibration.tare_counts == 8000.0
     assert after.control_loop.tool.grip == Grip(before.control_loop.tool.grip.origin_rad)
+
+
+ZERO = (0.0, 0.0, 0.0, 0.0, 0.0, -0.11)
+
+
+def clamped_with_wrench() -> Rig:
+    """Return a rig without a gripper, whose sources include the wrench."""
+    sources = {"right": EIT, "load_cell": LOAD, "wrench": wrench_source(125.0, 0.05)}
+    rig = Rig(ControlLoop(CONFIG, sources, ("right",)))
+    rig.force_n, rig.silent = 60.0, {"hand"}
+    return rig
+
+
+def test_a_clamped_tool_that_was_turned_may_load_the_wrench_until_another_one_is_clamped():
+    """A program that starts then keeps the zero of the wrench, and does not take the tool's load for it."""
+    rig = clamped_rig()
+    assert not rig.control_loop.tool.may_be_loaded()
+    turn_to_limit(rig)
+    assert rig.control_loop.tool.may_be_loaded()
+    rig.control_loop.tool.on_release_ended()
+    assert not rig.control_loop.tool.may_be_loaded()
+
+
+@pytest.mark.parametrize("tared", [True, False])
+async def test_the_zeros_of_a_clamped_tool_outlive_the_process(tared):
+    before, robot = clamped_with_wrench(), UrRobot(SETTINGS)
+    cell = LoadCell(None, LoadCalibration(tare_counts=8321.5, scale_n_per_count=0.001))
+    memory = RigMemory(FILES, before.control_loop, cell, robot)
+    turn_to_limit(before)
+    robot.restore_wrench_zero(ZERO)
+    before.control_loop.on_zero("load_cell")
+    before.control_loop.on_zero("wrench", known=tared)
+    await memory.save_present()
+    after, robot = clamped_with_wrench(), UrRobot(SETTINGS)
+    cell = LoadCell(None, LoadCalibration(tare_counts=8000.0, scale_n_per_count=0.001))
+    RigMemory(FILES, after.control_loop, cell, robot)
+    assert (cell.calibration.tare_counts, robot.wrench_zero) == (8321.5, ZERO)
+    assert after.control_loop.has_zero("load_cell")
+    assert after.control_loop.has_zero("wrench") is tared
+
+
+@pytest.mark.parametrize(
+    ("known", "torque_nm", "turned_rad", "why"),
+    [
+        (True, 0.15, 0.2, "wrench measures +0.150 N·m on the clamped tool"),
+        (True, 0.09, 0.2, ""),
+        (False, 0.0, 0.2, "turned by +0.200 rad, and no zero of the wrench is known"),
+        (False, 0.15, 0.01, ""),
+    ],
+)
+def test_a_step_takes_no_zero_of_the_wrench_under_a_clamped_tool(known, torque_nm, turned_rad, why):
+    """The wrench has no other zero than that of a step. Without one its torque says nothing, but the angle does."""
+    rig = clamped_with_wrench()
+    rig.run(0.1)
+    loop = rig.control_loop
+    loop.on_zero("wrench", known=known)
+    loop.tool.count_angle(loop.inputs.arm.wrist_rad - turned_rad)
+    now_ns = loop.inputs.arm.t_ns
+    loop.on_torque(TorqueSample("wrench", torque_nm, "", now_ns, now_ns))
+    refusal = loop.operator.why_no_tare_step()
+    assert (why in refusal) if why else refusal is None
 
 
 async def test_the_operator_says_that_another_tool_is_clamped():

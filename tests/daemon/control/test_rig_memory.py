@@ -182,7 +182,7 @@ def test_the_log_calls_a_zero_kept_only_where_it_was_taken(tared, restarted, log
     again.wrist_rad, again.force_n, again.width_mm, again.hand = rig.wrist_rad, rig.force_n, rig.width_mm, rig.hand
     RigMemory(FILES, again.control_loop, load_cell(), UrRobot(SETTINGS))
     again.run(0.1)
-    (kept,) = (line["of"] for line in logged if line["event"] == "the zeros of the present grip are kept")
+    (kept,) = (line["of"] for line in logged if line["event"] == "the zeros of the present tool are kept")
     unknown = [line for line in logged if "the wrench has no known zero" in line["event"]]
     assert (kept, len(unknown)) == ((["load_cell", "wrench"], 0) if tared else (["load_cell"], 1))
     assert again.control_loop.has_zero("wrench") is tared

@@ -285,7 +285,9 @@ def check_slices(one: Recorded, out: Path, ran: Any) -> None:
     tare = [row["t_mono_ns"] for row in states if row["step_name"] == "tare"]
     after = min(row["t_mono_ns"] for row in states if row["t_mono_ns"] > max(tare))
     half_ns = np.median(np.diff([row["t_mono_ns"] for row in frames])) / 2
-    rest = np.mean([row["line"] for row in frames if min(tare) + half_ns <= row["t_mono_ns"] <= after], axis=0)
+    from_ns, to_ns = min(tare) + half_ns, after - half_ns
+    rested = [row for row in frames if from_ns <= row["t_mono_ns"] <= to_ns and not row["repeated"]]
+    rest = np.mean([row["line"] for row in rested], axis=0)
     held = [row["t_mono_ns"] for row in states if row["hold"]]
     end_ns = min(row["t_mono_ns"] for row in states if row["t_mono_ns"] > max(held))
     from_ns, to_ns = min(held) + half_ns, end_ns - half_ns

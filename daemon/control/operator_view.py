@@ -17,10 +17,15 @@ from shearloop.daemon.control.experiment_schema import (
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
 from shearloop.daemon.control.safety import SafetyMonitor
-from shearloop.daemon.torques import CONFIRM_TARE, LOADED_NM, TorqueSource, loaded_sentence
+from shearloop.daemon.torques import CONFIRM_TARE, TorqueSource, loaded_sentence
 
 # A clamped tool that was turned by less is back at the angle of its zero.
 UNTURNED_RAD = 0.02
+# The way out for a clamped tool, also without a known zero.
+CLAMPED_CURE = (
+    "turn it back, at the pendant if no zero is known, or loosen its clamp; once nothing loads it, `shearloop command "
+    "release --yes` lets its angle count from 0"
+)
 
 
 def activation_sentence(what: str) -> str:
@@ -86,9 +91,8 @@ class OperatorView:
         if loaded := self._loaded():
             cure = "if nothing is loaded, `shearloop command tare --yes` takes the zero before the start"
             return f"{loaded}, which would become the zero; take the load off ({cure})"
-        if loaded := self._clamped_load():
-            cure = "if nothing loads it, `shearloop command release --yes` lets its angle count from 0"
-            return f"{loaded}, and its load would become the zero of the wrench; turn it back or take it out ({cure})"
+        if turned := self._turned_on_wrench():
+            return f"{turned}, and its load would become the zero of the wrench; {CLAMPED_CURE}"
         return None
 
     def _loaded(self) -> str:
@@ -102,21 +106,16 @@ class OperatorView:
         }
         return loaded_sentence(judged)
 
-    def _clamped_load(self) -> str:
-        """Return how the wrench, or the angle where the wrench has no zero, shows a load on a clamped tool."""
-        if self.tool.has_gripper:
+    def _turned_on_wrench(self) -> str:
+        """Return how far a clamped tool is turned, which may load the robot's wrench; empty where it is not.
+
+        Its angle says so without an error that adds up. A torque below the wrench's noise would, from zero to zero.
+        """
+        from_robot = any(source.from_robot for source in self.sources.values())
+        angle_rad = self.tool.twisted_rad
+        if self.tool.has_gripper or not from_robot or abs(angle_rad) <= UNTURNED_RAD:
             return ""
-        for name, source in self.sources.items():
-            latest = self.inputs.torques.get(name)
-            if not source.from_robot or latest is None:
-                continue
-            if not self.zero_known.get(name):
-                angle_rad = self.tool.twisted_rad
-                turned = f"the clamped tool is turned by {angle_rad:+.3f} rad, and no zero of the {name} is known"
-                return turned if abs(angle_rad) > UNTURNED_RAD else ""
-            if latest.torque_nm is not None and abs(latest.torque_nm) > LOADED_NM + source.noise_nm:
-                return f"{name} measures {latest.torque_nm:+.3f} N·m on the clamped tool"
-        return ""
+        return f"the clamped tool is turned by {angle_rad:+.3f} rad"
 
     def release_refusal(self) -> str | None:
         """Return why the operator cannot open the gripper at present, or None; the state of the arm does not count."""

@@ -92,8 +92,9 @@ class FaultCode(Enum):
     TORQUE_LIMIT = Rule(
         _RELEASE,
         "the torque is beyond its limit: {detail}.",
-        "Find the obstacle at the tool, then send `shearloop command unlock`. `shearloop command release --yes` lets "
-        "go a tool that is still held. Raise `limits.torque_nm` only if tool and gel bear it.",
+        "Find the obstacle at the tool, then send `shearloop command unlock`. `shearloop command release --yes` opens "
+        "a gripper that still holds the tool; a clamped tool is turned back at the pendant. Raise `limits.torque_nm` "
+        "only if tool and gel bear it.",
     )
     ANGLE_LIMIT = Rule(
         _KEEP,

@@ -1,16 +1,19 @@
 """The angle since the grip belongs to the grip, whatever stops, starts and restarts come between."""
 
+import asyncio
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from shearloop.daemon.commands import Commands
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.wrench import wrench_source
-from shearloop.daemon.rig_memory import RigMemory
+from shearloop.daemon.rig_memory import RigMemory, read_memories
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
@@ -233,26 +236,45 @@ async def test_the_zeros_of_a_clamped_tool_outlive_the_process(tared):
     assert after.control_loop.has_zero("wrench") is tared
 
 
-@pytest.mark.parametrize(
-    ("known", "torque_nm", "turned_rad", "why"),
-    [
-        (True, 0.15, 0.2, "wrench measures +0.150 N·m on the clamped tool"),
-        (True, 0.09, 0.2, ""),
-        (False, 0.0, 0.2, "turned by +0.200 rad, and no zero of the wrench is known"),
-        (False, 0.15, 0.01, ""),
-    ],
-)
-def test_a_step_takes_no_zero_of_the_wrench_under_a_clamped_tool(known, torque_nm, turned_rad, why):
-    """The wrench has no other zero than that of a step. Without one its torque says nothing, but the angle does."""
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("torque_nm", [0.0, 0.08, 0.15])
+def test_a_step_takes_no_zero_of_the_wrench_under_a_clamped_tool_that_is_turned(known, torque_nm):
+    """Whatever the wrench measures: loads below its noise would add up from zero to zero."""
     rig = clamped_with_wrench()
     rig.run(0.1)
     loop = rig.control_loop
     loop.on_zero("wrench", known=known)
-    loop.tool.count_angle(loop.inputs.arm.wrist_rad - turned_rad)
-    now_ns = loop.inputs.arm.t_ns
-    loop.on_torque(TorqueSample("wrench", torque_nm, "", now_ns, now_ns))
-    refusal = loop.operator.why_no_tare_step()
-    assert (why in refusal) if why else refusal is None
+    loop.on_torque(TorqueSample("wrench", torque_nm, "", loop.inputs.arm.t_ns, loop.inputs.arm.t_ns))
+    assert loop.operator.why_no_tare_step() is None
+    loop.tool.count_angle(loop.inputs.arm.wrist_rad - 0.01)
+    assert loop.operator.why_no_tare_step() is None
+    loop.tool.on_release_ended()
+    loop.tool.count_angle(loop.inputs.arm.wrist_rad - 0.08)
+    assert "the clamped tool is turned by +0.080 rad" in loop.operator.why_no_tare_step()
+    # The operator says that nothing loads it.
+    loop.tool.on_release_ended()
+    assert loop.operator.why_no_tare_step() is None
+
+
+async def test_a_release_is_on_the_disk_before_it_is_answered():
+    """A daemon that is killed then must not restore the angle and the zeros of the tool before."""
+    rig = clamped_with_wrench()
+    memory = RigMemory(FILES, rig.control_loop)
+    turn_to_limit(rig)
+    await memory.save_present()
+
+    async def release() -> None:
+        rig.control_loop.tool.on_release_ended()
+
+    subject = SimpleNamespace(
+        control_loop=rig.control_loop,
+        runner=SimpleNamespace(release=release, release_refusal=lambda: None),
+        memory=memory,
+        occasion=lambda: (),
+    )
+    commands = Commands(subject, None, None, None, asyncio.Event(), None)
+    assert await commands.handlers()["release"]({"confirmed": True}) == {}
+    assert not read_memories(FILES).grip.known
 
 
 async def test_the_operator_says_that_another_tool_is_clamped():

@@ -235,8 +235,12 @@ async def test_each_state_is_decided_upon_and_every_fifth_published(monkeypatch,
 
 
 async def test_a_zero_is_taken_after_a_turn():
-    """A wrist that turned is the robot's to move until its last speed, zero, has run out."""
-    async with driven({"do": "turn_to", "angle_rad": 0.2}, {"do": "tare"}) as cell:
+    """A wrist that turned is the robot's to move until its last speed, zero, has run out.
+
+    It turns back before, because a clamped tool that is turned may load the wrench.
+    """
+    there, back = ({"do": "turn_to", "angle_rad": angle_rad} for angle_rad in (0.2, 0.0))
+    async with driven(there, back, {"do": "tare"}) as cell:
         await cell.until_done()
 
 

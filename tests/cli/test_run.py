@@ -165,7 +165,11 @@ async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, mo
         estimates = collector(daemon, "eit.estimate")
         async with emulated_kit(tmp_path, 40):
             seen = [(await estimates.get())["frame"] for _ in range(8)]
-    assert seen[:4] == [0, 1, 2, 4], "frames continue after the one that killed it"
+    before, after = seen[:3], seen[3:]
+    assert before == [0, 1, 2]
+    # On a busy computer further frames pass while its task starts again.
+    assert after[0] > 3, "frames continue after the one that killed it"
+    assert after == list(range(after[0], after[0] + len(after)))
     record = daemon.supervisor.records["right"]
     assert (record.restarts, record.last_error) == (1, "RuntimeError: a bug")
 

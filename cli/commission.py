@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     config = load_daemon_config(args.config)
     counts = Counts() if args.stops is None else replace(Counts(), stops=args.stops)
     label = f"{EMULATED}: " if args.emulate or config.emulated else ""
-    terminal = _Terminal(sys.stderr if args.json else sys.stdout, label)
+    terminal = Terminal(sys.stderr if args.json else sys.stdout, label)
     with ExitStack() as emulating:
         order = None
         if args.emulate:
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 @contextmanager
 def _emulated(
-    config: "DaemonConfig", path: Path, terminal: "_Terminal"
+    config: "DaemonConfig", path: Path, terminal: "Terminal"
 ) -> "Iterator[tuple[DaemonConfig, EmulatedDevices]]":
     """Run the emulators of all devices; yield the configuration that names them."""
     from shearloop.cli.emulator_processes import EmulatedDevices
@@ -88,7 +88,7 @@ def _emulated(
         yield rehearsed.config, devices
 
 
-class _Terminal:
+class Terminal:
     """The operator's terminal; each line begins with `label`."""
 
     def __init__(self, said: TextIO, label: str) -> None:

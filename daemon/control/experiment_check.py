@@ -29,6 +29,7 @@ from shearloop.daemon.control.experiment_schema import (
     demand,
     direction_of,
     outline,
+    wrist_after,
 )
 from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
@@ -136,7 +137,7 @@ def turns(file: ExperimentFile) -> Iterator[Turn]:
         low_rad, high_rad = angle_rad.low - around_rad, angle_rad.high + around_rad
         yield Turn(begins, leaves, loads, low_rad, high_rad, by_angle, way_unknown)
         held = _may_hold_after(step, held=held)
-        wrist_rad = _wrist_after(step, wrist_rad)
+        wrist_rad = wrist_after(step, wrist_rad)
 
 
 def _may_hold_after(step: Step, *, held: bool) -> bool:
@@ -154,22 +155,6 @@ def _wrist_target(step: Step) -> float | None:
         case TwistStep(absolute=True, angles_rad=angles_rad):
             return angles_rad[0]
     return None
-
-
-def _wrist_after(step: Step, wrist_rad: float | None) -> float | None:
-    """Return the angle of the wrist joint after a step, from the one before; None where it is not known."""
-    match step:
-        case TurnToStep(angle_rad=angle_rad):
-            return angle_rad
-        case TwistStep(return_to_start=True):
-            return wrist_rad
-        case TwistStep(absolute=True, angles_rad=angles_rad):
-            return angles_rad[-1]
-        case TwistStep() | TightenStep() | HoldTorqueStep() | IdentifyStep():
-            return None
-        case ApproachStep(pose_m_rad=tuple()):
-            return None
-    return wrist_rad
 
 
 def _last_way(angles_rad: Sequence[float]) -> Direction | None:

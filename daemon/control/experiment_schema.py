@@ -464,18 +464,31 @@ def demands(planned: Iterable[Step], speeds: Speeds = AS_ASKED) -> Iterator[Dema
     before = NOTHING_BEFORE
     for step in planned:
         yield demand(step, speeds, before)
+        wrist_rad = wrist_after(step, before.wrist_rad)
         match step:
-            case TurnToStep(angle_rad=angle_rad):
-                before = Before(wrist_rad=angle_rad)
             case HoldTorqueStep():
-                before = Before(step.signed_torque_nm)
-            case GripStep() | ReleaseStep() | TwistStep(return_to_start=True):
-                before = Before(wrist_rad=before.wrist_rad)
+                before = Before(step.signed_torque_nm, wrist_rad)
             case ApproachStep(pose_m_rad=pose):
-                before = Before(before.torque_nm, pose_m_rad=pose)
-            case TwistStep() | TightenStep() | IdentifyStep():
-                # How they end is not known before.
-                before = NOTHING_BEFORE
+                before = Before(before.torque_nm, wrist_rad, pose)
+            case GripStep() | ReleaseStep() | TurnToStep() | TwistStep() | TightenStep() | IdentifyStep():
+                # With which torque a twist ends is not known before.
+                before = Before(wrist_rad=wrist_rad)
+
+
+def wrist_after(step: Step, wrist_rad: float | None) -> float | None:
+    """Return the angle of the wrist joint after a step, from the one before; None where it is not known."""
+    match step:
+        case TurnToStep(angle_rad=angle_rad):
+            return angle_rad
+        case TwistStep(return_to_start=True):
+            return wrist_rad
+        case TwistStep(absolute=True, angles_rad=angles_rad):
+            return angles_rad[-1]
+        case TwistStep() | TightenStep() | HoldTorqueStep() | IdentifyStep():
+            return None
+        case ApproachStep(pose_m_rad=tuple()):
+            return None
+    return wrist_rad
 
 
 def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFORE) -> Demand:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from shearloop.cli import terminal
-from shearloop.cli.commission import _Terminal
+from shearloop.cli.commission import Terminal
 from shearloop.cli.terminal import Operator, forget_typed_ahead
 
 
@@ -47,7 +47,7 @@ def keyboard(monkeypatch) -> Iterator[Keyboard]:
 
 def test_a_motion_is_not_allowed_by_a_word_of_before(keyboard):
     keyboard.type("move\nmove\n")
-    assert _Terminal(keyboard, "").answer("MOTION: the fingers close").strip() == "no"
+    assert Terminal(keyboard, "").answer("MOTION: the fingers close").strip() == "no"
     assert keyboard.shown.getvalue() == "MOTION: the fingers close\n"
 
 

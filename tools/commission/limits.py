@@ -1,4 +1,4 @@
-"""The limits on times, for a real rig and for an emulated one, whose busy computer delays them."""
+"""The limits on rates and times, for a real rig and for an emulated one, which a busy computer delays."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -13,19 +13,19 @@ PROMISED_S: Final = 0.2
 
 @dataclass(frozen=True, slots=True)
 class TimeLimits:
-    """What the lines on rates, gaps, delays and stops pass at."""
+    """The limits of the report's lines on rates, gaps, delays and stops."""
 
-    # Of the robot's states: their fraction, and the longest time without one.
+    # The least fraction of the robot's states that must arrive, and the longest time without a state.
     least_rate: float
     longest_gap_s: float
     longest_exchange_s: float
-    # Of the script's clock, as a fraction: one that counts a cycle too few here and there makes every deadline late.
+    # The largest error of the script's clock, as a fraction. If the clock misses cycles, every deadline is late.
     script_tolerance: float
-    # Of a board: the difference of its rate from the configured one, as a fraction.
+    # The largest difference of a board's rate from the configured rate, as a fraction.
     rate_tolerance: float
     # The largest difference between the moments at which two devices see the same event.
     clocks_s: float
-    # How much later than the settings' times the computer may be; None: the promise of docs/safety.md counts.
+    # How much later than the settings' times the computer may be. None: the limit is the promise of docs/safety.md.
     late_s: float | None = None
 
     def reaction_s(self, settings: UrSettings) -> float:
@@ -45,7 +45,7 @@ REAL: Final = TimeLimits(
     rate_tolerance=0.1,
     clocks_s=0.05,
 )
-# Its computer plays the devices too. What the procedure shows stays the same.
+# The same computer plays the devices too. The stages and their lines stay the same.
 EMULATED: Final = TimeLimits(
     least_rate=0.25,
     longest_gap_s=5.0,

@@ -1,7 +1,5 @@
-"""What configuration, drivers and emulators have in common: properties of the devices, and the standard gravity."""
+"""Properties of the devices that a configuration may change. Configuration and drivers take them from here."""
 
-# In m/s²: turns the masses of a calibration into forces.
-STANDARD_GRAVITY = 9.80665
 # The EIT-kit: the mean over two recordings of 832 frames each.
 FRAME_PERIOD_S = 0.5408
 # The load cell, measured on the paper's rig (4882 lines in 447 s); the HX711's data sheet says 10 samples a second.

@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from shearloop.drivers.defaults import STANDARD_GRAVITY
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.load_cell import LEVER_ARM_M, LoadCalibration, LoadSample
 
+STANDARD_GRAVITY = 9.80665
 # Before the scale is known, any value may be a load.
 UNCALIBRATED = LoadCalibration(tare_counts=0.0, scale_n_per_count=1e-9)
 SAMPLES_PER_STEP = 30

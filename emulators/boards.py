@@ -13,7 +13,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.defaults import STANDARD_GRAVITY
 from shearloop.emulators.numbers import number_between
 from shearloop.emulators.ports import PtyPort
 
@@ -156,7 +155,7 @@ class EmulatedBoard:
 
 def format_line(values: NDArray[np.float64]) -> bytes:
     """Return the line of the EIT-kit for (v,) values in volts."""
-    return b"%.4f, " * len(values) % tuple(values.tolist()) + b"\n"
+    return ("".join(f"{value:.4f}, " for value in values.tolist()) + "\n").encode()
 
 
 class EitKitBoard(EmulatedBoard):
@@ -211,7 +210,7 @@ class Sketch:
     The default is our sketch with a 5 kg cell of 1 mV/V on a 35 mm lever arm: 420 counts a gram.
     """
 
-    counts_per_nm: float = 420e3 / (STANDARD_GRAVITY * 0.035)
+    counts_per_nm: float = 420e3 / (9.80665 * 0.035)
     tare_counts: float = 81_250.0
     noise_counts: float = 120.0
     decimals: int = 0

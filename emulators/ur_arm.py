@@ -11,9 +11,8 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-
-from shearloop.drivers.defaults import STANDARD_GRAVITY
-from shearloop.emulators.rotations import matrix_of, rotation_vector_of
+from scipy import constants
+from scipy.spatial.transform import Rotation
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -54,13 +53,13 @@ def tool_frames(q_rad: Vector, tool: Matrix) -> list[Matrix]:
 def frame_of_pose(pose: Sequence[float] | Vector) -> Matrix:
     """Return the frame (4, 4) of a pose (6,): position and rotation vector."""
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = matrix_of(np.asarray(pose[3:])), pose[:3]
+    frame[:3, :3], frame[:3, 3] = Rotation.from_rotvec(np.asarray(pose[3:])).as_matrix(), pose[:3]
     return frame
 
 
 def _pose_of_frame(frame: Matrix) -> Vector:
     """Return the pose (6,) of a frame (4, 4)."""
-    return np.concatenate([frame[:3, 3], rotation_vector_of(frame[:3, :3])])
+    return np.concatenate([frame[:3, 3], Rotation.from_matrix(frame[:3, :3]).as_rotvec()])
 
 
 def joints_within(
@@ -93,12 +92,9 @@ def joints_within(
 
 def jacobian(frames: list[Matrix]) -> Matrix:
     """Return the geometric Jacobian (6, 6): joint speeds to the tool's linear and angular velocity in the base."""
-    joints = np.array(frames[:-1])
-    axes, arms = joints[:, :3, 2], frames[-1][:3, 3] - joints[:, :3, 3]
-    (x, y, z), (to_x, to_y, to_z) = axes.T, arms.T
-    # np.cross takes several times as long.
-    linear = (y * to_z - z * to_y, z * to_x - x * to_z, x * to_y - y * to_x)
-    return np.asfortranarray([*linear, x, y, z])
+    axes = np.array([frame[:3, 2] for frame in frames[:-1]])
+    arms = frames[-1][:3, 3] - np.array([frame[:3, 3] for frame in frames[:-1]])
+    return np.hstack([np.cross(axes, arms), axes]).T
 
 
 # The arm after a cycle: joints (6,), speeds (6,), and whether the motion is over.
@@ -142,7 +138,7 @@ class LinearMove:
     def __post_init__(self) -> None:
         """Compute the length; a move that only turns is measured in radians."""
         way_m = float(np.linalg.norm(self.target[:3, 3] - self.start[:3, 3]))
-        self._turn = rotation_vector_of(self.start[:3, :3].T @ self.target[:3, :3])
+        self._turn = Rotation.from_matrix(self.start[:3, :3].T @ self.target[:3, :3]).as_rotvec()
         self._length = self._end = way_m if way_m > 1e-6 else float(np.linalg.norm(self._turn))
         self._done = self._rate = 0.0
 
@@ -157,8 +153,8 @@ class LinearMove:
         frames = tool_frames(q_rad, self.tool)
         here = frames[-1]
         where = self.start[:3, 3] + share * (self.target[:3, 3] - self.start[:3, 3])
-        turned = self.start[:3, :3] @ matrix_of(share * self._turn)
-        turn = rotation_vector_of(turned @ here[:3, :3].T)
+        turned = self.start[:3, :3] @ Rotation.from_rotvec(share * self._turn).as_matrix()
+        turn = Rotation.from_matrix(turned @ here[:3, :3].T).as_rotvec()
         error = np.concatenate([where - here[:3, 3], turn])
         try:
             step = np.linalg.solve(jacobian(frames), error)
@@ -249,7 +245,7 @@ class Arm:
     @property
     def wrench(self) -> Vector:
         """Force and torque at the tool, relative to the zero."""
-        hung_n = np.array([0.0, 0.0, -STANDARD_GRAVITY * self.hung_kg])
+        hung_n = np.array([0.0, 0.0, -constants.g * self.hung_kg])
         apart = np.concatenate([self.bias_n + hung_n, np.zeros(3)])
         return np.asarray(self.load + self._noise - self._wrench_zero + apart)
 

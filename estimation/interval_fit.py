@@ -195,8 +195,6 @@ def best_strength(
         point = fit(features[past], values[past], strength)
         return float(((reported_values(point, point.predict(features[future])) - values[future]) ** 2).mean())
 
-    # All strengths of a split in turn: fits to the same features share their longest part.
-    squared = [[squared_error(one, *split) for one in strengths] for split in splits]
-    errors = {one: float(np.mean(each)) for one, each in zip(strengths, zip(*squared, strict=True), strict=True)}
+    errors = {one: float(np.mean([squared_error(one, *split) for split in splits])) for one in strengths}
     best = max(strength for strength, error in errors.items() if error <= min(errors.values()) * 1.001)
     return best, errors[best]

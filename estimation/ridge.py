@@ -5,7 +5,7 @@ side only: where it reads nothing the twist may be anything below, so these fram
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol, Self, TypeAlias
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -18,24 +18,6 @@ _MARGIN_SHARE = 0.05
 _LEAST_SIGMA_SHARE, _HINGE_ROUNDS = 0.01, 50
 # Penalties to choose from, in units of the features' sum of squares.
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
-
-
-# The last features that were decomposed, and their decomposition.
-_Decomposition: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-_last: list[tuple[FloatArray, _Decomposition]] = []
-
-
-def _decomposed(centred: FloatArray) -> _Decomposition:
-    """Return the singular value decomposition u, s, vt of (n, d) features.
-
-    It takes longest in a fit, and fits to the same features with other penalties come one after the other.
-    """
-    for features, found in _last:
-        if np.array_equal(features, centred):
-            return found
-    u, s, vt = np.linalg.svd(centred, full_matrices=False)
-    _last[:] = [(centred, (u, s, vt))]
-    return u, s, vt
 
 
 class Predictor(Protocol):
@@ -58,7 +40,7 @@ class Ridge:
     def fit(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
         """Fit to (n, d) features of one unit and (n,) values; strength is in units of the features' sum of squares."""
         mean, offset = features.mean(axis=0), float(values.mean())
-        u, s, vt = _decomposed(features - mean)
+        u, s, vt = np.linalg.svd(features - mean, full_matrices=False)
         penalty = strength * float((s**2).sum())
         weights = vt.T @ (s / (s**2 + penalty) * (u.T @ (values - offset)))
         return cls(mean, weights, offset, strength)

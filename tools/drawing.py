@@ -94,12 +94,15 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
         boxes: list[Bbox] = []
         costs: list[float] = []
         for offset in _BESIDE:
-            notes.append(_note(axes, point, offset))
+            note = _note(axes, point, offset)
             # The text's own extent is without the line.
-            boxes.append(box := Text.get_window_extent(notes[-1]))
+            box = Text.get_window_extent(note)
             outside = _common_px(box, box) - _common_px(box, inside)
-            costs.append(sum(_common_px(box, other) for other in taken) + 10 * outside)
-            if costs[-1] == 0:
+            cost = sum(_common_px(box, other) for other in taken) + 10 * outside
+            notes.append(note)
+            boxes.append(box)
+            costs.append(cost)
+            if cost == 0:
                 # No later place is better, and each takes a while to measure.
                 break
         best = costs.index(min(costs))

@@ -145,8 +145,8 @@ def _configure_hx711(parser: argparse.ArgumentParser) -> None:
 
 
 def _play_hx711(args: argparse.Namespace) -> Playing:
-    from shearloop.drivers.defaults import STANDARD_GRAVITY
     from shearloop.drivers.load_cell import LEVER_ARM_M
+    from shearloop.drivers.load_cell_calibration import STANDARD_GRAVITY
     from shearloop.emulators.boards import PAPER_SKETCH, Hx711Board, Sketch
 
     held_nm, period_s = args.torque_nm, 1.0 / (args.load_rate_hz * args.speed)

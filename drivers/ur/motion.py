@@ -7,7 +7,7 @@ robot's watchdog: nothing more is sent to the program, and only a new program ma
 import math
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from shearloop.drivers.ur.messages import (
     ARRIVED,
@@ -106,9 +106,6 @@ class MotionExecutor:
         # How many samples at rest came last.
         self._at_rest = 0
         self._accelerations = Accelerations()
-        # The latest sample, and what it violates: each is asked about several times in a cycle.
-        self._judged: RtdeSample | None = None
-        self._beyond = ""
 
     @property
     def motion(self) -> MotionKind:
@@ -216,9 +213,7 @@ class MotionExecutor:
 
     def violation(self, sample: RtdeSample) -> str:
         """Return a sentence that names the limit that the sample or the present motion exceeds, or the empty string."""
-        if sample is not self._judged:
-            self._judged, self._beyond = sample, violation(sample, self._settings)
-        beyond = self._beyond
+        beyond = violation(sample, self._settings)
         if not beyond and isinstance(self._motion, WristSpeed | _Move):
             beyond = self._accelerations.violation(self._settings.limits)
         return beyond
@@ -505,9 +500,6 @@ class Accelerations:
         )
 
 
-_SPEED_NAMES: Final = (*(f"joint {number} speed" for number in range(1, WRIST + 1)), "wrist speed")
-
-
 def violation(sample: RtdeSample, settings: UrSettings) -> str:
     """Return a sentence that names the hard limit or the setting that the sample contradicts, or the empty string."""
     measured = (*sample.q_rad, *sample.qd_rad_per_s, *sample.tcp_pose, *sample.tcp_speed, *sample.wrench)
@@ -521,8 +513,10 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
     for axis, value, low, high in zip("xyz", sample.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
         if not low <= value <= high:
             return f"The tool is at {axis} = {value:.3f} m, beyond the workspace's {low:g} to {high:g} m."
-    fastest = limits.wrist_speed_rad_per_s
-    speeds = [(name, abs(qd), fastest, "rad/s") for name, qd in zip(_SPEED_NAMES, sample.qd_rad_per_s, strict=True)]
+    speeds = [
+        (f"joint {number} speed" if number <= WRIST else "wrist speed", abs(qd), limits.wrist_speed_rad_per_s, "rad/s")
+        for number, qd in enumerate(sample.qd_rad_per_s, 1)
+    ]
     tool = ("tool speed", sample.tcp_speed_m_per_s, limits.linear_speed_m_per_s, "m/s")
     for one in (*speeds, tool, *_loads(sample, limits)):
         if beyond := _beyond(*one):
@@ -587,8 +581,8 @@ def _rounded(value: float | tuple[float, ...] | None) -> str:
 
 
 def _beyond(name: str, value: float, bound: Bound, unit: str) -> str:
-    # Rounding errors do not count. In almost every cycle the first comparison is enough.
-    if value <= bound.hard or round(value, 9) <= bound.hard:
+    # Rounding errors do not count.
+    if round(value, 9) <= bound.hard:
         return ""
     return f"{name.capitalize()} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
 

@@ -28,7 +28,7 @@ _POINT = "; the decimal sign is a point: 0.1, not 0,1"
 # The largest number of mistakes that are shown for one file.
 _MOST_MISTAKES = 100
 
-# To make an adapter takes longer than to read a file.
+# Making an adapter takes longer than reading a file.
 _adapter_of: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
 
 # The library's words for frequent mistakes, and ours.
@@ -77,7 +77,7 @@ def first_key(model: type) -> str:
 
 @cache
 def _schema_of(model: type) -> dict[str, Any]:
-    """Return the JSON Schema of a model, which nobody changes."""
+    """Return the JSON Schema of a model; callers must not change it."""
     return _adapter_of(model).json_schema()
 
 

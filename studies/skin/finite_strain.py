@@ -6,7 +6,6 @@ its response is the mean of λ² − 1. Each Newton step linearises the skin abo
 contact nodes, and solves the contact there (Josephy–Newton); the frames at the nodes turn with them.
 """
 
-import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -39,44 +38,30 @@ MAX_HALVINGS = 6
 def internal_force(basis: skfem.Basis, displacement: FloatArray, young_mpa: float, poisson_ratio: float) -> FloatArray:
     """Return the nodal forces (dofs,) of the stresses, N per millimetre of width."""
     lame, shear = lame_parameters(young_mpa, poisson_ratio)
-    # The same for all shape functions.
-    deformation, inverse, log_volume = _kinematics(basis.interpolate(displacement).grad)
-    stress = shear * deformation + (lame * log_volume - shear) * inverse
 
-    def work(v: skfem.DiscreteField, _: skfem.DiscreteField) -> FloatArray:
+    def work(v: skfem.DiscreteField, w: skfem.DiscreteField) -> FloatArray:
+        deformation, inverse, log_volume = _kinematics(w["u"].grad)
+        stress = shear * deformation + (lame * log_volume - shear) * inverse
         found: FloatArray = np.einsum("ij...,ij...->...", stress, v.grad)
         return found
 
-    force: FloatArray = skfem.LinearForm(work).assemble(basis)
+    force: FloatArray = skfem.LinearForm(work).assemble(basis, u=basis.interpolate(displacement))
     return force
 
 
 def tangent(basis: skfem.Basis, displacement: FloatArray, young_mpa: float, poisson_ratio: float) -> csc_matrix:
     """Return the derivative of `internal_force`, N/mm per millimetre of width."""
     lame, shear = lame_parameters(young_mpa, poisson_ratio)
-    # The same for all pairs of shape functions.
-    _, inverse, log_volume = _kinematics(basis.interpolate(displacement).grad)
-    pressure = lame * log_volume - shear
 
-    def work(u: skfem.DiscreteField, v: skfem.DiscreteField, _: skfem.DiscreteField) -> FloatArray:
+    def work(u: skfem.DiscreteField, v: skfem.DiscreteField, w: skfem.DiscreteField) -> FloatArray:
+        _, inverse, log_volume = _kinematics(w["u"].grad)
         swelling = np.einsum("ij...,ij...->...", inverse, u.grad) * np.einsum("ij...,ij...->...", inverse, v.grad)
-        turning = _turning(inverse, u.grad, v.grad)
+        turning = np.einsum("ij...,kj...,kl...,il...->...", inverse, u.grad, inverse, v.grad)
         stretching = np.einsum("ij...,ij...->...", u.grad, v.grad)
-        found: FloatArray = shear * stretching + lame * swelling - pressure * turning
+        found: FloatArray = shear * stretching + lame * swelling - (lame * log_volume - shear) * turning
         return found
 
-    return csc_matrix(skfem.BilinearForm(work).assemble(basis))
-
-
-def _turning(inverse: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the sum over i, j, k, m of inverse_ij u_kj inverse_km v_im, each (2, 2, …)."""
-    found = np.zeros(inverse.shape[2:])
-    # np.einsum of four factors takes several times as long.
-    for i, j, k in itertools.product(range(2), repeat=3):
-        first = inverse[i, j] * u[k, j]
-        for m in range(2):
-            found += first * inverse[k, m] * v[i, m]
-    return found
+    return csc_matrix(skfem.BilinearForm(work).assemble(basis, u=basis.interpolate(displacement)))
 
 
 def _kinematics(gradient: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

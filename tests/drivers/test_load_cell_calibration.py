@@ -8,10 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers import load_cell_calibration
-from shearloop.drivers.defaults import STANDARD_GRAVITY
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN, LoadParser, LoadSample
-from shearloop.drivers.load_cell_calibration import Level, check_levels, check_masses, fit_levels, measure_level
+from shearloop.drivers.load_cell_calibration import (
+    STANDARD_GRAVITY,
+    Level,
+    check_levels,
+    check_masses,
+    fit_levels,
+    measure_level,
+)
 
 STEP = load_cell_calibration.SKIP_SAMPLES + load_cell_calibration.SAMPLES_PER_STEP
 

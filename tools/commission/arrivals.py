@@ -110,20 +110,14 @@ class Arrivals(Generic[T]):
 
     def take(self, count: int, silent_s: float) -> list[T]:
         """Return the next items that are made from now on; raises UserError after a silence of `silent_s`."""
-        since_ns, looked = self.clock.now_ns(), 0
-        found: list[T] = []
-
-        def more(items: Sequence[T]) -> bool | None:
-            nonlocal looked
-            before = len(found)
-            found.extend(item for item in items[looked:] if self._time_of(item) >= since_ns)
-            looked = len(items)
-            return len(found) > before or None
-
-        while len(found) < count:
-            if self.wait_until(more, silent_s) is None:
+        since_ns = self.clock.now_ns()
+        while len(found := self.since(since_ns)) < count:
+            if self._more_than(len(found), since_ns, silent_s) is None:
                 raise UserError(self._silent)
         return found[:count]
+
+    def _more_than(self, count: int, since_ns: int, within_s: float) -> bool | None:
+        return self.wait_until(lambda _: len(self.since(since_ns)) > count or None, within_s)
 
     def listen(self, seconds: float) -> list[T]:
         """Return the items of the next seconds; waits a second longer for the last of them."""

@@ -22,7 +22,6 @@ from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError
 from shearloop.files import open_file
-from shearloop.tools.recordings.indexed_messages import in_file_order, in_time_order
 from shearloop.tools.recordings.intact_records import (
     LARGEST_RECORD_BYTES,
     NOTHING_INTACT,
@@ -68,7 +67,6 @@ class OpenRecording:
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
             raise McapError("it has no index")
-        self._file, self._summary = file, summary
         counts = summary.statistics.channel_message_counts
         self.counts = {channel.topic: counts.get(channel.id, 0) for channel in summary.channels.values()}
         # By the records' names.
@@ -93,8 +91,8 @@ class OpenRecording:
         return self._found(wanted, by_log_time=by_time)
 
     def _found(self, topics: list[str] | None, *, by_log_time: bool) -> Messages:
-        in_order = in_time_order if by_log_time else in_file_order
-        return in_order(self._file, self._summary, topics)
+        messages = self._reader.iter_messages(topics, log_time_order=by_log_time)
+        return ((channel, message) for _, channel, message in messages)
 
     def content(self, channel: Channel, message: Message) -> dict[str, Any]:
         """Return a message's content by the names of its topic; raises ContentError and UnknownTopicError."""

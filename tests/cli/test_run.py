@@ -163,13 +163,10 @@ async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, mo
     monkeypatch.setattr(Session, "estimate", fragile)
     async with running_daemon(config()) as daemon:
         estimates = collector(daemon, "eit.estimate")
-        async with emulated_kit(tmp_path, 40):
+        # The task starts again within the time of a frame at this pace.
+        async with emulated_kit(tmp_path, 40, "--speed", "4"):
             seen = [(await estimates.get())["frame"] for _ in range(8)]
-    before, after = seen[:3], seen[3:]
-    assert before == [0, 1, 2]
-    # On a busy computer further frames pass while its task starts again.
-    assert after[0] > 3, "frames continue after the one that killed it"
-    assert after == list(range(after[0], after[0] + len(after)))
+    assert seen == [0, 1, 2, 4, 5, 6, 7, 8], "frames continue after the one that killed it"
     record = daemon.supervisor.records["right"]
     assert (record.restarts, record.last_error) == (1, "RuntimeError: a bug")
 

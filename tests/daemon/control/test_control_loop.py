@@ -39,6 +39,17 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive):
     assert held.std() < 0.006
 
 
+def test_a_load_cell_identifies_as_well_in_a_third_of_the_time():
+    found = []
+    for hold_s in (0.8, 2.5):
+        step = {"do": "identify", "amplitude_rad": 0.1, "hold_s": hold_s}
+        rig = started(Rig(new_loop()), GRIP, step, {"do": "wait", "wait_s": 0.1}, torque_source="load_cell")
+        rig.run(60)
+        assert phase(rig) is ExperimentPhase.DONE
+        found.append(rig.control_loop.wrist.tool.stiffness_nm_per_rad)
+    assert found[0] == pytest.approx(found[1], rel=0.01)
+
+
 def holding(drive: str) -> Rig:
     """Return a rig that has reached its torque and holds it."""
     hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 60}

@@ -16,6 +16,7 @@ from pydantic import ConfigDict
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
+from shearloop.daemon.control.operator_view import CLAMPED_CURE
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
@@ -28,6 +29,10 @@ from shearloop.mistakes import validated
 VERSION = 1
 # The file is written at this interval, and at the start of each experiment.
 FOLLOWS_S = 0.1
+# A known zero of the wrench needs a step: the command tares sensors alone.
+RELEASE_AND_TARE = "run an experiment that begins with the steps `release` and `tare`"
+# Nothing shows that another tool was clamped.
+CLAMPED_ANOTHER = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
 # A state takes some hundred bytes.
 _MOST_BYTES = 1 << 16
 # A name that had no address at the start is looked up again at this interval.
@@ -64,7 +69,7 @@ class Remembered:
 
     @property
     def grips(self) -> bool:
-        """Whether the gripper may hold a tool."""
+        """Whether a tool may be held, by the gripper or a clamp."""
         return self.grip != NO_GRIP or self.load_zero is not None or self.wrench_zero is not None
 
     @property
@@ -81,7 +86,7 @@ class Remembered:
             )
             if value is not None
         ]
-        return ", ".join(["a tool may be in the fingers", *known])
+        return ", ".join(["a tool may be held", *known])
 
     @property
     def faults(self) -> tuple[Fault, ...]:
@@ -181,13 +186,15 @@ class RigMemory:
             known = [name for name in zeros if name != WRENCH or self._wrench_tared]
             for name in known:
                 self.loop.on_restored_zero(name)
+            clamped = not self.loop.tool.has_gripper
             if known:
-                log.info("the zeros of the present tool are kept", of=known)
+                another = {"cure": CLAMPED_ANOTHER} if clamped else {}
+                log.info("the zeros of the present tool are kept", of=known, **another)
             if self._wrench_restored and not self._wrench_tared:
                 log.info(
                     "the wrench has no known zero with the present tool, and its torques may be off by any load",
                     reason="none was taken before the grip, or the last daemon ended while the robot's program started",
-                    cure="`shearloop command release --yes`, then `shearloop command tare`, before a step needs it",
+                    cure=CLAMPED_CURE if clamped else RELEASE_AND_TARE,
                 )
             return
         log.warning(
@@ -259,9 +266,11 @@ class RigMemory:
         robot_state = self.robot.state if self.robot is not None else None
         if robot_state is None:
             return
+        # A start that is given up leaves motion blocked; its program may run on, with a zero of its own.
+        ready = robot_state.program_running and (robot_state.awaits_enable or not robot_state.blocked)
         if robot_state.recovering:
             self._wrench_changes = True
-        elif robot_state.program_running:
+        elif ready:
             self._wrench_changes = False
 
     async def save(self, state: Remembered) -> None:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from statistics import fmean
 from typing import Protocol, runtime_checkable
 
 from shearloop.daemon.loop_config import LoopConfig
@@ -13,6 +14,8 @@ from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 LONGEST_TARE_S = 30.0
 # A torque below this counts as drift: a tare needs no confirmation.
 LOADED_NM = 0.05
+# A stretch within the noise may be a load if its mean exceeds this fraction of the noise. Noise has a smaller mean.
+_LOAD_IN_NOISE = 0.5
 CONFIRM_TARE = "take the load off, or confirm with `shearloop command tare --yes` that there is none"
 # The sources of the robot's own torque, and of the load cell's.
 WRENCH, LOAD_CELL = "wrench", "load_cell"
@@ -130,7 +133,8 @@ class LatestTorques:
 def beyond_noise(times_ns: Sequence[int], torques_nm: Sequence[float], noise_nm: float) -> list[float]:
     """Return torques beyond a source's noise, 0 between loads, and NaN where a load may begin or end.
 
-    Noise about 0 would look like small loads. A stretch within the noise is 0 in its middle half.
+    Noise about 0 would look like small loads. A stretch within the noise is 0 in its middle half, unless its mean is so
+    far from 0 that it may be a small load.
     """
     found: list[float] = []
     for is_noise, stretch in groupby(zip(times_ns, torques_nm, strict=True), lambda one: abs(one[1]) <= noise_nm):
@@ -140,9 +144,10 @@ def beyond_noise(times_ns: Sequence[int], torques_nm: Sequence[float], noise_nm:
             continue
         first_ns, last_ns = samples[0][0], samples[-1][0]
         quarter_ns = 0.25 * (last_ns - first_ns)
+        may_be_load = abs(fmean(torque_nm for _, torque_nm in samples)) > _LOAD_IN_NOISE * noise_nm
         for t_ns, _ in samples:
             in_the_middle = first_ns + quarter_ns <= t_ns <= last_ns - quarter_ns
-            found.append(0.0 if in_the_middle else math.nan)
+            found.append(0.0 if in_the_middle and not may_be_load else math.nan)
     return found
 
 

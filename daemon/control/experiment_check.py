@@ -85,8 +85,8 @@ _UNTURNED, _UNKNOWN = _Bounds(0.0, 0.0), _Bounds(-math.inf, math.inf)
 def turns(file: ExperimentFile) -> Iterator[Turn]:
     """Yield what each step turns."""
     angle_rad = torque_nm = _UNTURNED
-    # Whether a tool may be held: a `grip` then closes tighter on it, and its angle goes on.
-    held = False
+    # Whether a tool may be held, by a clamp or by the fingers. A `grip` then closes tighter, and the angle goes on.
+    held = True
     # The angle of the wrist joint.
     wrist_rad: float | None = None
     for step in file.steps:

@@ -486,9 +486,20 @@ def wrist_after(step: Step, wrist_rad: float | None) -> float | None:
             return angles_rad[-1]
         case TwistStep() | TightenStep() | HoldTorqueStep() | IdentifyStep():
             return None
-        case ApproachStep(pose_m_rad=tuple()):
+        case ApproachStep():
+            # Most straight lines turn wrist 3 as well.
             return None
     return wrist_rad
+
+
+def _line_s(step: ApproachStep, start: Sequence[float], end: Sequence[float], speeds: Speeds) -> float:
+    """Return how long a straight move between two poses takes: the tool turns evenly, no faster than the wrist may."""
+    speed = min(step.speed_m_per_s, speeds.linear_m_per_s)
+    way_m, turn_rad = math.dist(start[:3], end[:3]), turn_between(start, end)
+    if way_m <= ONLY_TURNS_M:
+        # The speed is one in rad/s then.
+        return turn_rad / min(speed, speeds.wrist_rad_per_s)
+    return max(way_m / speed, turn_rad / speeds.wrist_rad_per_s)
 
 
 def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFORE) -> Demand:
@@ -530,11 +541,7 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
             travel_rad = 1.0 if before.wrist_rad is None else abs(angle_rad - before.wrist_rad)
             return Demand(moves_s=SETTLES_S + travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s))
         case ApproachStep(pose_m_rad=tuple() as pose) if before.pose_m_rad is not None:
-            speed = min(step.speed_m_per_s, speeds.linear_m_per_s)
-            way_m, turn_rad = math.dist(pose[:3], before.pose_m_rad[:3]), turn_between(pose, before.pose_m_rad)
-            # The tool turns evenly on its way, and no faster than the wrist may.
-            turns_s = turn_rad / (speed if way_m <= ONLY_TURNS_M else speeds.wrist_rad_per_s)
-            return Demand(moves_s=1.0 + max(way_m / speed, turns_s))
+            return Demand(moves_s=1.0 + _line_s(step, before.pose_m_rad, pose, speeds))
         case ApproachStep():
             return Demand(moves_s=3.0, begins_anywhere=True)
         case GripStep() | ReleaseStep() | AdaptStep():

@@ -23,8 +23,8 @@ from shearloop.daemon.torques import CONFIRM_TARE, TorqueSource, loaded_sentence
 UNTURNED_RAD = 0.02
 # The way out for a clamped tool, also without a known zero.
 CLAMPED_CURE = (
-    "turn it back (a step `turn_to` needs no zero), or loosen its clamp; once nothing loads it, `shearloop command "
-    "release --yes` lets its angle count from 0"
+    "turn it back (a step `turn_to` needs no zero; if a limit stops it, at the pendant), or loosen its clamp; once "
+    "nothing loads it, `shearloop command release --yes` lets its angle count from 0"
 )
 
 

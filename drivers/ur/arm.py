@@ -187,7 +187,7 @@ class UrArm:
     def upload(self, *, held: bool = False) -> None:
         """Send the control script; the controller starts the program, which ends if it receives nothing.
 
-        An e-Series zeroes its wrench when a program starts. If the gripper holds something (`held`), the earlier zero
+        An e-Series zeroes its wrench when a program starts. If a tool may load the wrench (`held`), the earlier zero
         is kept, even if the first sent program has started without an answer.
 
         Raises:
@@ -204,7 +204,7 @@ class UrArm:
         self.script_readiness.command_sent()
 
     def forget_load(self) -> None:
-        """Keep no load for a program that has not answered: the gripper has let go."""
+        """Keep no load for a program that has not answered: the tool is gone."""
         self._held = None
 
     def arm_watchdog(self) -> bool:

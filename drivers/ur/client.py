@@ -104,7 +104,7 @@ class UrRobot:
         self._wrench_zero = self._restored_zero = zero
 
     def forget_wrench_zero(self) -> None:
-        """Remove the restored zero, because the gripper holds another object than the zero was measured with."""
+        """Remove the restored zero, because the tool is another one than the zero was measured with."""
         if not any(self._restored_zero):
             return
         pairs = zip(self._wrench_zero, self._restored_zero, strict=True)

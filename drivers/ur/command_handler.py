@@ -76,7 +76,7 @@ class Recovery:
         # Whether the attempt has succeeded, or why it has ended otherwise.
         self.ready = False
         self.refusal: str | None = None
-        # Whether the gripper holds something.
+        # Whether a tool may load the wrench.
         self.held = False
         # The daemon sees that the zero of the wrench may change, a second before the program starts.
         arm.measure_load_anew()
@@ -192,7 +192,7 @@ class CommandHandler:
         # Whether messages that came late can be that reason.
         self._disabled_late = False
         self._daemon_alive_ns = now_ns
-        # Whether the gripper holds something, as the daemon says.
+        # Whether a tool may load the wrench, as the daemon says.
         self._held_tool = False
         # Whether the daemon disconnects: only stops are accepted from then on.
         self.leaving = False

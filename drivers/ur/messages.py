@@ -138,7 +138,7 @@ class Unlock:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Whether the gripper holds something, or may; and for a new worker the zero of the wrench that another one had.
+    """Whether a tool may load the wrench; and for a new worker the zero of the wrench that another one had.
 
     Sent to each new worker, and at each change.
     """

@@ -393,8 +393,9 @@ def clip_linear(asked: MoveLinear, here: Six, limits: UrLimits) -> tuple[MoveLin
         asked.acceleration_m_per_s2, limits.linear_acceleration_m_per_s2, "linear acceleration", reasons
     )
     way_m, turn_rad = math.dist(here[:3], asked.pose[:3]), turn_between(here, asked.pose)
-    if way_m > ONLY_TURNS_M and turn_rad > 0:
-        m_per_rad = way_m / turn_rad
+    if turn_rad > 0:
+        # The speed of a move that only turns is one in rad/s.
+        m_per_rad = way_m / turn_rad if way_m > ONLY_TURNS_M else 1.0
         turning_m_per_s = m_per_rad * limits.wrist_speed_rad_per_s.inner
         if speed > turning_m_per_s:
             reasons.append(f"linear speed is limited to {turning_m_per_s:.2g}: the tool turns by {turn_rad:.2g} rad")

@@ -3,7 +3,8 @@
 import math
 from collections.abc import Sequence
 
-# The controller takes the speed of a shorter straight move, which only turns the tool, in rad/s.
+# A straight move over a shorter way only turns the tool, and the controller takes its speed in rad/s. This limit is an
+# assumption: UR publishes none.
 ONLY_TURNS_M = 1e-6
 
 

@@ -142,7 +142,7 @@ def control_program(settings: UrSettings, registers: ScriptRegisters = UPPER, lo
     Its first statement starts the watchdog on the register that the client writes, so the program ends if its client
     dies later. URScript manual, `rtde_set_watchdog`: a program's watchdogs end with it.
 
-    `load` is given if the gripper holds something and the controller zeroes its wrench at the start. It is the wrench
+    `load` is given if a tool may load the wrench and the controller zeroes its wrench at the start. It is the wrench
     before the start, in N and N·m in the base's frame. Turns about the tool's axis do not change its part along that
     axis.
     """

@@ -44,11 +44,13 @@ def rig(folder: Path, model: str = "2F-140", **keys: object) -> Path:
     return path
 
 
-# The delivered experiments that turn a tool back on purpose, and at which step.
-RETURNS = {
+# The notes of the delivered experiments, by step.
+NOTES = {
+    # A straight line before it turns the wrist too, by what the plan does not know.
+    "torque_sweep": {7: ["a tool may be held, and turns too: which way, and how far, depends on where wrist 3 stands"]},
     "skin_hold_shear": {
         4: ["reversal: twist turns clockwise, against step 3 (hold_torque), which turned counterclockwise"]
-    }
+    },
 }
 
 
@@ -68,7 +70,7 @@ def test_the_plan_of_every_delivered_experiment_is_in_words_and_in_numbers(path,
     assert planned["duration_s"] == pytest.approx(sum(step["duration_s"] for step in planned["steps"]))
     assert not any(step["refused"] for step in planned["steps"])
     notes = {step["number"]: step["notes"] for step in planned["steps"] if step["notes"]}
-    assert notes == RETURNS.get(path.stem, {})
+    assert notes == NOTES.get(path.stem, {})
 
 
 def test_a_reversal_is_pointed_out_at_its_step(tmp_path, result_of, ran):
@@ -242,12 +244,14 @@ TURN = {"do": "turn_to", "angle_rad": 0.25}
 @pytest.mark.parametrize(
     ("steps", "by_angle", "unknown", "direction"),
     [
-        ([TURN], False, False, ""),
+        ([TURN], True, True, ""),
+        ([{"do": "release"}, TURN], False, False, ""),
         ([GRIP, TURN], True, True, ""),
         ([GRIP, {"do": "release"}, TURN], False, False, ""),
-        ([{"do": "turn_to", "angle_rad": 0.1}, GRIP, TURN], True, False, "counterclockwise"),
+        ([{"do": "release"}, {**TURN, "angle_rad": 0.1}, GRIP, TURN], True, False, "counterclockwise"),
         ([GRIP, {"do": "twist", "angles_rad": [0.1]}, TURN], True, True, ""),
-        ([{**TURN, "angle_rad": 0.4}, GRIP, TURN], True, False, "clockwise"),
+        ([{"do": "release"}, {**TURN, "angle_rad": 0.4}, GRIP, TURN], True, False, "clockwise"),
+        ([{"do": "release"}, TURN, GRIP, {"do": "approach", "along_tool_m": 0.1}, TURN], True, True, ""),
     ],
 )
 def test_a_turn_of_the_wrist_with_a_held_tool_twists_it(steps, by_angle, unknown, direction):

@@ -183,7 +183,7 @@ def test_a_gripper_of_a_daemon_is_refused_and_what_it_may_hold_is_said_before_it
                 "From the last program: the daemon ended"
             )
             calibrate.tell("")
-            calibrate.hear("From the last program: a tool may be in the fingers, gripped with at most 60 N. Look at")
+            calibrate.hear("From the last program: a tool may be held, gripped with at most 60 N. Look at")
             calibrate.tell("")
             calibrate.hear("The fingers will open")
             calibrate.end()

@@ -55,7 +55,7 @@ class Operator:
     answer: Callable[[str], str]
     say: Callable[[str], None]
     play: Play | None = None
-    allows: bool = True
+    allows: bool = False
 
     def ask(self, question: str, played: Played | None = None) -> str:
         """Return the answer, without blanks around it."""

@@ -15,7 +15,7 @@ from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.wrench import wrench_source
-from shearloop.daemon.torques import TorqueSample
+from shearloop.daemon.torques import TorqueSample, beyond_noise
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, started, stop
 
 
@@ -752,3 +752,12 @@ def test_torques_within_the_noise_of_their_source_are_no_loads():
     np.testing.assert_array_equal(found, [0.2, np.nan, 0.0, 0.0, 0.0, np.nan, -0.06, 0.3])
     assert loop.torques_of("load_cell")[1] == torques_nm
     assert loop.torques_of("other") == ([], [])
+
+
+@pytest.mark.parametrize(("hold_nm", "is_known"), [(0.0, True), (0.04, False), (-0.045, False)])
+def test_a_small_load_within_the_noise_is_not_taken_for_none(hold_nm, is_known):
+    """As a true 0 it would teach `adapt` a gain that is too low."""
+    noise = np.random.default_rng(2).normal(0.0, 0.003, 100)
+    found = beyond_noise(range(100), (hold_nm + noise).clip(-0.05, 0.05).tolist(), 0.05)
+    assert bool(np.nanmax(np.abs(found), initial=0.0) == 0.0)
+    assert bool(np.isfinite(found).any()) is is_known

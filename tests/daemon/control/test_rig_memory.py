@@ -21,6 +21,8 @@ from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, re
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.command_handler import BEING_MADE_READY
+from shearloop.drivers.ur.motion import NOT_OURS
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS, HandlerBench
 
@@ -521,15 +523,17 @@ async def test_a_daemon_that_is_killed_while_a_program_starts_leaves_no_zero_of_
     before.run(0.6)
     robot, ready = UrRobot(SETTINGS), HandlerBench().state
     memory = RigMemory(FILES, before.control_loop, robot=robot)
-    for recovering, program_running, tared in (
-        (False, True, True),
-        (True, False, False),
-        # A start that was given up; the program may have begun.
-        (False, False, False),
-        (True, True, False),
-        (False, True, True),
+    for recovering, program_running, blocked, tared in (
+        (False, True, "", True),
+        (True, False, BEING_MADE_READY, False),
+        # A start that was given up; the program may have begun, and its state plays for a while.
+        (False, False, NOT_OURS, False),
+        (True, True, BEING_MADE_READY, False),
+        (False, True, NOT_OURS, False),
+        (False, True, "", True),
     ):
         runtime_state = 2 if program_running else 1
-        robot.handle_message(0, replace(ready, recovering=recovering, runtime_state=runtime_state))
+        state = replace(ready, recovering=recovering, runtime_state=runtime_state, blocked=blocked)
+        robot.handle_message(0, state)
         await memory.save_present()
         assert read_memories(FILES).wrench_tared is tared

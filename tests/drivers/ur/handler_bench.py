@@ -83,6 +83,8 @@ class FakeArm:
         self.refuses: dict[str, str] = {}
         self.ignores: dict[str, str] = {}
         self.stale_command = False
+        # Whether the load has been measured since this start began.
+        self.load_is_new = False
         self._resumed_target = 0.0
         self._watched = False
         self._since_call_ns = 0
@@ -169,7 +171,7 @@ class FakeArm:
         return True
 
     def measure_load_anew(self) -> None:
-        pass
+        self.load_is_new = True
 
     def knows_load(self, *, held: bool) -> bool:  # noqa: ARG002 - nothing is measured here
         return True
@@ -203,6 +205,7 @@ class FakeArm:
         self.calls.append("forget_load")
 
     def upload(self, *, held: bool = False) -> None:
+        assert self.load_is_new, "a load from before this start could be of another zero"
         self.calls.append("upload, held" if held else "upload")
         if self.stale_command:
             self.target = 0.8
@@ -212,6 +215,7 @@ class FakeArm:
     def arm_watchdog(self) -> bool:
         self.note("arm_watchdog")
         self._watched = True
+        self.load_is_new = False
         return True
 
 

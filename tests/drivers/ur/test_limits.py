@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.motion import clip_linear, clip_stop, clip_wrist, is_close, line_violation, violation
 from shearloop.drivers.ur.poses import ONLY_TURNS_M, turn_between
-from shearloop.drivers.ur.settings import InstalledTool
+from shearloop.drivers.ur.settings import InstalledTool, WristAccelerationBound, WristSpeedBound
 from tests.drivers.ur.handler_bench import AT_REST, LIMITS, POSE, SETTINGS, enabled
 
 CYCLE_S = 0.008
@@ -267,13 +267,25 @@ def test_the_turn_between_two_poses(one, other):
     ("way_m", "turn_rad"), [(0.001, 1.5), (0.01, 1.5), (0.1, 0.1), (0.1, 0.0), (0.0, 1.0), (1e-16, 1.0), (1e-7, 1.0)]
 )
 def test_a_straight_move_turns_the_tool_no_faster_than_the_wrist_may(way_m, turn_rad):
-    """One that only turns, but for rounding, keeps its speed: the controller takes it in rad/s."""
+    """The speed of one that only turns, but for rounding, is in rad/s."""
     here = (0.4, 0.1, 0.0, math.pi, 0.0, 0.0)
     turned = (Rotation.from_rotvec(here[3:]) * Rotation.from_rotvec((0.0, 0.0, turn_rad))).as_rotvec()
     asked = MoveLinear((0.4, 0.1, way_m, *map(float, turned)), 0.05, 0.3)
     sent, reasons = clip_linear(asked, here, LIMITS)
-    if way_m > ONLY_TURNS_M:
-        assert turn_rad / way_m * sent.speed_m_per_s <= LIMITS.wrist_speed_rad_per_s.inner + 1e-9
-        assert turn_rad / way_m * sent.acceleration_m_per_s2 <= LIMITS.wrist_acceleration_rad_per_s2.inner + 1e-9
+    rad_per_m = turn_rad / way_m if way_m > ONLY_TURNS_M else 1.0
+    assert rad_per_m * sent.speed_m_per_s <= LIMITS.wrist_speed_rad_per_s.inner + 1e-9
+    assert rad_per_m * sent.acceleration_m_per_s2 <= LIMITS.wrist_acceleration_rad_per_s2.inner + 1e-9
     assert any("the tool turns" in reason for reason in reasons) is (sent.speed_m_per_s < 0.05)
     assert (sent.speed_m_per_s < 0.05) is (turn_rad == 1.5)
+
+
+@pytest.mark.parametrize("way_m", [0.0, 1e-7])
+def test_a_move_that_only_turns_the_tool_is_as_slow_as_the_wrist(way_m):
+    limits = dataclasses.replace(
+        LIMITS,
+        wrist_speed_rad_per_s=WristSpeedBound(0.02, 0.35),
+        wrist_acceleration_rad_per_s2=WristAccelerationBound(0.1, 8.0),
+    )
+    asked = MoveLinear((0.4, 0.1, way_m, math.pi / 2, 0.0, 0.0), 0.1, 0.5)
+    sent, _ = clip_linear(asked, (0.4, 0.1, 0.0, math.pi, 0.0, 0.0), limits)
+    assert (sent.speed_m_per_s, sent.acceleration_m_per_s2) == (0.02, 0.1)

@@ -103,7 +103,7 @@ def stage_0(tmp_path: Path, answers: list[str], version: str, tool: InstalledToo
 
     rig = SimpleNamespace(outputs=lambda _: replace(OUTPUTS, **changed))
     settings, controller = replace(read_settings(config.robot), tool=tool), replace(CONTROLLER, version=version)
-    operator = Operator(answer, lambda _: None)
+    operator = Operator(answer, lambda _: None, allows=True)
     measured = identity.measure(Context(config, settings, rig, controller, operator, None, Counts(), ExitStack()))
     assert answers == []
     return {line.what: line for line in measured.lines}, asked

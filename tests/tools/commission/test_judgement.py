@@ -424,9 +424,14 @@ def test_a_gauge_is_judged_by_the_table_of_the_others():
     line, supplied = judge_widths(gauges, SimpleNamespace(model="2F-140"))
     assert (failed([line]), supplied.widths) == (["widths"], None)
     assert line.value.startswith("1.6")
-    # The outermost ones are judged by a table that goes through them.
-    line, _ = judge_widths([gauges[0], gauges[4]], SimpleNamespace(model="2F-140"))
-    assert line.value.startswith("0.00")
+
+
+def test_two_widths_confirm_no_table():
+    """Both may be mistyped alike."""
+    gauges = [(10.0, 100.0), (10.0, 100.0), (170.0, 20.0), (170.0, 20.0), (170.0, 20.0)]
+    line, supplied = judge_widths(gauges, SimpleNamespace(model="2F-140"))
+    assert (failed([line]), supplied.widths) == (["widths"], None)
+    assert "fewer than 3 different widths" in line.value
 
 
 def test_the_robot_itself_bounds_every_motion():

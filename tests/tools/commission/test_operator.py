@@ -14,7 +14,7 @@ QUESTIONS = {WORD: Operator.allow, DONE: Operator.act}
 
 def answering(answers: list[str]) -> tuple[Operator, list[str]]:
     said: list[str] = []
-    return Operator(lambda _: answers.pop(0), said.append), said
+    return Operator(lambda _: answers.pop(0), said.append, allows=True), said
 
 
 @pytest.mark.parametrize("word", QUESTIONS)
@@ -74,7 +74,7 @@ def test_a_pose_that_changes_while_it_is_asked_for_is_asked_for_again():
         return SimpleNamespace(wrist_rad=stands_rad[0], outputs=SimpleNamespace(q_rad=(0.0, stands_rad[0])))
 
     rig = SimpleNamespace(observer=lambda _: nullcontext(SimpleNamespace(latest=latest)))
-    operator, controller = Operator(answer, lambda _: None), SimpleNamespace(registers=None)
+    operator, controller = Operator(answer, lambda _: None, allows=True), SimpleNamespace(registers=None)
     context = Context(None, None, rig, controller, operator, None, Counts(), ExitStack())
     assert context.pose_rad == 0.5
     assert ["stands at 0.300" in asked[0], "stands at 0.500" in asked[1]] == [True, True]
@@ -84,7 +84,7 @@ def test_a_pose_that_changes_while_it_is_asked_for_is_asked_for_again():
 
 def test_a_script_allows_no_motion():
     said: list[str] = []
-    operator = Operator(lambda question: said.append(question) or WORD, said.append, allows=False)
+    operator = Operator(lambda question: said.append(question) or WORD, said.append)
     with pytest.raises(UserError, match="do not come from a terminal"):
         operator.allow("the fingers close")
     assert said == []

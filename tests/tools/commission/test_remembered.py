@@ -59,14 +59,14 @@ def test_each_motion_says_that_a_tool_may_be_held(lab):
     write_memory(memory_path(HOST), GRIP)
     lab.run("3")
     assert len(motions(lab)) > 0
-    assert all("a tool may be in the fingers, gripped with at most 60 N" in motion for motion in motions(lab))
+    assert all("a tool may be held, gripped with at most 60 N" in motion for motion in motions(lab))
     assert read_memory(memory_path(HOST)) == GRIP
 
 
 def test_the_fingers_open_once_a_tool_that_may_be_held_is_secured_and_the_grip_is_over(lab):
     write_memory(memory_path(HOST), GRIP)
     lab.operator.declined = "Stage 2 gripper opens the fingers, and it drops"
-    with pytest.raises(DeclinedError, match="A tool may be in the fingers"):
+    with pytest.raises(DeclinedError, match="A tool may be held"):
         lab.run("2")
     assert motions(lab) == []
     assert read_memory(memory_path(HOST)) == GRIP

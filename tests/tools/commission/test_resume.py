@@ -46,7 +46,7 @@ def test_a_setting_that_one_stage_judges_makes_only_that_stage_run_again(tmp_pat
     def run() -> list[str]:
         ran.clear()
         procedure.commission(
-            load_daemon_config(path), path, out, Operator(lambda _: WORD, said.append), Counts(), (), RIG
+            load_daemon_config(path), path, out, Operator(lambda _: WORD, said.append, allows=True), Counts(), (), RIG
         )
         return list(ran)
 
@@ -70,7 +70,9 @@ def test_stages_are_kept_blocked_and_continued(tmp_path, monkeypatch):
 
     def run(only: str = "") -> list[str]:
         ran.clear()
-        operator = Operator(lambda question: WORD if any(one in question for one in allowed) else "no", lambda _: None)
+        operator = Operator(
+            lambda question: WORD if any(one in question for one in allowed) else "no", lambda _: None, allows=True
+        )
         procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only, RIG)
         return list(ran)
 

@@ -94,12 +94,14 @@ async def _grip(
                     await operator.ask(f"From the last program: {sentence}. Look at the rig, then press Enter.")
             warning = "The fingers will open and close. Empty them, keep your hands clear, then press Enter."
             await operator.ask(warning)
-            await gripper.activate(operator_confirmed=True)
+            async with gripper.halted_if_interrupted():
+                await gripper.activate(operator_confirmed=True)
             gauges: list[tuple[float, float]] = []
             while len(gauges) < len(diameters_mm):
                 diameter_mm = diameters_mm[len(gauges)]
                 await operator.ask(f"Hold the object of {diameter_mm:g} mm between the fingertips, then press Enter.")
-                counts = await _contact(gripper)
+                async with gripper.halted_if_interrupted():
+                    counts = await _contact(gripper)
                 if counts is None:
                     print("Refused: the fingers closed without meeting anything.", file=sys.stderr, flush=True)
                 else:

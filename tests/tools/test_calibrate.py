@@ -1,10 +1,13 @@
 """The guided calibrations and the emulators from the command line, each as a process of its own."""
 
+import asyncio
 import contextlib
 import json
+import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from itertools import cycle
 
 import pytest
@@ -17,7 +20,8 @@ from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import SerialPort
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.load_cell import LoadCalibration
-from shearloop.drivers.robotiq.gripper import WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.emulators.boards import Hx711Board
 from tests.running import running
 
@@ -188,6 +192,64 @@ def test_a_gripper_of_a_daemon_is_refused_and_what_it_may_hold_is_said_before_it
             calibrate.hear("The fingers will open")
             calibrate.end()
     assert read_memory(memory_path("127.0.0.1")).running == "loosen", "the arm waits for its own acknowledgement"
+
+
+COMMISSIONING = """
+import sys
+from shearloop.daemon.process import raise_ending_signals
+from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.tools.commission.fingers import ConnectedGripper, close_fingers
+
+client = SocketClient(sys.argv[1], int(sys.argv[2]))
+with raise_ending_signals(), ConnectedGripper(RobotiqGripper(client, WidthCalibration.nominal())) as gripper:
+    gripper.activate(operator_confirmed=True)
+    close_fingers(gripper)
+"""
+
+
+async def halted_mm(host: str, port: int, interrupt: Callable[[], None]) -> tuple[float, float]:
+    """Interrupt while the fingers close; return their width at once after that, and many readings later."""
+    gripper = RobotiqGripper(SocketClient(host, port), WidthCalibration.nominal(), poll_s=0.01)
+    await gripper.connect()
+    try:
+        # An activation opens them first.
+        while (await gripper.read()).width_mm < 135.0:
+            continue
+        while (await gripper.read()).width_mm > 125.0:
+            continue
+        await asyncio.to_thread(interrupt)
+        first = await gripper.read()
+        for _ in range(50):
+            last = await gripper.read()
+        return first.width_mm, last.width_mm
+    finally:
+        await gripper.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM])
+@pytest.mark.parametrize("program", ["calibrate", "commission"])
+def test_fingers_that_close_are_halted_by_the_end_of_the_program(program, number, tmp_path):
+    """They would go on by themselves, onto a hand that reaches for what stopped."""
+    with Process("emulate", "gripper-socket", "--port", "0", "--speed", "3") as emulated:
+        host, _, port = emulated.hear("127.0.0.1:").partition(":")
+        given = ("--diameter-mm", "10", "--diameter-mm", "40", "--out", str(tmp_path / "gripper.yaml"))
+        command = [*SHEARLOOP, "calibrate", "gripper", "--host", host, "--socket-port", port, *given]
+        if program == "commission":
+            command = [sys.executable, "-c", COMMISSIONING, host, port]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
+
+            def interrupt() -> None:
+                child.send_signal(number)
+                child.communicate(timeout=30)
+
+            if program == "calibrate":
+                # The fingers may open and close; then they close onto the object.
+                child.stdin.write(b"\n\n")
+                child.stdin.flush()
+            first_mm, last_mm = asyncio.run(halted_mm(host, int(port), interrupt))
+    assert child.returncode != 0
+    assert last_mm == first_mm > 20.0
 
 
 def test_a_gripper_of_another_model_is_measured_where_its_counts_begin_and_bow(tmp_path):

@@ -45,8 +45,16 @@ class ConnectedGripper(Opened):
 
     def close(self) -> None:
         """Close the connection."""
-        self._runner.run(self._gripper.close())
+        self._runner.run(self._close())
         self._runner.close()
+
+    async def _close(self) -> None:
+        # A signal that ends the program may leave a motion, which halts the fingers as it is cancelled.
+        motions = asyncio.all_tasks() - {asyncio.current_task()}
+        for motion in motions:
+            motion.cancel()
+        await asyncio.gather(*motions, return_exceptions=True)
+        await self._gripper.close()
 
     @property
     def model(self) -> GripperModel:
@@ -55,7 +63,7 @@ class ConnectedGripper(Opened):
 
     def activate(self, *, operator_confirmed: bool = False) -> None:
         """Return once the gripper is active."""
-        self._runner.run(self._gripper.activate(operator_confirmed=operator_confirmed))
+        self._runner.run(self._activate(operator_confirmed=operator_confirmed))
 
     def poll(self) -> GripperState:
         """Return the gripper's state as the daemon polls it."""
@@ -65,8 +73,13 @@ class ConnectedGripper(Opened):
         """Move the fingers, and return the state at their target or on an object."""
         return self._runner.run(self._move(command))
 
+    async def _activate(self, *, operator_confirmed: bool) -> None:
+        async with self._gripper.halted_if_interrupted():
+            await self._gripper.activate(operator_confirmed=operator_confirmed)
+
     async def _move(self, command: GripperCommand) -> GripperState:
-        return await self._gripper.finish(await self._gripper.move(command))
+        async with self._gripper.halted_if_interrupted():
+            return await self._gripper.finish(await self._gripper.move(command))
 
 
 def open_fingers(gripper: Gripper, force_n: float = GENTLE_N) -> None:

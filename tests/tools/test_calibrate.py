@@ -46,7 +46,8 @@ class Process(contextlib.AbstractContextManager["Process", None]):
         self.said: list[str] = []
 
     def __exit__(self, *_: object) -> None:
-        self.end()
+        with self._child:
+            self.end()
 
     def tell(self, line: str) -> None:
         self._child.stdin.write(f"{line}\n")
@@ -77,8 +78,14 @@ class Process(contextlib.AbstractContextManager["Process", None]):
             self.hear(f"  {mass_g} g:", on_stderr=on_stderr)
 
     def end(self) -> tuple[int, str, str]:
-        out, err = self._child.communicate(timeout=30)
-        return self._child.returncode, out, err
+        """Close its input; return its status and what it said that nobody has heard yet.
+
+        `communicate` would not do: it reads the pipes beside the streams, whose buffers may hold lines already.
+        What these commands say fits into a pipe, so that none of them waits for a reader.
+        """
+        self._child.stdin.close()
+        status = self._child.wait(timeout=30)
+        return status, self._child.stdout.read(), self._child.stderr.read()
 
 
 @pytest.mark.parametrize("script", [False, True], ids=["for a person", "for a script"])

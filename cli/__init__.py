@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 from shearloop.daemon.errors import USER_ERRORS
 from shearloop.daemon.process import interrupt_status, raise_ending_signals
 from shearloop.errors import UserError
-from shearloop.printable import printable_output
+from shearloop.printable import OutputError, open_closed_streams, printable_output, silence
 
 # Our products are small: a BLAS with one thread is faster. Must be set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -165,8 +165,22 @@ def command_module(name: str) -> ModuleType:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; print a user's mistake as one sentence on stderr and return status 2."""
+    open_closed_streams()
     with printable_output():
-        return _run(argv)
+        try:
+            try:
+                return _run(argv)
+            finally:
+                sys.stdout.flush()
+        except BrokenPipeError:
+            # The reader of our output (`| head`) has closed the pipe; that is no error.
+            silence(sys.stdout)
+            return EXIT_OK
+        except OutputError as error:
+            silence(sys.stdout)
+            with contextlib.suppress(OSError):
+                print(f"shearloop: the output cannot be written: {error.strerror}", file=sys.stderr)
+            return EXIT_USAGE
 
 
 def _run(argv: Sequence[str] | None) -> int:
@@ -191,10 +205,6 @@ def _run(argv: Sequence[str] | None) -> int:
     except USER_ERRORS as error:
         print(f"{program}: {error}", file=sys.stderr)
         return EXIT_USAGE
-    except BrokenPipeError:
-        # The reader of our output (`| head`) has closed the pipe; that is no error.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_OK
     except KeyboardInterrupt as interrupt:
         if program not in _ENDED_BY_INTERRUPT:
             # A closed terminal accepts no output.

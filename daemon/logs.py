@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TextIO, cast
 import structlog
 
 from shearloop.drivers.connection import LinkEvent
-from shearloop.printable import own_stream, printable
+from shearloop.printable import own_stream, printable, silence
 
 if TYPE_CHECKING:
     from shearloop.daemon.torques import SensorListener
@@ -75,13 +75,6 @@ class NonBlockingWriter:
             except OSError as error:
                 silence(self._stream)
                 structlog.get_logger().warning("the output has no reader any more", reason=error.strerror)
-
-
-def silence(stream: TextIO) -> None:
-    """Redirect a stream without a reader to the null device, so that its buffer does not fail again."""
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, stream.fileno())
-    os.close(null)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, commissioning_of, measured_widths
 from shearloop.daemon.config import DaemonConfig, GripperConfig
+from shearloop.daemon.control.action_executor import no_state
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment_schema import first_motion
@@ -341,10 +342,11 @@ def build_rig(
     sensors = build_sensors(config, publisher, clock, recorder, sessions, loop, gripper)
     robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), settings_for=commissioning.on_controller)
     robot.holds = loop.tool.may_be_loaded
-    runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock)
+    memory = RigMemory(files, loop, sensors.load_cell, robot) if keeps_memory(config) else None
+    write_state = memory.save_present if memory is not None else no_state
+    runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock, write_state)
     experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning)
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
-    memory = RigMemory(files, loop, sensors.load_cell, robot) if keeps_memory(config) else None
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
     if memory is not None:
         tasks["memory"] = memory

@@ -93,7 +93,7 @@ class Remembered:
         """The faults of the stop that waits for the operator, one for each code; a killed experiment is one of them."""
         entries = list(self.stop)
         if self.running:
-            ended = f"it was killed, it crashed or the power failed while {self.running!r} was under way"
+            ended = f"it was killed, it crashed, or power or disk failed while {self.running!r} was under way"
             entries.append((FaultCode.DAEMON_ENDED.name, ended))
         details: dict[FaultCode, list[str]] = {}
         for name, detail in entries:
@@ -232,11 +232,10 @@ class RigMemory:
     async def begins(self, experiment: str) -> str | None:
         """Write that an experiment begins, before anything moves; return why it cannot be written, or None."""
         self.starting = experiment
-        await self.save_present()
-        return self.error or None
+        return await self.save_present()
 
-    async def save_present(self) -> None:
-        """Write the present state, unless the file has it already."""
+    async def save_present(self) -> str | None:
+        """Write the present state, unless the file has it already; return why it cannot be written, or None."""
         self._watch_wrench()
         state = Remembered.of(self.loop)
         state = replace(state, running=state.running or self.starting)
@@ -246,6 +245,7 @@ class RigMemory:
         if self.robot is not None and self.loop.tool.may_be_loaded():
             state = replace(state, wrench_zero=self.robot.wrench_zero, wrench_tared=self._knows_wrench_zero)
         await self.save(state)
+        return self.error or None
 
     @property
     def _knows_load_zero(self) -> bool:

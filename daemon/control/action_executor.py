@@ -11,7 +11,14 @@ import structlog
 from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import Action
-from shearloop.daemon.control.experiment_schema import AdaptStep, ApproachStep, GripStep, IdentifyStep, TareStep
+from shearloop.daemon.control.experiment_schema import (
+    AdaptStep,
+    ApproachStep,
+    GripStep,
+    IdentifyStep,
+    Opening,
+    TareStep,
+)
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.supervisor import error_text
@@ -41,6 +48,14 @@ GIVES_UP_BEFORE_S = 0.1
 UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
 
 
+# Writes the state that a later daemon finds; returns why it cannot be written, or None.
+WriteState = Callable[[], Awaitable[str | None]]
+
+
+async def no_state() -> None:
+    """Write nothing: the state of a rig that ends with its daemon."""
+
+
 @dataclass(slots=True)
 class ActionExecutor:
     """Carries out one action at a time; a straight move that is interrupted continues to its end afterwards."""
@@ -50,6 +65,7 @@ class ActionExecutor:
     sensors: Mapping[str, Tareable]
     sender: CommandSender
     control_loop: ControlLoop
+    write_state: WriteState = no_state
     # The fingers may be on their way; cleared by a stop of the fingers.
     fingers_move: bool = False
     # Set while straight moves may go on.
@@ -199,9 +215,11 @@ class ActionExecutor:
             case GripStep():
                 if self.gripper is None:
                     raise ActionError("no gripper is configured; add a `gripper` section to the configuration")
-                # After a failure, such as a lost connection, the fingers may still move.
-                self.fingers_move = True
                 try:
+                    if not isinstance(action, Opening):
+                        await self._write_new_grip()
+                    # After a failure, such as a lost connection, the fingers may still move.
+                    self.fingers_move = True
                     await self.gripper.grip(action)
                 except NotBegunError:
                     # A halt would only make the gripper forget that it holds something.
@@ -210,6 +228,8 @@ class ActionExecutor:
                     raise
                 self.fingers_move = False
             case TareStep():
+                if reason := await self.write_state():
+                    raise ActionError(f"no zero was taken: {reason}")
                 loop, longest_s = asyncio.get_running_loop(), action.timeout_s or LONGEST_TARE_S
                 until_s = loop.time() + longest_s - GIVES_UP_BEFORE_S
                 await self._rest()
@@ -222,6 +242,16 @@ class ActionExecutor:
                 await sensor.adapt(action.reference)
             case IdentifyStep():
                 raise TypeError("the control loop identifies by itself")
+
+    async def _write_new_grip(self) -> None:
+        """Write the grip that begins: a later daemon would go on with an earlier one; raises NotBegunError."""
+        try:
+            reason = await self.write_state()
+        except asyncio.CancelledError:
+            self.control_loop.tool.on_grip_refused()
+            raise
+        if reason:
+            raise NotBegunError(f"the fingers were not closed: {reason}")
 
     async def _rest(self) -> None:
         """Wait until no motion is under way; raises ActionError.

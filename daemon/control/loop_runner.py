@@ -6,7 +6,7 @@ from contextlib import suppress
 import structlog
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.action_executor import UNLOCKING, ActionExecutor
+from shearloop.daemon.control.action_executor import UNLOCKING, ActionExecutor, WriteState, no_state
 from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import Experiment, ExperimentPhase
@@ -50,14 +50,15 @@ class ControlLoopRunner:
         sensors: Mapping[str, Tareable],
         publisher: Publisher,
         clock: Clock,
+        write_state: WriteState = no_state,
     ) -> None:
-        """`sensors` are those that an experiment tares or adapts."""
+        """`sensors` are those that an experiment tares or adapts; `write_state` is as in `ActionExecutor`."""
         self._control_loop = control_loop
         self._robot = robot
         self._clock = clock
         self._timeline = StopTimeline()
         self._sender = CommandSender(robot, control_loop, self._timeline, clock)
-        self.actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop)
+        self.actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop, write_state)
         self.states = StatePublisher(publisher, control_loop)
         self._wrench = WrenchMean(robot.settings.rate_hz)
         self._running = False

@@ -4,6 +4,7 @@ Names, reasons and labels come from files, boards and other computers. JSON esca
 line of JSON stays one.
 """
 
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -42,6 +43,10 @@ def _escaped(text: str) -> str:
     return "".join(f"\\u{units[i] << 8 | units[i + 1]:04x}" for i in range(0, len(units), 2))
 
 
+class OutputError(OSError):
+    """Standard output or standard error cannot be written, for another reason than a reader that is gone."""
+
+
 class PrintableStream:
     """A stream of text that a terminal can show; `own` takes the program's control characters as they are."""
 
@@ -55,20 +60,55 @@ class PrintableStream:
         return PrintableStream(self._stream, controls=True)
 
     def write(self, text: str) -> int:
-        """Write a text; return its length."""
+        """Write a text; return its length; raises BrokenPipeError and OutputError."""
         shown = text if self._controls else printable(text)
-        self._stream.write(encodable(shown, self._stream.encoding))
+        with _output_errors():
+            self._stream.write(encodable(shown, self._stream.encoding))
         return len(text)
+
+    def flush(self) -> None:
+        """Write what is buffered; raises BrokenPipeError and OutputError."""
+        with _output_errors():
+            self._stream.flush()
 
     def __getattr__(self, name: str) -> Any:
         """Return what else the stream has."""
         return getattr(self._stream, name)
 
 
+@contextmanager
+def _output_errors() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(error.errno, error.strerror) from error
+
+
 def own_stream(stream: TextIO) -> TextIO:
     """Return a stream for control characters of the program itself, which can show every text."""
     own = stream.own if isinstance(stream, PrintableStream) else PrintableStream(stream, controls=True)
     return cast(TextIO, own)
+
+
+def open_closed_streams() -> None:
+    """Open the null device for each standard stream that is closed.
+
+    Otherwise the next file would get its number, and the texts of libraries, which print by number.
+    """
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            # The lowest free number is the stream's.
+            os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, os.fdopen(number, mode, closefd=False, encoding="utf-8"))
+
+
+def silence(stream: TextIO) -> None:
+    """Redirect a stream that cannot be written to the null device, so that its buffer does not fail again."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, stream.fileno())
+    os.close(null)
 
 
 @contextmanager

@@ -130,3 +130,19 @@ def test_a_stream_escapes_what_is_not_the_programs_own():
     assert printable("plain µ\n") == "plain µ\n"
     assert encodable("N·m \U0001f600", "ascii") == r"N\u00b7m \ud83d\ude00"
     assert json.loads(f'"{encodable(chr(0x1F600), "ascii")}"') == "\U0001f600"
+
+
+@pytest.mark.parametrize(
+    ("redirection", "status", "said"),
+    [
+        (">&-", 0, ""),
+        ("<&-", 0, ""),
+        ("2>&-", 0, ""),
+        (">/dev/full", 2, "shearloop: the output cannot be written: No space left on device\n"),
+        (">/dev/full 2>&-", 2, ""),
+    ],
+)
+def test_a_closed_or_full_output_is_no_crash(redirection, status, said):
+    command = ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "shearloop", "schema", "experiment"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (status, said)

@@ -184,3 +184,18 @@ async def test_a_daemon_of_another_user_that_gets_the_arm_after_a_kill_moves_not
             still = await standing(rig)
             await watcher.until("robot.state", lambda _: True)
             await nothing_moves(watcher, rig, still)
+
+
+async def test_no_grip_begins_that_a_later_daemon_would_not_find(rig_config, tiny_bank, tmp_path, monkeypatch):
+    """It would go on with the angle and the zeros of the grip before."""
+    second_grip = {"do": "grip", "width_mm": 5, "force_n": 60}
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, _order, command):
+        await started(watcher, command, experiment(tmp_path, {"do": "release"}, second_grip))
+        await watcher.until("gripper.state", lambda state: state["diameter_mm"] is not None)
+        (tmp_path / "no-folder").write_text("")
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "no-folder"))
+        state = await watcher.until("loop.state", lambda state: state["phase"] == "stopped")
+        assert "the fingers were not closed: the rig's state cannot be kept" in state["reasons"]
+        seen = watcher.count("gripper.state")
+        await watcher.until("gripper.state", lambda state: state["object"] != "moving", seen + 5)
+        assert watcher.seen["gripper.state"][-1]["object"] == "at target"

@@ -6,9 +6,10 @@ from contextlib import asynccontextmanager
 
 import pytest
 
+from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.messages import Stop
+from shearloop.drivers.ur.messages import Stop, ZeroForceTorque
 from shearloop.errors import NotBegunError
 from tests.daemon.control.cell import GRIP, Cell, driven, experiment, no_tick
 
@@ -57,6 +58,46 @@ async def test_a_grip_that_was_refused_halts_nothing():
         await cell.cycles(20)
         assert "would open them" in cell.control_loop.experiment.stop_reason
         assert cell.gripper.asked == ["grip"]
+
+
+@pytest.mark.parametrize("stops", [False, True])
+async def test_fingers_stay_where_their_new_grip_cannot_be_written_or_a_stop_comes_first(stops):
+    """The tool keeps what is known of its grip."""
+    written = asyncio.Event()
+
+    async def fails() -> str:
+        await written.wait()
+        return "the disk is full"
+
+    async with driven(GRIP) as cell:
+        await cell.until_done()
+        grip = cell.control_loop.tool.grip
+        assert grip.force_n
+        cell.runner.actions.write_state = fails
+        await cell.start(GRIP)
+        await cell.cycles(10)
+        if stops:
+            cell.runner.stop()
+        else:
+            written.set()
+        await cell.cycles(20)
+        assert cell.phase is ExperimentPhase.STOPPED
+        assert ("the fingers were not closed: the disk is full" in cell.why) is not stops
+        assert cell.gripper.asked == ["grip"]
+        assert cell.control_loop.tool.grip == grip
+
+
+async def test_no_zero_is_taken_that_cannot_be_written():
+    async def fails() -> str:
+        return "the disk is full"
+
+    async with driven() as cell:
+        cell.holding = False
+        cell.runner.actions.write_state = fails
+        await cell.start({"do": "tare"})
+        await cell.cycles(10)
+        assert "no zero was taken: the disk is full" in cell.why
+        assert ZeroForceTorque() not in cell.robot.commands
 
 
 async def test_a_stop_after_a_grip_leaves_the_fingers_alone():

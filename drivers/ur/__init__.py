@@ -2,6 +2,8 @@
 
 In the daemon: `client` runs the worker, `settings` has limits and deadlines, `messages` passes between both. In
 the `worker`: `command_handler` accepts or refuses commands, `motion` keeps one within the limits, `arm` calls
-ur-rtde. With the controller: `control_box` probes and receives states, `script` makes the program of
-`control.script`, which runs on the robot, and `script_port` sends it, `primary_port` reads error codes.
+ur-rtde. With the controller: `ports` connects, `rtde` has the packages and `receiver` the samples, whose age is
+`sample_age`'s; `dashboard` asks for modes and power, `control_box` for version and mode, and `primary_port` for error
+codes. `script` makes the program of `control.script`, which runs on the robot, `script_port` sends it, and
+`script_readiness` waits for it between two commands.
 """

@@ -16,13 +16,7 @@ from statistics import fmean
 
 import rtde_control
 
-from shearloop.drivers.ur.control_box import (
-    RtdeReceiver,
-    SampleAge,
-    ScriptReadiness,
-    command_dashboard,
-    lose_dead_peers_of_ports,
-)
+from shearloop.drivers.ur.dashboard import command_dashboard
 from shearloop.drivers.ur.messages import (
     RUNTIME_PLAYING,
     ControllerError,
@@ -31,9 +25,13 @@ from shearloop.drivers.ur.messages import (
     RtdeSample,
     WristSpeed,
 )
+from shearloop.drivers.ur.ports import lose_dead_peers_of_ports
 from shearloop.drivers.ur.primary_port import PrimaryPort
+from shearloop.drivers.ur.receiver import RtdeReceiver
+from shearloop.drivers.ur.sample_age import SampleAge
 from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, ScriptRegisters, control_program, why_other_client
 from shearloop.drivers.ur.script_port import ScriptPort
+from shearloop.drivers.ur.script_readiness import ScriptReadiness
 from shearloop.drivers.ur.settings import Six, UrSettings
 
 # A thread of ur-rtde polls its socket every 0.1 ms, which takes 5 % of a core. With this timer slack it wakes once per

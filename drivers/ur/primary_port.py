@@ -11,8 +11,8 @@ from typing import Final
 
 from shearloop.drivers.defaults import PRIMARY_PORT
 from shearloop.drivers.errors import ProtocolError, system_reason
-from shearloop.drivers.ur.control_box import SERVICES_MENU, lose_dead_peers
 from shearloop.drivers.ur.messages import ControllerError
+from shearloop.drivers.ur.ports import SERVICES_MENU, lose_dead_peers
 
 # Its size and kind; then, of a message: the controller's time, the source and the kind of message.
 _PACKAGE: Final = struct.Struct(">iB")

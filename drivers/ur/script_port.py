@@ -11,8 +11,8 @@ from typing import Final
 
 from shearloop.drivers.defaults import SCRIPT_PORT
 from shearloop.drivers.errors import system_reason
-from shearloop.drivers.ur.control_box import lose_dead_peers
 from shearloop.drivers.ur.messages import RobotLostError
+from shearloop.drivers.ur.ports import lose_dead_peers
 
 # Some seconds of states.
 _READ_BYTES: Final = 1 << 18

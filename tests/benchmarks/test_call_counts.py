@@ -19,7 +19,7 @@ def test_the_daemon_loads_nothing_but_what_runs_on_the_robots_pc():
     assert loaded.lines > 1000
     assert loaded.lines <= MOST_LINES_WITH_ROBOT
     assert [name for name in loaded.modules if "skin" in name] == [], "only a rig with a skin loads its modules"
-    assert "shearloop.drivers.ur.control_box" not in loaded.modules, "the worker talks to the control box"
+    assert "shearloop.drivers.ur.receiver" not in loaded.modules, "the worker talks to the control box"
 
 
 def test_sensors_alone_load_neither_control_loop_nor_drivers_of_robot_and_gripper():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shearloop.drivers.ur import settings as ur
-from shearloop.drivers.ur.control_box import ask_dashboard
+from shearloop.drivers.ur.dashboard import ask_dashboard
 from shearloop.emulators.ur_arm import CURRENTS_ERROR
 from shearloop.emulators.ur_controller import Controller
 from shearloop.emulators.ur_robot import ControllerSpec, Robot

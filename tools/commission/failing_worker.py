@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 from shearloop.drivers.defaults import RTDE_PORT
-from shearloop.drivers.ur.control_box import RtdeReceiver
+from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.drivers.ur.worker import main
 
 NO_DEADLINES: Final = signal.SIGUSR1

@@ -10,8 +10,9 @@ import time
 
 from pydantic import TypeAdapter
 
-from shearloop.drivers.ur.control_box import RtdeReceiver, SampleAge
 from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
+from shearloop.drivers.ur.receiver import RtdeReceiver
+from shearloop.drivers.ur.sample_age import SampleAge
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.errors import UserError
 from shearloop.tools.commission.observer import Observer, Seen

@@ -13,14 +13,11 @@ from shearloop.drivers.connection import SerialLink
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
-from shearloop.drivers.ur.control_box import (
-    ControllerInfo,
-    RtdeReceiver,
-    ask_dashboard,
-    query_controller,
-    register_round_trip,
-)
+from shearloop.drivers.ur.control_box import ControllerInfo, query_controller
+from shearloop.drivers.ur.dashboard import ask_dashboard
 from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.drivers.ur.receiver import RtdeReceiver
+from shearloop.drivers.ur.rtde import register_round_trip
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.tools.commission.arrivals import REAL_CLOCK, Arrivals, Clock

@@ -18,13 +18,8 @@ from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.rig_identity import why_not_emulated
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
-from shearloop.drivers.ur.control_box import (
-    REMOTE_CURE,
-    check_generation,
-    check_ports,
-    query_controller,
-    untested_sentence,
-)
+from shearloop.drivers.ur.control_box import check_generation, check_ports, query_controller, untested_sentence
+from shearloop.drivers.ur.dashboard import REMOTE_CURE
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.primary_port import PrimaryPort
 from shearloop.drivers.ur.script import UPPER

@@ -11,7 +11,7 @@ from shearloop.daemon.control.state_publisher import PUBLISH_EVERY
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample, TorqueSource
-from shearloop.drivers.ur.control_box import SampleAge
+from shearloop.drivers.ur.sample_age import SampleAge
 
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
 LOAD = TorqueSource(name="load_cell", period_s=1 / 10.9)

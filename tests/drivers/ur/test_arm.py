@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from shearloop.drivers.ur import control_box, script
+from shearloop.drivers.ur import receiver, script
 from shearloop.drivers.ur import settings as ur
 from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeOutputs, WristSpeed
 from shearloop.drivers.ur.script import LOWER, NO_MOTION_TICKS, UPPER
@@ -73,7 +73,7 @@ def arm(monkeypatch) -> Iterator[ModuleType]:
     # Another test may have imported it over the real clients.
     monkeypatch.delitem(sys.modules, "shearloop.drivers.ur.arm", raising=False)
     # It is the default of an argument, so that it has to be there at the import.
-    monkeypatch.setattr(control_box, "RtdeReceiver", Receiver)
+    monkeypatch.setattr(receiver, "RtdeReceiver", Receiver)
     arm = importlib.import_module("shearloop.drivers.ur.arm")
     monkeypatch.setattr(script, "version", lambda _: script.CLIENT_VERSION)
     yield arm

@@ -11,19 +11,11 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.control_box import (
-    SERVICES,
-    check_generation,
-    check_ports,
-    closed_ports_sentence,
-    command_dashboard,
-    probe_controller,
-    probe_ports,
-    query_controller,
-    serial_number_in,
-)
+from shearloop.drivers.ur.control_box import check_generation, check_ports, probe_controller, query_controller
+from shearloop.drivers.ur.dashboard import command_dashboard, serial_number_in
 from shearloop.drivers.ur.messages import ROBOT_MODES, RUNTIME_STATES, SAFETY_MODES, RobotLostError, Unlock
 from shearloop.drivers.ur.motion import why_unfit
+from shearloop.drivers.ur.ports import SERVICES, closed_ports_sentence, probe_ports
 from shearloop.drivers.ur.settings import TorqueBound, UrSettings
 from shearloop.emulators.ur_controller import Controller
 from shearloop.emulators.ur_robot import Robot

@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur.control_box import RtdeReceiver, SampleParser, lose_dead_peers_of_ports
 from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
+from shearloop.drivers.ur.ports import lose_dead_peers_of_ports
+from shearloop.drivers.ur.receiver import RtdeReceiver, SampleParser
 
 TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,DOUBLE,INT32,INT32,DOUBLE"
 TOOL_TYPES = TYPES + b",DOUBLE,VECTOR3D,VECTOR6D"

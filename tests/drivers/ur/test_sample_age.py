@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from shearloop.drivers.ur.control_box import _OFFSET_RISE, SampleAge
+from shearloop.drivers.ur.sample_age import _OFFSET_RISE, SampleAge
 
 PERIOD_NS = 8_000_000
 STARTED_NS = 7 * 10**12

@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from shearloop.drivers.ur import control_box as ready_module
-from shearloop.drivers.ur.control_box import ScriptReadiness
+from shearloop.drivers.ur import script_readiness as ready_module
 from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.drivers.ur.script_readiness import ScriptReadiness
 from tests.drivers.ur.handler_bench import received
 
 READY, DONE = 1, 2

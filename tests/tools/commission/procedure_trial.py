@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.config import load_daemon_config
-from shearloop.drivers.ur.control_box import ask_dashboard
+from shearloop.drivers.ur.dashboard import ask_dashboard
 from shearloop.tools.commission.procedure import STAGES, commission
 from tests.emulator_process import own_address
 from tests.running import DEADLINE_S

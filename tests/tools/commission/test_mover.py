@@ -11,7 +11,7 @@ import subprocess
 import pytest
 
 from shearloop.drivers.defaults import RTDE_PORT
-from shearloop.drivers.ur.control_box import RtdeReceiver
+from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.errors import UserError
 from shearloop.tools.commission import mover
 from shearloop.tools.commission.failing_worker import ForgetfulReceiver, close_rtde

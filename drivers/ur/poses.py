@@ -1,4 +1,4 @@
-"""Orientations of poses: x, y, z in m and a rotation vector in rad, as URScript has them."""
+"""Poses: x, y, z in m and a rotation vector in rad, as URScript has them."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,12 @@ ONLY_TURNS_M = 1e-6
 def turn_between(pose: Sequence[float], other: Sequence[float]) -> float:
     """Return the angle between the orientations of two poses, 0 to pi."""
     dot = sum(one * another for one, another in zip(_quaternion(pose), _quaternion(other), strict=True))
-    return 2.0 * math.acos(min(1.0, abs(dot)))
+    return 2.0 * math.acos(min(abs(dot), 1.0))
+
+
+def is_close(pose: Sequence[float], other: Sequence[float], within: float) -> bool:
+    """Return whether two poses are less than `within` metres and radians apart; poses with NaN are not."""
+    return math.dist(pose[:3], other[:3]) < within and turn_between(pose, other) < within
 
 
 def _quaternion(pose: Sequence[float]) -> tuple[float, float, float, float]:

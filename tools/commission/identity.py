@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from shearloop.daemon.commissioning import Line
 from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.drivers.ur.control_box import ControllerInfo, untested_sentence
+from shearloop.drivers.ur.limits import PAYLOAD_KG, tool_difference
 from shearloop.drivers.ur.messages import RtdeOutputs
-from shearloop.drivers.ur.motion import PAYLOAD_KG, tool_difference
 from shearloop.drivers.ur.settings import InstalledTool, UrSettings
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.operator import Played

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shearloop.daemon.commissioning import Line, Supplied
-from shearloop.drivers.ur.motion import ACCELERATION_S
+from shearloop.drivers.ur.limits import ACCELERATION_S
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context

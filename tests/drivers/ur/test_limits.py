@@ -10,9 +10,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from shearloop.drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation, violation
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
-from shearloop.drivers.ur.motion import clip_linear, clip_stop, clip_wrist, is_close, line_violation, violation
-from shearloop.drivers.ur.poses import ONLY_TURNS_M, turn_between
+from shearloop.drivers.ur.poses import ONLY_TURNS_M, is_close, turn_between
 from shearloop.drivers.ur.settings import InstalledTool, WristAccelerationBound, WristSpeedBound
 from tests.drivers.ur.handler_bench import AT_REST, LIMITS, POSE, SETTINGS, enabled
 

@@ -20,8 +20,8 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.rig_identity import RigIdentity
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.drivers.ur.control_box import ControllerInfo
+from shearloop.drivers.ur.limits import tool_difference
 from shearloop.drivers.ur.messages import RtdeOutputs
-from shearloop.drivers.ur.motion import tool_difference
 from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import InstalledTool, read_settings
 from shearloop.errors import UserError

@@ -20,8 +20,8 @@ from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import check_generation, check_ports, probe_controller, untested_sentence
 from shearloop.drivers.ur.dashboard import REMOTE_CURE, SERIAL_NUMBER, ask_dashboard, serial_number_in
+from shearloop.drivers.ur.fitness import why_unfit
 from shearloop.drivers.ur.messages import RobotLostError
-from shearloop.drivers.ur.motion import why_unfit
 from shearloop.drivers.ur.primary_port import PrimaryPort
 from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.drivers.ur.rtde import free_registers, registers_in_use

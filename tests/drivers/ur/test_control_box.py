@@ -13,8 +13,8 @@ import pytest
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.control_box import check_generation, check_ports, probe_controller, query_controller
 from shearloop.drivers.ur.dashboard import command_dashboard, serial_number_in
+from shearloop.drivers.ur.fitness import why_unfit
 from shearloop.drivers.ur.messages import ROBOT_MODES, RUNTIME_STATES, SAFETY_MODES, RobotLostError, Unlock
-from shearloop.drivers.ur.motion import why_unfit
 from shearloop.drivers.ur.ports import SERVICES, closed_ports_sentence, probe_ports
 from shearloop.drivers.ur.settings import TorqueBound, UrSettings
 from shearloop.emulators.ur_controller import Controller

@@ -3,8 +3,8 @@
 import pytest
 
 from shearloop.drivers.ur import worker
-from shearloop.drivers.ur.command_handler import LOAD_WITHIN_S
 from shearloop.drivers.ur.messages import Disconnect, Held, Unlock
+from shearloop.drivers.ur.recovery import LOAD_WITHIN_S
 from tests.drivers.ur.handler_bench import SETTINGS, HandlerBench
 from tests.drivers.ur.process import CyclingArm
 

@@ -1,0 +1,161 @@
+"""Makes the robot ready for motion: unlocked, powered, and with the control program running.
+
+No clock: the arm and the time are arguments.
+"""
+
+from typing import TYPE_CHECKING
+
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.messages import (
+    ROBOT_MODE_IDLE,
+    ROBOT_MODE_POWER_OFF,
+    ROBOT_MODE_RUNNING,
+    RUNTIME_STOPPED,
+    SAFETY_NORMAL,
+    SAFETY_REDUCED,
+    RobotLostError,
+    RtdeSample,
+)
+
+if TYPE_CHECKING:
+    from shearloop.drivers.ur.arm import UrArm
+
+# The period of a request that the robot does not follow yet.
+_RETRY_S = 1.0
+# A program without heartbeats has ended by its watchdog after this time.
+ENDS_ITSELF_S = 2.0
+# A program that does not play within this time after its first upload does not start with this worker.
+STARTS_WITHIN_S = 2.0
+# An arm that does not come to rest has no load that could be measured for longer than this.
+LOAD_WITHIN_S = 5.0
+
+NOT_STARTING = (
+    "The controller took the control program and does not play it: look at the teach pendant for a message, for local "
+    "control, and for the log's last lines. The robot's worker is started again with motion disabled."
+)
+
+
+class Recovery:
+    """One attempt to make the robot ready: unlock, power, brakes, control program, watchdog.
+
+    Each cycle runs one step, and none waits, so that states keep coming while the arm powers up. A protective stop is
+    unlocked only on the operator's request (UR's own rule). Without one, only the control program is started.
+    """
+
+    def __init__(self, arm: "UrArm", now_ns: int, timeout_s: float, unlock_number: int | None = None) -> None:
+        """Begin. The number of an operator's `Unlock` allows unlocking, powering and stopping any program."""
+        self.unlock_number = unlock_number
+        self._arm = arm
+        self._deadline_ns = now_ns + int(timeout_s * 1e9)
+        self._timeout_s = timeout_s
+        self._load_by_ns = now_ns + int(LOAD_WITHIN_S * 1e9)
+        self._asked_ns: dict[str, int] = {}
+        self._cleared = False
+        # When the control program was first sent.
+        self._uploaded_ns: int | None = None
+        # The controller's latest refusal of a request that could be done without.
+        self._answered = ""
+        # Whether the attempt has succeeded, or why it has ended otherwise.
+        self.ready = False
+        self.refusal: str | None = None
+        # Whether a tool may load the wrench.
+        self.held = False
+        # The daemon sees that the zero of the wrench may change, a second before the program starts.
+        arm.measure_load_anew()
+
+    @property
+    def operator_asked(self) -> bool:
+        """Whether the attempt is an operator's."""
+        return self.unlock_number is not None
+
+    def give_up(self, reason: str) -> None:
+        """End the attempt."""
+        self.refusal = reason
+
+    def advance(self, sample: RtdeSample, now_ns: int, *, recent: bool) -> bool:
+        """Do the step that is due in this cycle, unless the sample is old; return whether the attempt has ended.
+
+        Raises:
+            RobotLostError: the control program cannot be sent, or does not start.
+        """
+        if self.refusal is None and now_ns > self._deadline_ns:
+            self.refusal = (
+                f"The robot did not get ready within {self._timeout_s:g} s (robot mode: {sample.robot_mode_name}, "
+                f"safety mode: {sample.safety_mode_name}, program: {sample.runtime_name}). {self._answered}Look at the "
+                "teach pendant."
+            )
+        if self.refusal is None and recent:
+            try:
+                self._step(sample, now_ns)
+            except RobotLostError:
+                raise
+            except DriverError as error:
+                self.refusal = str(error)
+        return self.ready or self.refusal is not None
+
+    def _step(self, sample: RtdeSample, now_ns: int) -> None:
+        safe = sample.safety_mode in (SAFETY_NORMAL, SAFETY_REDUCED)
+        if not (safe and sample.robot_mode == ROBOT_MODE_RUNNING):
+            self._make_safe(sample, now_ns, safe)
+            return
+        self._close_popups(now_ns)
+        if self._uploaded_ns is not None and sample.program_running:
+            # The control connection may see the program a sample later; then try again in the next cycle.
+            self.ready = self._arm.arm_watchdog()
+        elif sample.runtime_state != RUNTIME_STOPPED:
+            if self.operator_asked:
+                self._ask_dashboard(now_ns, "stop")
+            elif now_ns > self._asked_ns.setdefault("end", now_ns) + int(ENDS_ITSELF_S * 1e9):
+                # Not ours to stop. After the death of its daemon its watchdog would have ended it.
+                self.refusal = ""
+        elif not self._cleared:
+            # Registers outlive the program: a new one would first execute the last command.
+            self._cleared = self._arm.clear_command()
+        else:
+            if self._uploaded_ns is None and not self._arm.knows_load(held=self.held) and now_ns < self._load_by_ns:
+                return
+            if self._uploaded_ns is None:
+                self._uploaded_ns = now_ns
+            elif now_ns >= self._uploaded_ns + int(STARTS_WITHIN_S * 1e9):
+                raise RobotLostError("script", NOT_STARTING)
+            else:
+                # A heartbeat, for a script that arms its watchdog before its loop.
+                self._arm.clear_command()
+            # The controller may be busy and drop an upload.
+            if self._is_due("upload", now_ns):
+                self._arm.upload(held=self.held)
+
+    def _make_safe(self, sample: RtdeSample, now_ns: int, safe: bool) -> None:
+        if not self.operator_asked:
+            self.refusal = ""
+        elif sample.emergency_stop:
+            self.refusal = "The emergency stop is still pressed: make the cell safe, release it, and unlock again."
+        elif sample.protective_stop:
+            # Once: the controller refuses it in the first 5 s.
+            if "unlock protective stop" not in self._asked_ns:
+                self._ask_dashboard(now_ns, "unlock protective stop")
+        elif not safe:
+            self.refusal = (
+                f"The safety mode “{sample.safety_mode_name}” cannot be cured from here: look at the pendant."
+            )
+        else:
+            self._close_popups(now_ns)
+            if sample.robot_mode == ROBOT_MODE_POWER_OFF:
+                self._ask_dashboard(now_ns, "power on")
+            elif sample.robot_mode == ROBOT_MODE_IDLE:
+                self._ask_dashboard(now_ns, "brake release")
+
+    def _close_popups(self, now_ns: int) -> None:
+        if self.operator_asked and "close popup" not in self._asked_ns:
+            self._ask_dashboard(now_ns, "close popup", "close safety popup")
+
+    def _ask_dashboard(self, now_ns: int, *requests: str) -> None:
+        if self._is_due(requests[0], now_ns) and (refused := self._arm.ask_dashboard(*requests)):
+            self._answered = f"{refused}. "
+
+    def _is_due(self, step: str, now_ns: int) -> bool:
+        """Return whether a step is due, and note that it is taken: the robot may not follow a request at once."""
+        due = now_ns >= self._asked_ns.get(step, -(1 << 62)) + int(_RETRY_S * 1e9)
+        if due:
+            self._asked_ns[step] = now_ns
+        return due

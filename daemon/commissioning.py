@@ -15,8 +15,8 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.rig_identity import Record, RigIdentity, identity_of, judged_by, judged_sha256s, why_not_emulated
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.robotiq.models import ModelName
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import Bound, UrSettings
 from shearloop.errors import UserError

@@ -13,12 +13,12 @@ from shearloop.daemon.config import DaemonConfig, GripperConfig
 from shearloop.daemon.control.action_executor import no_state
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
-from shearloop.daemon.control.experiment_schema import first_motion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
 from shearloop.daemon.control.plan import plan_of, speeds_of
 from shearloop.daemon.control.state_publisher import loop_state
+from shearloop.daemon.control.step_motions import first_motion
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment, check_experiment
 from shearloop.daemon.logs import LinkReporter
@@ -35,8 +35,9 @@ from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.hosts import is_loopback_host
-from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper
 from shearloop.drivers.robotiq.socket_client import REPLY_DEADLINE_S, SocketClient
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError

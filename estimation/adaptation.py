@@ -11,7 +11,8 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.estimator import OutputModel, Quantity
-from shearloop.estimation.gain import GainCorrection, find_twists, first_twists
+from shearloop.estimation.gain import GainCorrection
+from shearloop.estimation.twists import find_twists, first_twists
 from shearloop.estimation.values import Measured
 
 # Frames of a grip that can correct its gain: ten minutes.

@@ -26,7 +26,7 @@ from shearloop.estimation.estimator import (
 )
 from shearloop.estimation.estimator_names import EstimatorName, estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator, GripParts, too_few_frames
-from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, ToolLaw, first_twists, loaded_log_gain
+from shearloop.estimation.gain import GainCorrection, ToolLaw
 from shearloop.estimation.grips import Grip, find_grips
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import LearnedFrames
@@ -34,6 +34,7 @@ from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_b
 from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
+from shearloop.estimation.twists import LOADED_SHARE, first_twists, loaded_log_gain
 from shearloop.estimation.values import FrameSeries, Measured, check_finite, distinct
 from shearloop.words import counted
 

@@ -7,11 +7,12 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.gain import LOADED_SHARE, GainSpread, find_twists, first_twists, loaded_log_gain, log_gain
+from shearloop.estimation.gain import GainSpread
 from shearloop.estimation.interval_regressor import IntervalRegressor, Regressor, reported_values
 from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange, student_inflation
 from shearloop.estimation.left_out import LeftOut, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.ridge import STRENGTHS, CensoredRidge, Predictor
+from shearloop.estimation.twists import LOADED_SHARE, find_twists, first_twists, loaded_log_gain, log_gain
 from shearloop.words import counted
 
 # The future differs from the past more than one part of a recording from the next.

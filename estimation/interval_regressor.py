@@ -14,9 +14,10 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation.gain import LOADED_SHARE, GainCorrection, GainSpread, find_twists
+from shearloop.estimation.gain import GainCorrection, GainSpread
 from shearloop.estimation.intervals import Intervals, ValueRange
 from shearloop.estimation.ridge import CensoredRidge, Predictor, Ridge
+from shearloop.estimation.twists import LOADED_SHARE, find_twists
 from shearloop.estimation.values import INLINE
 
 Regressor: TypeAlias = Ridge | CensoredRidge

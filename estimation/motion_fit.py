@@ -17,10 +17,10 @@ from typing import TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.estimation.gain import find_twists
 from shearloop.estimation.interval_regressor import reported_values
 from shearloop.estimation.left_out import LeftOut, left_out_groups
 from shearloop.estimation.ridge import CensoredRidge, Ridge
+from shearloop.estimation.twists import find_twists
 
 # Ends of the steps of the memory in frames back: 18 frames are 10 s, and the gel creeps for some seconds.
 MEMORY_EDGES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 16, 19)

@@ -17,10 +17,10 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.estimator import Bounds, CalibrationRows, Estimator, Material, OutputModel, Quantity, Reading
 from shearloop.estimation.fingertip_validator import FingertipValidator
-from shearloop.estimation.gain import LOADED_SHARE
 from shearloop.estimation.grip_memory import Motion
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
+from shearloop.estimation.twists import LOADED_SHARE
 
 if TYPE_CHECKING:
     from shearloop.estimation.motion_fit import MotionFit

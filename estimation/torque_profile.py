@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.estimation.gain import find_twists
+from shearloop.estimation.twists import find_twists
 from shearloop.estimation.values import FrameSeries
 
 # Step of a twist's profile, and how far it reaches either way from the twist's middle: a twist of the paper takes 5 s.

@@ -10,8 +10,8 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
-from shearloop.estimation.gain import find_twists
 from shearloop.estimation.grips import Grip, find_grips
+from shearloop.estimation.twists import find_twists
 from shearloop.estimation.values import Measured, distinct
 from shearloop.tools.frame_series import Series
 from shearloop.words import counted

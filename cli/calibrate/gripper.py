@@ -45,9 +45,10 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.rig_memory import Remembered, read_memories
     from shearloop.daemon.robot_files import RobotFiles, lock_gripper
     from shearloop.drivers.calibration_files import save_calibration
-    from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper, WidthCalibration
+    from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
     from shearloop.drivers.robotiq.socket_client import SocketClient
+    from shearloop.drivers.robotiq.widths import WidthCalibration
 
     if len(set(args.diameter_mm)) < 2:
         raise UserError("give at least two different --diameter-mm")

@@ -15,7 +15,6 @@ from shearloop.daemon.control.experiment_schema import (
     ExperimentLimits,
     GripStep,
     IdentifyStep,
-    Speeds,
     TareStep,
 )
 from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
@@ -23,6 +22,7 @@ from shearloop.daemon.control.held_tool import HeldTool
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.operator_view import OperatorView
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
+from shearloop.daemon.control.step_motions import Speeds
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import Compute, WristController, at_once
 from shearloop.daemon.loop_config import LoopConfig

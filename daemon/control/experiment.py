@@ -11,6 +11,8 @@ from typing import TypeAlias
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
+from shearloop.daemon.control.step_demands import demands
+from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
 
 # An angle counts as reached within this; the wrist's resolution is ten times finer.
 ANGLE_TOLERANCE_RAD = 0.002
@@ -96,11 +98,11 @@ StepProgram: TypeAlias = Generator[StepCommand, StepContext, None]
 class Experiment:
     """One run of an experiment file."""
 
-    def __init__(self, file: ExperimentFile, t_ns: int, speeds: steps.Speeds = steps.AS_ASKED) -> None:
+    def __init__(self, file: ExperimentFile, t_ns: int, speeds: Speeds = AS_ASKED) -> None:
         """Begin at t_ns; `speeds` are the largest that the rig allows."""
         self.file = file
         # The approximate duration of each step, for the remaining time shown to the operator.
-        self._expected_s = [one.takes_s for one in steps.demands(file.steps, speeds)]
+        self._expected_s = [one.takes_s for one in demands(file.steps, speeds)]
         self.phase = ExperimentPhase.RUNNING
         self.stop_reason = ""
         # The step's command, also while the wrist is paused or held.

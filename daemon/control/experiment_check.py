@@ -26,11 +26,10 @@ from shearloop.daemon.control.experiment_schema import (
     TurnToStep,
     TwistingStep,
     TwistStep,
-    demand,
     direction_of,
     outline,
-    wrist_after,
 )
+from shearloop.daemon.control.step_demands import demand, wrist_after
 from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits

@@ -1,9 +1,8 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias, get_args
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJsonSchema, model_validator
@@ -12,8 +11,7 @@ from shearloop.daemon.commissioning import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD
 from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, FileKind, either, not_of_kind
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
-from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S, GripperModel
-from shearloop.drivers.ur.poses import ONLY_TURNS_M, turn_between
+from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S
 from shearloop.mistakes import shown
 
 MOST_ANGLES = 1000
@@ -287,101 +285,6 @@ class ExperimentFile(ConfigModel):
         return ExperimentLimits.model_construct(torque_nm=torque_nm, angle_rad=angle_rad)
 
 
-class Speeds(NamedTuple):
-    """The largest speeds that a rig allows; a step that asks for more moves with these."""
-
-    wrist_rad_per_s: float = math.inf
-    linear_m_per_s: float = math.inf
-
-    def turning(self, asked_rad_per_s: float) -> str:
-        """Return in words how fast a step turns the wrist."""
-        return f"at {min(asked_rad_per_s, self.wrist_rad_per_s):g} rad/s"
-
-    def moving(self, asked_m_per_s: float) -> str:
-        """Return in words how fast a step moves the tool centre."""
-        return f"at {min(asked_m_per_s, self.linear_m_per_s):g} m/s"
-
-
-AS_ASKED: Final = Speeds()
-
-
-def first_motion_before_grip(file: ExperimentFile) -> int | None:
-    """Return the number, from 1, of the first step that moves the arm before any grip or release, or None."""
-    for number, step in enumerate(file.steps, 1):
-        if isinstance(step, GripperStep):
-            return None
-        if isinstance(step, TwistingStep | TurnToStep | ApproachStep):
-            return number
-    return None
-
-
-def first_turn_before_tare(file: ExperimentFile, *, holds: bool = False) -> int | None:
-    """Return the number, from 1, of the first step that turns a tool before any tare, or None.
-
-    `holds`: whether the gripper may hold one as the experiment begins.
-    """
-    for number, step in enumerate(file.steps, 1):
-        if isinstance(step, TareStep):
-            return None
-        if isinstance(step, GripperStep):
-            holds = not isinstance(step, ReleaseStep)
-        if isinstance(step, TwistingStep) or (holds and isinstance(step, TurnToStep)):
-            return number
-    return None
-
-
-def first_gripper_step(file: ExperimentFile) -> tuple[int, GripperStep] | None:
-    """Return the first step that moves the fingers, with its number from 1, or None."""
-    return next(((n, step) for n, step in enumerate(file.steps, 1) if isinstance(step, GripperStep)), None)
-
-
-def opens_to(step: ReleaseStep, gripper: GripperModel | None) -> str:
-    """Return how far a step opens the fingers of a gripper, in words; as it is written where none is known.
-
-    A width that would not let a held tool go opens them fully.
-    """
-    stroke_mm = LARGEST_STROKE_MM if gripper is None else gripper.stroke_mm
-    if step.width_mm >= stroke_mm:
-        return f"to {stroke_mm:g} mm"
-    return f"to {step.width_mm:g} mm, or fully where they hold something about as wide or wider"
-
-
-def first_motion(file: ExperimentFile, gripper: GripperModel | None = None, speeds: Speeds = AS_ASKED) -> str:
-    """Return the first motion of an experiment as a sentence, for the operator who starts it."""
-    for number, step in enumerate(file.steps, 1):
-        if (motion := motion_of(step, gripper, speeds)) is not None:
-            return f"the first motion is step {number} of {len(file.steps)} ({step.do}): {motion}"
-    return "no step moves anything"
-
-
-def motion_of(step: Step, gripper: GripperModel | None, speeds: Speeds) -> str | None:
-    """Return what moves in a step, as a sentence, or None."""
-    match step:
-        case ApproachStep(along_tool_m=float(distance_m)):
-            return (
-                f"the arm moves {1e3 * distance_m:+.0f} mm along the tool's axis, {speeds.moving(step.speed_m_per_s)}"
-            )
-        case ApproachStep(pose_m_rad=tuple(pose)):
-            x, y, z = (f"{1e3 * value:.0f}" for value in pose[:3])
-            return f"the arm moves to x {x}, y {y}, z {z} mm, {speeds.moving(step.speed_m_per_s)}"
-        case GripStep():
-            return f"the fingers close to {step.width_mm:g} mm, or onto a tool with at most {step.force_n:g} N"
-        case ReleaseStep():
-            return f"the fingers open {opens_to(step, gripper)}, and a tool in them drops"
-        case TurnToStep():
-            return f"the wrist turns to {step.angle_rad:g} rad, {speeds.turning(step.speed_rad_per_s)}"
-        case TwistStep():
-            return f"the wrist twists to {step.angles_rad[0]:g} rad, {speeds.turning(step.speed_rad_per_s)}"
-        case IdentifyStep():
-            return f"the wrist turns to and fro, by at most {step.amplitude_rad:g} rad"
-        case HoldTorqueStep():
-            return f"the wrist turns until the torque is {step.signed_torque_nm:+g} N·m"
-        case TightenStep():
-            return f"the wrist turns {step.direction}, {speeds.turning(step.speed_rad_per_s)}"
-        case _:
-            return None
-
-
 # A location in an experiment's file, and the mistake there.
 Mistake = tuple[tuple[int | str, ...], str]
 _STEP: TypeAdapter[Step] = TypeAdapter(Step)
@@ -417,134 +320,3 @@ def _outlined(content: object) -> Step:
         names = {key: given[key] for key in ("do", "fingertip", "reference") if isinstance(given.get(key), str)}
         step: Step = STEP_KINDS.get(names.get("do", ""), WaitStep).model_construct(**names)
         return step
-
-
-class Demand(NamedTuple):
-    """The largest torque (N·m) and angle from the grip (rad) of a step, and its times.
-
-    It stands still for `stands_s` in all, and takes about `moves_s` for everything else. `begins_anywhere`: it moves to
-    a pose from one that is not known before, so that `moves_s` is a guess.
-    """
-
-    torque_nm: float = 0.0
-    angle_rad: float = 0.0
-    stands_s: float = 0.0
-    moves_s: float = 0.0
-    begins_anywhere: bool = False
-
-    @property
-    def takes_s(self) -> float:
-        """About how long the step takes."""
-        return self.stands_s + self.moves_s
-
-
-# The wrist slows down as it comes near an angle. At the default bandwidth this adds 0.3 s to a turn at 0.1 rad/s, and
-# 0.7 s to one at 0.5 rad/s.
-SETTLES_S: Final = 0.5
-
-
-def _travel_rad(angles_rad: Sequence[float]) -> float:
-    """Return how far the wrist turns from angle to angle."""
-    return sum(abs(later - earlier) for earlier, later in pairwise(angles_rad))
-
-
-class Before(NamedTuple):
-    """What a step begins at: the held torque, the wrist joint's angle, and the tool's pose; None for unknown ones."""
-
-    torque_nm: float = 0.0
-    wrist_rad: float | None = None
-    pose_m_rad: Sequence[float] | None = None
-
-
-NOTHING_BEFORE: Final = Before()
-
-
-def demands(planned: Iterable[Step], speeds: Speeds = AS_ASKED) -> Iterator[Demand]:
-    """Yield the demand of each step after those before it."""
-    before = NOTHING_BEFORE
-    for step in planned:
-        yield demand(step, speeds, before)
-        wrist_rad = wrist_after(step, before.wrist_rad)
-        match step:
-            case HoldTorqueStep():
-                before = Before(step.signed_torque_nm, wrist_rad)
-            case ApproachStep(pose_m_rad=pose):
-                before = Before(before.torque_nm, wrist_rad, pose)
-            case GripStep() | ReleaseStep() | TurnToStep() | TwistStep() | TightenStep() | IdentifyStep():
-                # With which torque a twist ends is not known before.
-                before = Before(wrist_rad=wrist_rad)
-
-
-def wrist_after(step: Step, wrist_rad: float | None) -> float | None:
-    """Return the angle of the wrist joint after a step, from the one before; None where it is not known."""
-    match step:
-        case TurnToStep(angle_rad=angle_rad):
-            return angle_rad
-        case TwistStep(return_to_start=True):
-            return wrist_rad
-        case TwistStep(absolute=True, angles_rad=angles_rad):
-            return angles_rad[-1]
-        case TwistStep() | TightenStep() | HoldTorqueStep() | IdentifyStep():
-            return None
-        case ApproachStep():
-            # Most straight lines turn wrist 3 as well.
-            return None
-    return wrist_rad
-
-
-def _line_s(step: ApproachStep, start: Sequence[float], end: Sequence[float], speeds: Speeds) -> float:
-    """Return how long a straight move between two poses takes: the tool turns evenly, no faster than the wrist may."""
-    speed = min(step.speed_m_per_s, speeds.linear_m_per_s)
-    way_m, turn_rad = math.dist(start[:3], end[:3]), turn_between(start, end)
-    if way_m <= ONLY_TURNS_M:
-        # The speed is one in rad/s then.
-        return turn_rad / min(speed, speeds.wrist_rad_per_s)
-    return max(way_m / speed, turn_rad / speeds.wrist_rad_per_s)
-
-
-def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFORE) -> Demand:
-    """Return the demand of a step; unknown values, as in an outline, are 0."""
-    match step:
-        case HoldTorqueStep(torque_nm=torque_nm):
-            ramped_nm = abs(step.signed_torque_nm - before.torque_nm)
-            return Demand(abs(torque_nm), stands_s=step.hold_s, moves_s=ramped_nm / step.ramp_nm_per_s)
-        case TightenStep(until_torque_nm=torque_nm, until_angle_rad=angle_rad):
-            speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
-            return Demand(torque_nm, angle_rad, moves_s=angle_rad / speed_rad_per_s)
-        case IdentifyStep(amplitude_rad=angle_rad, hold_s=hold_s):
-            # Two cycles at least; the first of their five rests is twice as long.
-            return Demand(angle_rad=angle_rad, stands_s=6.0 * hold_s, moves_s=5.0)
-        case TwistStep(angles_rad=angles_rad):
-            stands_s = step.hold_s * len(angles_rad) * step.repeats
-            reach = [abs(angle_rad) for angle_rad in angles_rad]
-            if step.absolute:
-                # How far an absolute angle is from the grip is known only there, unless the wrist was turned to one.
-                reach = [0.2 if before.wrist_rad is None else abs(one - before.wrist_rad) for one in angles_rad]
-            moves = step.repeats * len(angles_rad)
-            if step.return_to_start:
-                moves, travel_rad = 2 * moves, step.repeats * 2.0 * sum(reach)
-            else:
-                # Each round begins at the last angle of the one before, the first one at the grip.
-                between_rounds_rad = abs(angles_rad[0] - angles_rad[-1])
-                travel_rad = reach[0] + step.repeats * _travel_rad(angles_rad)
-                travel_rad += (step.repeats - 1) * between_rounds_rad
-            moves_s = travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s) + SETTLES_S * moves
-            return Demand(0.0, 0.0 if step.absolute else max(reach), stands_s, moves_s)
-        case WaitStep(wait_s=wait_s):
-            return Demand(stands_s=wait_s)
-        case TareStep():
-            return Demand(moves_s=6.0)
-        case ApproachStep(along_tool_m=float() as distance_m):
-            return Demand(moves_s=1.0 + abs(distance_m) / min(step.speed_m_per_s, speeds.linear_m_per_s))
-        case TurnToStep(angle_rad=angle_rad):
-            # Where the wrist is, is known only there.
-            travel_rad = 1.0 if before.wrist_rad is None else abs(angle_rad - before.wrist_rad)
-            return Demand(moves_s=SETTLES_S + travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s))
-        case ApproachStep(pose_m_rad=tuple() as pose) if before.pose_m_rad is not None:
-            return Demand(moves_s=1.0 + _line_s(step, before.pose_m_rad, pose, speeds))
-        case ApproachStep():
-            return Demand(moves_s=3.0, begins_anywhere=True)
-        case GripStep() | ReleaseStep() | AdaptStep():
-            return Demand(moves_s=3.0)
-        case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | TurnToStep() | WaitStep():
-            return Demand()

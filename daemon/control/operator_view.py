@@ -5,18 +5,11 @@ from dataclasses import dataclass
 
 from shearloop.daemon.control.experiment import Experiment
 from shearloop.daemon.control.experiment_check import not_measured, too_noisy
-from shearloop.daemon.control.experiment_schema import (
-    ApproachStep,
-    ExperimentFile,
-    GripStep,
-    TareStep,
-    first_gripper_step,
-    first_motion_before_grip,
-    first_turn_before_tare,
-)
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, TareStep
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
 from shearloop.daemon.control.safety import SafetyMonitor
+from shearloop.daemon.control.step_motions import first_gripper_step, first_motion_before_grip, first_turn_before_tare
 from shearloop.daemon.torques import CONFIRM_TARE, TorqueSource, loaded_sentence
 
 # A clamped tool that was turned by less is back at the angle of its zero.

@@ -8,7 +8,9 @@ from typing import Any
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_check import Turn, reversals, turns
-from shearloop.daemon.control.experiment_schema import AS_ASKED, Demand, ExperimentFile, Speeds, Step, demands
+from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
+from shearloop.daemon.control.step_demands import Demand, demands
+from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare, opens_to
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
@@ -146,7 +148,7 @@ def plan_of(
     # Whether the next step that twists waits for the first torques of a grip or a tare.
     waits = False
     opened = False
-    untared = steps.first_turn_before_tare(file) if file.torque_source in (LOAD_CELL, WRENCH) else None
+    untared = first_turn_before_tare(file) if file.torque_source in (LOAD_CELL, WRENCH) else None
     expected = zip(file.steps, turns(file), demands(file.steps, speeds), strict=True)
     for number, (step, turn, needs) in enumerate(expected, 1):
         duration_s = needs.takes_s
@@ -206,7 +208,7 @@ def _words(step: Step, gripper: GripperModel | None) -> str:
             to = f"closes the fingers to {step.width_mm:g} mm, or onto a tool, at {step.speed_mm_per_s:g} mm/s"
             return f"{to} with up to {step.force_n:g} N; {empty}"
         case steps.ReleaseStep():
-            return f"opens the fingers {steps.opens_to(step, gripper)}: a held tool drops"
+            return f"opens the fingers {opens_to(step, gripper)}: a held tool drops"
         case steps.TareStep():
             return "takes the zero of every torque sensor; nothing turns"
         case steps.IdentifyStep():

@@ -4,22 +4,19 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
-from itertools import pairwise
-from typing import TYPE_CHECKING, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import ValidationError, model_validator
 
-from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
-from shearloop.drivers.errors import DeviceCalibrationError, DriverError
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq import messages
-from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel, ModelName
+from shearloop.drivers.robotiq.models import COUNTS_MAX, MODELS, GripperModel
 from shearloop.drivers.robotiq.requests import RequestWatch
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.timeouts import timeout
 
 if TYPE_CHECKING:
@@ -30,11 +27,6 @@ T = TypeVar("T")
 # Each of its calls has a deadline; DeviceLostError closes the connection.
 RobotiqClient: TypeAlias = "SocketClient | ModbusClient"
 
-COUNTS_MAX = 255
-# Without a calibration, the width of a gripper of unknown fingertips.
-_NOMINAL_STD_MM = 3.0
-# This many diameters over this fraction of the stroke show whether the width bows.
-_BOW_GAUGES, _BOW_SPREAD = 4, 0.5
 POLL_S = 0.1
 # Without a readout of `states` for this number of poll periods, a command reads by itself.
 _POLLS_WAITED = 3
@@ -45,149 +37,7 @@ RESET_DEADLINE_NS = 3_000_000_000
 ACTIVATION_DEADLINE_NS = 15_000_000_000
 # The full stroke at the slowest speed takes 4.7 s.
 MOTION_DEADLINE_NS = 10_000_000_000
-# Of the nominal counts per millimetre: more means diameters in another unit, or another model.
-_STEEPEST = 2.5
 _NO_COMMUNICATION = 9
-
-
-class WidthCalibration(CalibrationModel):
-    """The width over the counts: the line through two positions of known width, and its bow.
-
-    `bow_mm` is how much wider than the line the fingers are half-way between the two positions, on a parabola.
-    `std_mm` is the standard deviation of the width about the curve; `width_std_mm` adds the step of one count.
-    """
-
-    model: ModelName = DEFAULT_MODEL
-    open_counts: Finite
-    open_mm: Positive
-    closed_counts: Finite
-    closed_mm: Finite = 0.0
-    bow_mm: Finite = 0.0
-    std_mm: Positive
-
-    @model_validator(mode="after")
-    def _two_different_widths(self) -> Self:
-        if self.open_counts >= self.closed_counts or self.open_mm <= self.closed_mm:
-            raise ValueError("the open position must have fewer counts and more millimetres than the closed one")
-        widths = [self.width_mm(counts) for counts in range(COUNTS_MAX + 1)]
-        if any(one <= other for one, other in pairwise(widths)):
-            raise ValueError(
-                f"with a bow of {self.bow_mm:g} mm the width would not fall with the counts: measure it again with "
-                "`shearloop calibrate gripper`"
-            )
-        return self
-
-    @classmethod
-    def nominal(cls, model: ModelName = DEFAULT_MODEL) -> Self:
-        """Return the data sheet's line for bare fingers: good enough to move, not to measure a diameter."""
-        own = MODELS[model]
-        ends = {"open_counts": own.open_counts, "closed_counts": own.closed_counts, "open_mm": own.stroke_mm}
-        return cls(model=model, std_mm=max(own.bow_mm, _NOMINAL_STD_MM), **ends)
-
-    @classmethod
-    def of_gauges(cls, gauges: Sequence[tuple[float, float]], model: ModelName = DEFAULT_MODEL) -> Self:
-        """Return the curve through (counts, width in mm) pairs of gripped objects.
-
-        Four diameters or more show whether it bows; the scatter about it is then its standard deviation, and one count
-        at least. Raises DeviceCalibrationError when no falling curve fits.
-        """
-        own = MODELS[model]
-        diameters = {width for _, width in gauges}
-        if len(diameters) < 2:
-            raise DeviceCalibrationError("A width calibration needs objects of at least two different diameters.")
-        if max(diameters) > own.stroke_mm:
-            raise DeviceCalibrationError(
-                f"An object of {max(diameters):g} mm does not fit between the fingers of a {model}: its stroke is "
-                f"{own.stroke_mm:g} mm. Measure without it, or correct `--model`."
-            )
-        counts, widths = (np.array(column, dtype=float) for column in zip(*gauges, strict=True))
-        line = cls._line(counts, widths, own)
-        spread_mm = max(diameters) - min(diameters)
-        found, unseen_mm = line, 0.0
-        if len(diameters) < _BOW_GAUGES or spread_mm < _BOW_SPREAD * own.stroke_mm:
-            # The error of a line between gauges with an unknown bow.
-            unseen_mm = own.bow_mm * (spread_mm / own.stroke_mm) ** 2
-        elif (bowed := cls._bowed(counts, widths, own)) is not None and bowed.std_mm < line.std_mm:
-            found = bowed
-        if found.std_mm > 0.02 * own.stroke_mm:
-            raise DeviceCalibrationError(
-                f"The diameters scatter by {found.std_mm:.1f} mm about a smooth curve: check them, and that each "
-                "object was gripped at the same place of the fingertips."
-            )
-        return found.model_copy(update={"std_mm": max(found.std_mm, unseen_mm)})
-
-    @classmethod
-    def _line(cls, counts: NDArray[np.float64], widths: NDArray[np.float64], model: GripperModel) -> Self:
-        """Return the line through counts (n,) and widths (n,); from three pairs on with its scatter."""
-        counts_per_mm, closed_counts = (float(value) for value in np.polyfit(widths, counts, 1))
-        # Less than a quarter of the nominal slope means objects in the wrong order.
-        if counts_per_mm > -0.25 * COUNTS_MAX / model.stroke_mm:
-            raise DeviceCalibrationError(
-                "The fingers did not stop further closed on the smaller objects: were they measured in the order "
-                "given, and did the fingers hold each of them?"
-            )
-        times = -counts_per_mm * model.stroke_mm / COUNTS_MAX
-        if times > _STEEPEST:
-            raise DeviceCalibrationError(
-                f"Between the objects the fingers moved {times:.1f} times as far as a {model.name} does for these "
-                "diameters: give the diameters in mm, and the model with --model."
-            )
-        residuals = (counts - (closed_counts + counts_per_mm * widths)) / counts_per_mm
-        scatter_mm = math.sqrt(float(residuals @ residuals) / (len(counts) - 2)) if len(counts) > 2 else 0.0
-        return cls(
-            model=model.name,
-            open_counts=closed_counts + counts_per_mm * model.stroke_mm,
-            open_mm=model.stroke_mm,
-            closed_counts=closed_counts,
-            std_mm=max(scatter_mm, -1 / counts_per_mm),
-        )
-
-    @classmethod
-    def _bowed(cls, counts: NDArray[np.float64], widths: NDArray[np.float64], model: GripperModel) -> Self | None:
-        """Return the parabola through counts (n,) and widths (n,), or None where it does not fall over the stroke."""
-        curve = np.polynomial.Polynomial.fit(counts, widths, 2).convert()
-        residuals = widths - curve(counts)
-        # The vertex lies to the right of a parabola that opens upward, and the stroke to the left of it.
-        bend, slope = float(curve.coef[2]), float(curve.coef[1])
-        vertex = -slope / (2 * bend) if bend else math.inf
-        roots = [(curve - width).roots() for width in (model.stroke_mm, 0.0)]
-        if any(np.iscomplex(ends).any() for ends in roots):
-            return None
-        opened, closed = (float(ends.real.min() if bend > 0 else ends.real.max()) for ends in roots)
-        if not (opened < closed and (vertex > closed if bend > 0 else vertex < opened)):
-            return None
-        try:
-            return cls(
-                model=model.name,
-                open_counts=opened,
-                open_mm=model.stroke_mm,
-                closed_counts=closed,
-                bow_mm=float(curve(0.5 * (opened + closed))) - 0.5 * model.stroke_mm,
-                std_mm=max(
-                    math.sqrt(float(residuals @ residuals) / (len(counts) - 3)), model.stroke_mm / (closed - opened)
-                ),
-            )
-        except ValidationError:
-            return None
-
-    @property
-    def mm_per_count(self) -> float:
-        """The mean change of width per count, mm; negative."""
-        return (self.open_mm - self.closed_mm) / (self.open_counts - self.closed_counts)
-
-    def width_mm(self, counts: float) -> float:
-        """Return the width at a position, mm."""
-        part = (counts - self.open_counts) / (self.closed_counts - self.open_counts)
-        return self.closed_mm + (counts - self.closed_counts) * self.mm_per_count + 4 * self.bow_mm * part * (1 - part)
-
-    def counts(self, width_mm: float) -> int:
-        """Return the position nearest to a width, within 0…255."""
-        return min(range(COUNTS_MAX + 1), key=lambda counts: abs(self.width_mm(counts) - width_mm))
-
-    @property
-    def width_std_mm(self) -> float:
-        """The standard deviation of a measured width, mm: of the curve and of the encoder's step."""
-        return math.hypot(self.std_mm, self.mm_per_count / math.sqrt(12))
 
 
 @dataclass(eq=False)

@@ -6,6 +6,8 @@ from typing import Final, Literal
 
 ModelName = Literal["2F-140", "2F-85", "Hand-E"]
 DEFAULT_MODEL: Final = "2F-140"
+# Positions, speeds and forces are counts from 0 to this one.
+COUNTS_MAX: Final = 255
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,18 +5,10 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.gain import (
-    FIRST_SPREAD,
-    PRIOR_SPREADS,
-    TOOL_SPREAD,
-    GainSpread,
-    ToolLaw,
-    find_twists,
-    first_twists,
-    loaded_log_gain,
-)
+from shearloop.estimation.gain import FIRST_SPREAD, PRIOR_SPREADS, TOOL_SPREAD, GainSpread, ToolLaw
 from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.ridge import CensoredRidge, Ridge
+from shearloop.estimation.twists import find_twists, first_twists, loaded_log_gain
 
 TWISTS = np.tile([0.0, 0.0, 0.0, 0.03, 0.05, 0.04, 0.0, 0.0], 10)
 # Of one fingertip.

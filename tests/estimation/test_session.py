@@ -10,8 +10,9 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import TRUSTED, Estimate, FrameSeries, Measured, Session, TactileFrame, fit, fitting
 from shearloop.estimation.fingertip_validator import mask_unmeasured
-from shearloop.estimation.gain import ToolLaw, find_twists
+from shearloop.estimation.gain import ToolLaw
 from shearloop.estimation.session import FINGERS_MOVED
+from shearloop.estimation.twists import find_twists
 from tests.estimation.conftest import IDLE_S, follow, judged, kept, twisting
 
 

@@ -20,8 +20,9 @@ from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import SerialPort
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.load_cell import LoadCalibration
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.emulators.boards import Hx711Board
 from tests.running import running
 
@@ -204,7 +205,8 @@ def test_a_gripper_of_a_daemon_is_refused_and_what_it_may_hold_is_said_before_it
 COMMISSIONING = """
 import sys
 from shearloop.daemon.process import raise_ending_signals
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.tools.commission.fingers import ConnectedGripper, close_fingers
 

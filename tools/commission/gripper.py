@@ -6,9 +6,10 @@ from typing import Final
 from shearloop.daemon.commissioning import Line, Supplied
 from shearloop.daemon.config import GripperConfig
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.robotiq.gripper import ACTIVATION_DEADLINE_NS, PAUSE_NS, RESET_DEADLINE_NS, WidthCalibration
+from shearloop.drivers.robotiq.gripper import ACTIVATION_DEADLINE_NS, PAUSE_NS, RESET_DEADLINE_NS
 from shearloop.drivers.robotiq.messages import GripperState
 from shearloop.drivers.robotiq.models import MODELS, ModelName
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.fingers import FINGERS_MM_PER_S, GENTLE_N, Gripper, close_fingers, open_fingers
 from shearloop.tools.commission.operator import Played

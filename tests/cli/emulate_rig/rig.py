@@ -17,9 +17,10 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers.connection import LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.load_cell import LoadCalibration, LoadSample
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState
 from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState, Stop, WristSpeed
 from shearloop.drivers.ur.settings import read_settings

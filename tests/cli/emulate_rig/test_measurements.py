@@ -9,9 +9,10 @@ import pytest
 
 from shearloop.drivers.connection import SerialLink
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import ObjectStatus
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from tests.cli.emulate_rig import rig as played
 
 pytestmark = pytest.mark.real_time

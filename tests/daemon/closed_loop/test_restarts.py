@@ -13,9 +13,10 @@ import yaml
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging.client import Subscriber, send_command
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand
 from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from tests.fixtures.daemons import DEADLINE_S, ask, running_daemon, shearloop
 from tests.fixtures.rigs import HOST, SLOW_TWIST, Watcher, emulated_rig, experiment, running_rig, started, truth
 

@@ -14,9 +14,10 @@ from unittest.mock import patch
 import pytest
 
 from shearloop.drivers.connection import LinkMonitor
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.emulators.gripper import Gripper, ModbusSlave, UrcapSession
 from shearloop.emulators.ports import PtyServer, Server, SocketServer
 from tests.running import LinkEvents

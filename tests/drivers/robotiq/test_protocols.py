@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError, ProtocolError
 from shearloop.drivers.robotiq import messages, modbus_client
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.socket_client import SocketClient, readout_of, set_lines, take_answer, value_of
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.emulators.gripper import Fingers
 
 byte = st.integers(0, 255)

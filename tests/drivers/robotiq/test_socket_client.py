@@ -11,9 +11,10 @@ import pytest
 
 from shearloop.drivers.errors import DeviceLostError, ProtocolError
 from shearloop.drivers.robotiq import socket_client
-from shearloop.drivers.robotiq.gripper import RobotiqGripper, WidthCalibration
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperAction, GripperCommand, GripperMove
 from shearloop.drivers.robotiq.socket_client import ALWAYS, IN_TURN, SocketClient
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.tools.commission.gripper import judge_exchanges
 from shearloop.tools.commission.limits import REAL
 

@@ -14,10 +14,10 @@ from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.load_cell import LoadCalibration, LoadParser, LoadSample
-from shearloop.drivers.robotiq.gripper import WidthCalibration
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand, GripperState, ObjectStatus, fault_of
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.socket_client import ALWAYS, IN_TURN, IN_TURN_S
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import (

@@ -15,7 +15,7 @@ from shearloop.daemon.commissioning import NOTHING_SUPPLIED
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
-from shearloop.drivers.robotiq.gripper import WidthCalibration
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.tools.commission import boards, tool
 from shearloop.tools.commission.boards import judge_frames, judge_load

@@ -13,7 +13,7 @@ from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
 from shearloop.daemon.sensors import Sensors
-from shearloop.daemon.supervisor import HealthReporter
+from shearloop.daemon.supervisor import HealthReporter, error_text
 from shearloop.errors import UserError
 from shearloop.printable import printable
 
@@ -89,18 +89,23 @@ class Commands:
 
     async def _reported(self, name: str, handler: Handler, request: Request) -> Reply:
         """Carry out a command, and report its result."""
-        refusal = None
+        refusal: str | None = f"{name} was ended before it was done"
         try:
             check_arguments(name, request)
             if name != STOP and request.get("instance", self.instance) != self.instance:
                 raise CommandRefusedError(_ANOTHER_DAEMON)
-            return await handler(request)
+            reply = await handler(request)
+            refusal = None
         except CommandRefusedError as error:
             refusal = str(error)
+            raise
+        except Exception as error:
+            refusal = f"{name} failed ({error_text(error)}); see the daemon's log"
             raise
         finally:
             if not request.get("ask"):
                 self.report(Answered(name, request, refusal))
+        return reply
 
     async def _experiments(self, _request: Request) -> Reply:
         """Return the experiments that `start` may name, and the configured one, which it runs without a name."""

@@ -16,7 +16,7 @@ from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.messaging.messages import stop_times, with_unit
 from shearloop.daemon.torques import LOAD_CELL
 from shearloop.printable import printable
-from shearloop.words import counted, times
+from shearloop.words import CountedReasons, counted, times
 
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
@@ -103,8 +103,8 @@ class _Run:
     identified: str = ""
     held_s: float = 0.0
     hold_reasons: Counter[str] = field(default_factory=Counter)
-    # By source, the reasons without their numbers.
-    invalid: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    # By source, why a torque was not valid.
+    invalid: defaultdict[str, CountedReasons] = field(default_factory=lambda: defaultdict(CountedReasons))
     torques: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     # By source, the times in ns of all torques, also of those that are not valid.
     times_ns: defaultdict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
@@ -192,7 +192,7 @@ def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
     if topic in TORQUES and content.get("torque_nm") is not None and content.get("valid", True):
         run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
     elif topic in TORQUES and not content.get("valid", True):
-        run.invalid[source][content["reason"].split(":")[0].split(",")[0]] += 1
+        run.invalid[source].add(content["reason"])
 
 
 def _update(run: _Run, content: Mapping[str, Any]) -> None:
@@ -343,7 +343,7 @@ def _counted(run: _Run) -> Iterator[str]:
     for source, reasons_of in run.invalid.items():
         # A source without any torque has another purpose.
         if source in run.torques:
-            count, ((most, _),) = reasons_of.total(), reasons_of.most_common(1)
+            count, (_, most) = reasons_of.total, reasons_of.most_frequent_first[0]
             every = count + len(run.torques[source])
             unused = f"{count} of {counted(every, 'torque')} of {source} {'was' if count == 1 else 'were'}"
             yield f"  {unused} not valid and not used, most often: {most}"

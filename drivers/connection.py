@@ -20,6 +20,7 @@ from serial.tools import list_ports
 
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError, DriverError
 from shearloop.timeouts import timeout
+from shearloop.words import without_digits
 
 DEFAULT_BAUD = 115_200
 # The kernel keeps 4 kB for a pseudo-terminal and up to 64 kB for a USB port.
@@ -289,7 +290,7 @@ class LinkMonitor:
         self._connected_ns = None
         before, self._last_error = self._last_error, str(error)
         # A different error is news even without a pause in between.
-        repeated = self._failures > 0 and _without_digits(before) == _without_digits(self._last_error)
+        repeated = self._failures > 0 and without_digits(before) == without_digits(self._last_error)
         pause_s = min(self._first_s * 2.0 ** min(self._failures, 32), self._longest_s)
         self._failures += 1
         self._notify(LinkEvent(up=False, sentence=self._last_error, repeated=repeated))
@@ -314,10 +315,6 @@ class LinkMonitor:
         self.latest = event
         if self._observer is not None:
             self._observer.on_link_event(event)
-
-
-def _without_digits(text: str) -> str:
-    return "".join(letter for letter in text if not letter.isdigit())
 
 
 @dataclass(eq=False, kw_only=True)

@@ -84,15 +84,17 @@ class LatestInputs:
     died: Mapping[str, str] = field(default_factory=dict)
 
     def add_torque(self, torque: TorqueSample) -> None:
-        """Store a torque, unless it is older than the latest one of its source."""
-        known = self.torques.get(torque.source)
-        if known is not None and torque.t_mid_ns <= known.t_mid_ns:
-            return
+        """Store a torque as the latest one of its source, and in the history unless a later measurement is there.
+
+        A mean over several frames lies before a single frame that came before it.
+        """
         self.torques[torque.source] = torque
         if torque.torque_nm is None:
             return
         self.unjudged.append(torque)
         times_ns, torques_nm = self.history.setdefault(torque.source, ([], []))
+        if times_ns and torque.t_mid_ns <= times_ns[-1]:
+            return
         times_ns.append(torque.t_mid_ns)
         torques_nm.append(torque.torque_nm)
         kept_ns = round(self.kept_s * 1e9)

@@ -17,7 +17,7 @@ from shearloop.daemon.control.inputs import ArmStatus
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.state_publisher import StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
-from shearloop.daemon.control.wrench import WrenchMean
+from shearloop.daemon.control.wrench import WrenchMean, publish_every
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import error_text
 from shearloop.daemon.torques import WRENCH, Tareable, TorqueSample
@@ -59,7 +59,7 @@ class ControlLoopRunner:
         self._timeline = StopTimeline()
         self._sender = CommandSender(robot, control_loop, self._timeline, clock)
         self.actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop, write_state)
-        self.states = StatePublisher(publisher, control_loop)
+        self.states = StatePublisher(publisher, control_loop, publish_every(robot.settings.rate_hz))
         self._wrench = WrenchMean(robot.settings.rate_hz)
         self._running = False
         self._stopped = True

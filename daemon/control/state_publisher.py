@@ -15,8 +15,6 @@ from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateM
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.ur.messages import RobotState
 
-# Every fifth state is published, 25 a second, and is a torque sample of the wrench.
-PUBLISH_EVERY = 5
 LOOP_STATE_PERIOD_S = 1.0
 # The columns of `robot.state` that the robot's state has under the same name.
 _SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s", "wrist_torque_nm"}
@@ -28,6 +26,8 @@ class StatePublisher:
 
     publisher: Publisher
     control_loop: ControlLoop
+    # Of how many of the robot's states one is published.
+    every: int
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     # The experiment of the last published end.
     ended: Experiment | None = None
@@ -37,8 +37,8 @@ class StatePublisher:
     _published_ns: int = 0
 
     def publish_robot(self, state: RobotState, wrist_torque_nm: float) -> bool:
-        """Publish every fifth state, with the mean torque of the latest ones; return whether it was this one."""
-        if (block := state.cycle // PUBLISH_EVERY) == self._block:
+        """Publish each `every`th state, with the mean torque of the latest ones; return whether it was this one."""
+        if (block := state.cycle // self.every) == self._block:
             return False
         self._block = block
         same: dict[str, Any] = {name: getattr(state, name) for name in _SAME}

@@ -2,17 +2,26 @@
 
 from collections import deque
 
-from shearloop.daemon.control.state_publisher import PUBLISH_EVERY
 from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.drivers.ur.messages import RobotState
 from shearloop.drivers.ur.settings import WRENCH_STATES
+
+# How often the robot's state is published, with a torque of the wrench; and the time that the torque is a mean over.
+PUBLISHED_HZ, MEAN_OVER_S = 25.0, 0.192
+# This fraction of the states in a mean's time must be there.
+_ENOUGH = 2.0 / 3.0
+
+
+def publish_every(rate_hz: float) -> int:
+    """Return of how many of the robot's states one is published, from their rate."""
+    return max(1, round(rate_hz / PUBLISHED_HZ))
 
 
 def wrench_source(rate_hz: float, noise_nm: float = 0.0) -> TorqueSource:
     """Return the torque source of a robot's wrench, from the robot's rate of states and the noise of a mean."""
     return TorqueSource(
         name=WRENCH,
-        period_s=PUBLISH_EVERY / rate_hz,
+        period_s=publish_every(rate_hz) / rate_hz,
         window_s=wrench_window_s(rate_hz),
         from_robot=True,
         needs_zero=True,
@@ -21,8 +30,8 @@ def wrench_source(rate_hz: float, noise_nm: float = 0.0) -> TorqueSource:
 
 
 def wrench_window_s(rate_hz: float) -> float:
-    """Return the time that a mean is over: at most a third of its states may be missing."""
-    return 1.5 * WRENCH_STATES / rate_hz
+    """Return the time that a mean is over: long enough for `WRENCH_STATES` states where some are missing."""
+    return max(MEAN_OVER_S, WRENCH_STATES / (_ENOUGH * rate_hz))
 
 
 class WrenchMean:
@@ -30,7 +39,9 @@ class WrenchMean:
 
     def __init__(self, rate_hz: float) -> None:
         """Begin without a state."""
-        self._window_ns = round(1e9 * wrench_window_s(rate_hz))
+        window_s = wrench_window_s(rate_hz)
+        self._window_ns = round(1e9 * window_s)
+        self._enough = round(_ENOUGH * window_s * rate_hz)
         # Times by the controller's clock in ns, ascending, and torques in N·m.
         self._states: deque[tuple[int, float]] = deque()
 
@@ -46,7 +57,7 @@ class WrenchMean:
     @property
     def known(self) -> bool:
         """Whether the mean is of enough states."""
-        return len(self._states) >= WRENCH_STATES
+        return len(self._states) >= self._enough
 
     @property
     def torque_nm(self) -> float:

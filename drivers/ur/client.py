@@ -92,7 +92,7 @@ class UrRobot:
         self._number = 0
         self._warning = ""
         # Tasks that wait for the next state.
-        self._waiting: list[asyncio.Future[messages.RobotState]] = []
+        self._waiting: set[asyncio.Future[messages.RobotState]] = set()
 
     @property
     def wrench_zero(self) -> Six:
@@ -126,8 +126,12 @@ class UrRobot:
     async def next_state(self) -> messages.RobotState:
         """Return the next state, also after a loss of the connection."""
         waiting: asyncio.Future[messages.RobotState] = asyncio.get_running_loop().create_future()
-        self._waiting.append(waiting)
-        return await waiting
+        self._waiting.add(waiting)
+        try:
+            return await waiting
+        finally:
+            # A waiter that gave up stays for no later state: a robot may be off for days.
+            self._waiting.discard(waiting)
 
     def send(self, command: messages.Command) -> asyncio.Future[messages.CommandReply]:
         """Send a command at once and return its reply; if the worker dies first, the reply is a refusal."""
@@ -206,10 +210,9 @@ class UrRobot:
                     connected = f"The robot at {self.settings.host} is connected."
                     said = (connected, self._warning, message.blocked)
                     self.monitor.connected(" ".join(filter(None, said)), time.monotonic_ns())
-                waiting, self._waiting = self._waiting, []
-                for one in waiting:
-                    if not one.done():
-                        one.set_result(message)
+                for waiting in self._waiting:
+                    if not waiting.done():
+                        waiting.set_result(message)
             case messages.CommandReply():
                 replied = self._replies.pop(number, None)
                 if replied is not None and not replied.done():

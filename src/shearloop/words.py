@@ -1,4 +1,4 @@
-"""Numbers in the words of a sentence."""
+"""Numbers in the words of a sentence, and sentences that differ in their numbers alone."""
 
 
 def times(count: int) -> str:
@@ -9,3 +9,31 @@ def times(count: int) -> str:
 def counted(count: int, one: str, many: str = "") -> str:
     """Return a number with its noun, and the verb if the noun brings one: 1 frame is, 2 frames are."""
     return f"{count} {one if count == 1 else many or f'{one}s'}"
+
+
+def without_digits(text: str) -> str:
+    """Return a text without its digits: sentences that differ in their numbers alone are then the same."""
+    return "".join(character for character in text if not character.isdigit())
+
+
+class CountedReasons:
+    """Counts reasons; those that differ in their numbers alone count as one, and the latest stands for all."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, tuple[int, str]] = {}
+
+    def add(self, reason: str) -> None:
+        """Count a reason."""
+        kind = without_digits(reason)
+        count, _ = self._counts.get(kind, (0, ""))
+        self._counts[kind] = count + 1, reason
+
+    @property
+    def total(self) -> int:
+        """The number of reasons."""
+        return sum(count for count, _ in self._counts.values())
+
+    @property
+    def most_frequent_first(self) -> list[tuple[int, str]]:
+        """Each reason with its count."""
+        return sorted(self._counts.values(), key=lambda counted_reason: -counted_reason[0])

@@ -106,6 +106,18 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
     assert "the wrist was never held" in text
 
 
+def test_the_most_frequent_reason_is_whole_and_counted_without_its_numbers():
+    reasons = ["right fingertip: 40 channels jumped", "no grip", "right fingertip: 51 channels jumped"]
+    refused = [
+        {"source": "right", "t_mono_ns": (20 + number) * S, "torque_nm": None, "valid": False, "reason": reason}
+        for number, reason in enumerate(reasons)
+    ]
+    text = summary_of_hold(None, [], *refused)
+    assert (
+        "4 of 64 torques of right were not valid and not used, most often: right fingertip: 51 channels jumped" in text
+    )
+
+
 def test_without_a_truth_nothing_is_said_of_it():
     assert "true" not in summary_of_hold(None, [])
 

@@ -16,8 +16,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.gripper_task import OPENING
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
-from shearloop.daemon.control.state_publisher import PUBLISH_EVERY
-from shearloop.daemon.control.wrench import wrench_source
+from shearloop.daemon.control.wrench import publish_every, wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import WRENCH, TorqueSample
 from shearloop.drivers.ur.client import UrRobot
@@ -289,7 +288,7 @@ async def driven(*steps: Mapping[str, Any], cycles: int = 0, cell: Cell | None =
     cell = cell or Cell()
     cell.drive()
     # Until the wrench is known.
-    await cell.cycles(WRENCH_STATES + PUBLISH_EVERY)
+    await cell.cycles(WRENCH_STATES + publish_every(SETTINGS.rate_hz))
     try:
         if steps:
             await cell.start(*steps)

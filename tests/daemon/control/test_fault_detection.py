@@ -7,8 +7,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, Grasp, Watched, compared_for_s, detect_faults
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.safety import TABLE, Fault, FaultCode, Response
-from shearloop.daemon.control.state_publisher import PUBLISH_EVERY
-from shearloop.daemon.control.wrench import wrench_source
+from shearloop.daemon.control.wrench import publish_every, wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample, TorqueSource
 from shearloop.drivers.ur.sample_age import SampleAge
@@ -131,6 +130,23 @@ def test_a_torque_that_counts_as_new_is_held_against_its_limit():
     assert found(beyond, driving=quick, supervising=()).keys() == {FaultCode.TORQUE_LIMIT}
 
 
+def test_means_that_lie_before_a_single_frame_are_the_latest_and_judged_and_do_not_disorder_the_history():
+    """A refused frame is no mean; the mean of ten frames that comes next lies four periods before it."""
+    senses, way_s = LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS)), 4.0 * EIT.period_s
+    senses.add_torque(torque(EIT, 0.1, came_s=2.0, way_s=way_s))
+    senses.add_torque(torque(EIT, None, came_s=1.0, why="200 channels cannot be used"))
+    mean = torque(EIT, 0.2, way_s=way_s)
+    senses.add_torque(mean)
+    assert senses.torques[EIT.name] is mean
+    assert [one.torque_nm for one in senses.unjudged] == [0.1, 0.2]
+    early = torque(EIT, 0.3, way_s=way_s + 1.0)
+    senses.add_torque(early)
+    times_ns, torques_nm = senses.history[EIT.name]
+    assert times_ns == sorted(times_ns)
+    assert torques_nm == [0.1, 0.2]
+    assert senses.torques[EIT.name] is early
+
+
 @pytest.mark.parametrize("rate_hz", [10.9, 80.0, 1000.0])
 def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_hz):
     """Else a disagreement would come and go with every frame, and a hold would never become a stop."""
@@ -233,7 +249,7 @@ def test_each_sample_is_compared_with_a_wrench(rate_hz, slow_hz):
     for cycle in range(round(20.0 * rate_hz)):
         t_ns = NOW_NS + round(cycle / rate_hz * 1e9)
         senses.arm = ArmStatus(0.0, t_ns)
-        if cycle % PUBLISH_EVERY == 0:
+        if cycle % publish_every(rate_hz) == 0:
             senses.add_torque(TorqueSample("wrench", 0.1, "", t_ns, t_ns))
         measured_ns = NOW_NS + round((sample - 0.5) / slow_hz * 1e9)
         if t_ns >= NOW_NS + round(sample / slow_hz * 1e9):

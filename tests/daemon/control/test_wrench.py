@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.daemon.control.wrench import WrenchMean
+from shearloop.daemon.control.wrench import WrenchMean, publish_every, wrench_source
 from shearloop.drivers.ur.messages import tool_axis
 from shearloop.drivers.ur.settings import GENERATIONS, WRENCH_STATES
 from shearloop.emulators.ur_robot import Robot
@@ -47,6 +47,20 @@ def test_with_a_third_of_the_states_a_mean_is_known_and_with_half_of_them_it_is_
         for number in range(60):
             mean.add(state(round(number * every), 0.1))
         assert mean.known is known
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 125.0, 250.0, 500.0])
+def test_a_mean_is_over_the_same_time_and_published_as_often_at_any_rate_of_states(rate_hz):
+    assert 20.0 <= rate_hz / publish_every(rate_hz) <= 30.0
+    mean = WrenchMean(rate_hz)
+    for number in range(round(rate_hz)):
+        t_ns = round(number * 1e9 / rate_hz)
+        mean.add(SimpleNamespace(t_mono_ns=t_ns, age_ns=0, wrist_torque_nm=number / rate_hz))
+    assert mean.known
+    # Of a ramp of 1 N·m a second: half the window, which at 50 states a second is for 24 of them.
+    window_s = max(0.192, 24 / rate_hz)
+    assert 1.0 - mean.torque_nm == pytest.approx(0.5 * window_s, abs=1.0 / rate_hz)
+    assert wrench_source(rate_hz).window_s == pytest.approx(window_s)
 
 
 def test_states_before_a_gap_belong_to_no_mean_after_it():

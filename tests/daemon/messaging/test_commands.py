@@ -186,6 +186,46 @@ async def test_commands_are_told_with_their_answer_and_questions_are_not():
     assert "there is no sensor 'left' to tare" in str(reported[1][1])
 
 
+async def test_a_command_that_crashes_or_is_cut_off_is_reported_as_not_carried_out():
+    reported: list[str | None] = []
+    begun, never = asyncio.Event(), asyncio.Event()
+
+    def crash() -> None:
+        raise ZeroDivisionError("nothing to divide")
+
+    class Runner:
+        def release_refusal(self) -> None:
+            return None
+
+        async def release(self) -> None:
+            begun.set()
+            await never.wait()
+
+    operator = SimpleNamespace(release_question=lambda: "the fingers open", release_stakes=tuple)
+    rig = SimpleNamespace(
+        runner=Runner(), control_loop=SimpleNamespace(operator=operator, pause=crash), occasion=tuple, memory=None
+    )
+    handlers = Commands(
+        rig=rig,
+        sensors=None,
+        experiment=None,
+        health=None,
+        daemon_end=asyncio.Event(),
+        tare_refusal=None,
+        report=lambda answered: reported.append(answered.refusal),
+    ).handlers()
+    with pytest.raises(ZeroDivisionError):
+        await handlers["pause"]({})
+    releasing = asyncio.create_task(handlers["release"]({"confirmed": True}))
+    await begun.wait()
+    releasing.cancel()
+    await asyncio.gather(releasing, return_exceptions=True)
+    assert reported == [
+        "pause failed (ZeroDivisionError: nothing to divide); see the daemon's log",
+        "release was ended before it was done",
+    ]
+
+
 @pytest.mark.parametrize(
     ("by", "shown"),
     [("ann@rig, a script", "ann@rig, a script"), ("a\nb\x1b[2J", "a b\\u001b[2J"), ("", UNKNOWN), (7, UNKNOWN)],

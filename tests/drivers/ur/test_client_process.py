@@ -1,9 +1,12 @@
 """`UrRobot` without a controller: the worker's end, and the message about it."""
 
 import asyncio
+import gc
 import sys
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -86,6 +89,29 @@ async def test_disconnects_and_refuses_what_is_unanswered(play, tmp_path):
         assert "ended before it answered" in (await replied).refusal
     assert robot.state is None
     assert log.read_text() == "True\n", "it exits on Disconnect"
+
+
+async def test_who_gave_up_waiting_for_a_state_is_not_kept():
+    """A robot may be off for days, and the loop waits ten times a second."""
+    robot = UrRobot(settings_for("127.0.0.254"))
+    kept: weakref.WeakSet[asyncio.Future[Any]] = weakref.WeakSet()
+    loop = asyncio.get_running_loop()
+    create_future = loop.create_future
+
+    def noted() -> asyncio.Future[Any]:
+        future = create_future()
+        kept.add(future)
+        return future
+
+    loop.create_future = noted
+    for _ in range(20):
+        waiter = asyncio.ensure_future(robot.next_state())
+        await asyncio.sleep(0)
+        waiter.cancel()
+        await asyncio.gather(waiter, return_exceptions=True)
+    del waiter
+    gc.collect()
+    assert len(kept) <= 1
 
 
 async def test_worker_that_ends_during_shutdown_is_awaited(play, monkeypatch):

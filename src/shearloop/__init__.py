@@ -14,9 +14,8 @@ Estimate the torque along a recording:
     calibration = shearloop.Calibration.load("fingertip.cal")
     session = shearloop.Session(calibration, bank)
     [series] = shearloop.read_series("twists.mcap", calibration.sides)
-    for t_s, channels in zip(series.t_s, series.channels):
-        estimate = session.estimate(shearloop.TactileFrame.of(t_s, channels))
-        print(t_s, estimate.torque_nm)
+    for frame in series.frames():
+        print(frame.t_s, session.estimate(frame).torque_nm)
 
 Read what a daemon recorded, as arrays and as pandas frames:
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+from shearloop.daemon.control.control_output import ControlOutput, Drive, End, StandStill
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, Hold, StepCommand, TrackTorque
 from shearloop.daemon.control.experiment_schema import (
@@ -30,20 +31,6 @@ from shearloop.daemon.torques import TorqueSample, TorqueSource, beyond_noise
 
 # An `adapt` step compares the fingertip with the torques of this time.
 ADAPTED_OVER_S = 600.0
-
-
-@dataclass(frozen=True, slots=True)
-class ControlOutput:
-    """Commands to the devices; `action` and `release` are set for one tick.
-
-    A straight move that is interrupted continues afterwards.
-    """
-
-    wrist_rad_per_s: float = 0.0
-    ends_motion: bool = False
-    interrupts_motion: bool = False
-    action: Action | None = None
-    release: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,7 +330,7 @@ class ControlLoop:
             return self._ended(self.safety.report(decision.faults))
         phase = "held" if held else experiment.phase.value
         self.status = LoopStatus(phase, awaited or experiment.command.activity, velocity, decision)
-        return ControlOutput(velocity.speed_rad_per_s, interrupts_motion=still, action=action)
+        return StandStill() if still else Drive(velocity.speed_rad_per_s, action)
 
     def _choose_command(
         self, experiment: Experiment, wrist_rad: float, origin_rad: float, t_ns: int, *, held: bool
@@ -425,7 +412,7 @@ class ControlLoop:
         for creep in self._creep.values():
             creep.reset()
 
-    def _ended(self, decision: SafetyDecision) -> ControlOutput:
+    def _ended(self, decision: SafetyDecision) -> End:
         experiment = self.experiment
         phase = experiment.phase.value if experiment is not None else "idle"
         reason = experiment.stop_reason if experiment is not None else ""
@@ -436,7 +423,7 @@ class ControlLoop:
         self.status = LoopStatus(phase, reason, WristCommand(), decision)
         release = decision.response is Response.STOP_AND_RELEASE and not self._released
         self._released |= release
-        return ControlOutput(ends_motion=True, release=release)
+        return End(release)
 
 
 def _turns(command: StepCommand) -> bool:

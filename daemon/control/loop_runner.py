@@ -8,7 +8,8 @@ import structlog
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.action_executor import UNLOCKING, ActionExecutor, WriteState, no_state
 from shearloop.daemon.control.command_sender import CommandSender
-from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.control_output import Drive, End, StandStill
 from shearloop.daemon.control.experiment import Experiment, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
@@ -62,7 +63,8 @@ class ControlLoopRunner:
         self.states = StatePublisher(publisher, control_loop, publish_every(robot.settings.rate_hz))
         self._wrench = WrenchMean(robot.settings.rate_hz)
         self._running = False
-        self._stopped = True
+        # Whether something may be moving: each decision but `End` lets it, and after a crash it is not known.
+        self._may_be_moving = False
         # The latest experiment whose stop has a timeline.
         self._timed: Experiment | None = None
         self._decided_ns = 0
@@ -80,7 +82,7 @@ class ControlLoopRunner:
             while True:
                 # Without a state the loop decides all the same.
                 with suppress(TimeoutError):
-                    longest_s = LONGEST_REST_S if self._stopped else LONGEST_TICK_S
+                    longest_s = LONGEST_TICK_S if self._may_be_moving else LONGEST_REST_S
                     async with timeout(max(longest_s, LONGEST_SILENCE_S)):
                         await self._robot.next_state()
                     # After a pause of this process several states arrive at once; only the newest one counts.
@@ -317,26 +319,36 @@ class ControlLoopRunner:
     def _decide(self) -> None:
         now_ns = self._clock.now_ns()
         # From decision to decision, so that a slow decision is late as well.
-        late_s = (now_ns - self._decided_ns) / 1e9 - (LONGEST_REST_S if self._stopped else LONGEST_TICK_S)
+        late_s = (now_ns - self._decided_ns) / 1e9 - (LONGEST_TICK_S if self._may_be_moving else LONGEST_REST_S)
         self._decided_ns = now_ns
         sent_rad_per_s = None if self._sender.unanswered else self._sender.sent_rad_per_s
         output = self._control_loop.tick(now_ns, max(0.0, late_s), sent_rad_per_s)
-        if output.ends_motion:
-            self._stop(output, now_ns)
-        else:
-            self._stopped = False
-            if not output.interrupts_motion:
+        match output:
+            case Drive(rad_per_s, action):
+                self._may_be_moving = True
                 self.actions.may_move.set()
-            elif self.actions.interrupt():
-                self._sender.stop()
-            if output.action is not None:
-                self.actions.begin(output.action)
-            self._sender.turn(output.wrist_rad_per_s, now_ns)
-            self._robot.keep_moving()
+                if action is not None:
+                    self.actions.begin(action)
+                self._turn(rad_per_s, now_ns)
+            case StandStill():
+                self._may_be_moving = True
+                if self.actions.interrupt():
+                    self._sender.stop()
+                self._turn(0.0, now_ns)
+            case End(release):
+                self._end(now_ns)
+                if release:
+                    self.actions.release()
         self.states.publish_loop(self._sender.sent_rad_per_s, now_ns)
         self.states.publish_stop(self._timeline.update(self._robot.state, now_ns))
 
-    def _stop(self, output: ControlOutput, now_ns: int) -> None:
+    def _turn(self, rad_per_s: float, now_ns: int) -> None:
+        self._sender.turn(rad_per_s, now_ns)
+        # A straight move goes on for as long as the loop decides.
+        self._robot.keep_moving()
+
+    def _end(self, now_ns: int) -> None:
+        """Stop what may move, once, and begin the timeline of an experiment that was stopped."""
         experiment, status = self._control_loop.experiment, self._control_loop.status
         is_new = (
             experiment is not None and experiment is not self._timed and experiment.phase is ExperimentPhase.STOPPED
@@ -347,16 +359,15 @@ class ControlLoopRunner:
             self.states.publish_stop(self._timeline.end())
             run, name = self._control_loop.runs, experiment.file.name
             self._timeline.begin(run, name, status.activity, status.decision, now_ns)
-        if is_new or not self._stopped:
-            self._stopped = True
+        if is_new or self._may_be_moving:
+            self._may_be_moving = False
             self.actions.cancel()
             self._sender.stop()
-        if output.release:
-            self.actions.release()
 
     async def _brake(self) -> None:
         """Stop the arm, including a straight move."""
-        self._stopped = False
+        # The stop may not arrive, so the next run sends one with its first `End`.
+        self._may_be_moving = True
         try:
             async with timeout(BRAKE_S):
                 await self._robot.send(self._sender.stop_command)

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.control_output import Drive
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.inputs import ArmStatus
@@ -137,12 +138,14 @@ class SkinLoop:
                 self._zero_begun = False
                 self.control_loop.on_action_ended()
         self.control_loop.on_arm(ArmStatus(self._angle_rad, self.t_ns))
-        orders = self.control_loop.tick(self.t_ns, sent_rad_per_s=self._speeds[-1])
-        speed = 0.0 if orders.ends_motion else orders.wrist_rad_per_s
-        self._speeds.append(speed)
-        if isinstance(orders.action, TareStep):
-            self.estimator.tare()
-            self._zero_begun = True
+        speed_rad_per_s = 0.0
+        output = self.control_loop.tick(self.t_ns, sent_rad_per_s=self._speeds[-1])
+        if isinstance(output, Drive):
+            speed_rad_per_s = output.rad_per_s
+            if isinstance(output.action, TareStep):
+                self.estimator.tare()
+                self._zero_begun = True
+        self._speeds.append(speed_rad_per_s)
         controller = self.control_loop.wrist.controller
         wanted_nm = controller.set_point_nm if controller is not None else None
         self.trace.truth_n.append(self.skin.shear_n)

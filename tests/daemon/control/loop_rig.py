@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.control_output import ControlOutput, Drive, End, StandStill
 from shearloop.daemon.control.experiment import Action, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus
@@ -49,7 +50,7 @@ class Rig:
         self.hand = GripperStatus(0, 140.0, holding=False, moving=False)
         self.pending: list[tuple[int, Action]] = []
         self.begun: list[Action] = []
-        self.orders = ControlOutput()
+        self.orders: ControlOutput = StandStill()
         self.true_nm: list[float] = []
 
     @property
@@ -67,13 +68,14 @@ class Rig:
             if self.tick >= due:
                 self.pending.remove((due, action))
                 self._finish(action)
-        orders = self.orders = self.control_loop.tick(self.t_ns, sent_rad_per_s=self.speed)
-        self.speed = 0.0 if orders.ends_motion else orders.wrist_rad_per_s
-        if orders.release:
-            self.force_n = 0.0
-        if orders.action is not None:
-            self.begun.append(orders.action)
-            self.pending.append((self.tick + 100, orders.action))
+        self.orders = self.control_loop.tick(self.t_ns, sent_rad_per_s=self.speed)
+        self.speed = speed_of(self.orders)
+        match self.orders:
+            case Drive(action=action) if action is not None:
+                self.begun.append(action)
+                self.pending.append((self.tick + 100, action))
+            case End(release=True):
+                self.force_n = 0.0
 
     def sense(self, torque_nm: float) -> None:
         now = self.t_ns
@@ -107,6 +109,11 @@ class Rig:
             self.step()
             if self.control_loop.experiment is not None and not self.control_loop.experiment.running:
                 return
+
+
+def speed_of(orders: ControlOutput) -> float:
+    """Return the wrist speed that the loop asks for, in rad/s."""
+    return orders.rad_per_s if isinstance(orders, Drive) else 0.0
 
 
 def started(rig: Rig, *steps: dict[str, Any], **keys: Any) -> Rig:

@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.control_loop import ControlOutput
+from shearloop.daemon.control.control_output import ControlOutput
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.inputs import GripperStatus
@@ -17,7 +17,7 @@ from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 from shearloop.emulators.scene import Twin, TwinSettings
 from tests.daemon.control.cell import GRIP, Cell, Gripper, driven
-from tests.daemon.control.loop_rig import EIT, new_loop
+from tests.daemon.control.loop_rig import EIT, new_loop, speed_of
 from tests.drivers.ur.handler_bench import CYCLE_NS, LIMITS, FakeArm
 
 SPEEDS = st.floats(0.01, 3.14)
@@ -112,7 +112,7 @@ class WholeRig(Cell):
         output = self.tick(*given)
         held = self.control_loop.status.decision.response >= Response.HOLD
         fastest = 0.0 if held else self.control_loop.config.wrist_speed_rad_per_s
-        self.arm.check((output, held), abs(output.wrist_rad_per_s) <= fastest)
+        self.arm.check((output, held), abs(speed_of(output)) <= fastest)
         return output
 
     def sense_gripper(self) -> None:

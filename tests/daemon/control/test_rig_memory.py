@@ -12,6 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.control_output import End
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import FOLLOWED_MM, SAME_WIDTH_MM, Grip
@@ -105,7 +106,7 @@ def test_a_stop_that_released_does_not_release_again_in_the_next_process():
     rig.force_n = 60.0
     for _ in range(20):
         rig.step()
-        assert not rig.orders.release
+        assert rig.orders != End(release=True)
     assert rig.control_loop.status.decision.response is Response.STOP_AND_KEEP_GRIP
 
 

@@ -145,6 +145,19 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         assert FaultCode.TASK_DIED in {trouble.code for trouble in cell.control_loop.status.decision.faults}
 
 
+async def test_the_next_run_after_a_crash_stops_the_arm_once_though_no_experiment_ran(monkeypatch):
+    """Nobody knows whether the stop of the run that crashed has arrived."""
+    async with driven() as cell:
+        monkeypatch.setattr(cell.control_loop, "tick", no_tick)
+        await cell.cycles(1)
+        await cell.loop_died()
+        monkeypatch.undo()
+        cell.robot.commands.clear()
+        cell.drive()
+        await cell.cycles(5)
+        assert [type(command) for command in cell.robot.commands] == [Stop]
+
+
 async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch):
     """Before the gripper has heard of it there is nothing that would open by itself."""
     async with driven({"do": "wait", "wait_s": 60}) as cell:

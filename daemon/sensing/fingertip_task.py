@@ -20,6 +20,7 @@ from shearloop.daemon.sensing.fingertip_messages import (
     torques_as_bytes,
 )
 from shearloop.daemon.sensing.snapshots import record_state
+from shearloop.daemon.sensing.zero_request import ZeroRequest, ZeroState
 from shearloop.daemon.torques import LONGEST_TARE_S, SensorListener, TorqueSample
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
@@ -57,69 +58,22 @@ class ToolHolder(Protocol):
         """Return whether the fingers moved at any time of an interval, as far as is known."""
 
 
-class _Tare:
-    """A tare of one estimator: when it begins, whether it is done, and why its frames were refused."""
+class _RefusedFrames:
+    """The reasons why a tare's frames gave no estimate."""
 
     def __init__(self) -> None:
-        # The tare begins with the first frame acquired after this, and ends before the first one acquired after that.
-        self._from_ns: int | None = None
-        self._until_ns = 0
-        self.begun = self._expired = False
-        self.done = asyncio.Event()
-        self.done.set()
         # By the reason without its numbers: the count, and the latest reason.
-        self._refused: dict[str, tuple[int, str]] = {}
-        # Why it ended without an idle frame, if it did.
-        self.failure: str | None = None
+        self._reasons: dict[str, tuple[int, str]] = {}
 
-    def begin(self, now_ns: int, within_s: float) -> None:
-        """Begin, also during another tare."""
-        self._from_ns, self._until_ns = now_ns, now_ns + round(within_s * 1e9)
-        self.begun = self._expired = False
-        self.failure = None
-        self.done.clear()
-        self._refused.clear()
-
-    def is_under_way(self, now_ns: int) -> bool:
-        """Return whether the next frames belong to it."""
-        return not (self.done.is_set() or self._expired) and now_ns <= self._until_ns
-
-    def expires(self, t_begin_ns: int) -> bool:
-        """Return, once, whether a frame that began then is too late for it."""
-        late = not (self.done.is_set() or self._expired) and t_begin_ns > self._until_ns
-        self._expired |= late
-        return late
-
-    def is_due(self, t_begin_ns: int) -> bool:
-        """Return, once, whether a frame that began then is the tare's first."""
-        due = not self._expired and self._from_ns is not None and t_begin_ns >= self._from_ns
-        self._from_ns = None if due else self._from_ns
-        self.begun |= due
-        return due
-
-    def give_up(self, now_ns: int) -> None:
-        """Forget a tare that no frame has begun, and end one that is not complete."""
-        self._from_ns = None
-        self._until_ns = min(self._until_ns, now_ns)
-
-    def fail(self, reason: str) -> None:
-        """End it without an idle frame: no later frame completes it."""
-        self._from_ns, self._expired, self.failure = None, True, reason
-        self.done.set()
-
-    def add(self, reason: str, *, taring: bool) -> None:
-        """Take the reason of an estimate, and whether more frames are needed."""
-        if self.done.is_set() or self._expired or not self.begun:
-            return
-        if not taring:
-            self.done.set()
+    def add(self, reason: str) -> None:
+        """Take the reason of a frame."""
         kind = "".join(letter for letter in reason if not letter.isdigit())
-        self._refused[kind] = self._refused.get(kind, (0, ""))[0] + 1, reason
+        self._reasons[kind] = self._reasons.get(kind, (0, ""))[0] + 1, reason
 
     @property
-    def reasons(self) -> str:
-        """The reasons with their counts, the most frequent first."""
-        often = sorted(self._refused.values(), reverse=True)
+    def sentence(self) -> str:
+        """The reasons with their counts, the most frequent first; empty without a frame."""
+        often = sorted(self._reasons.values(), reverse=True)
         return ", ".join(f"{counted(count, 'frame')}: {reason}" for count, reason in often)
 
 
@@ -141,28 +95,25 @@ class FingertipTask:
     # The longest time of a tare that no step of an experiment waits for.
     longest_tare_s: float = LONGEST_TARE_S
     count: int = 0
-    _tare: _Tare = field(default_factory=_Tare)
+    # The latest request for an idle frame, and why its frames were refused.
+    _zero: ZeroRequest | None = None
+    _refused: _RefusedFrames = field(default_factory=_RefusedFrames)
     _held: Measured | None = None
-    # Whether the gripper has not said yet that nothing was held in the session's first idle frame; None at first.
-    _unconfirmed: bool | None = None
+    # Whether the gripper has not said yet that nothing was held in an idle frame that nobody asked for.
+    _unconfirmed: bool = field(init=False)
     # The source of the known torque of a correction that waits for the next frame, and its result.
     _adapting: tuple[str, asyncio.Future[None]] | None = None
+
+    def __post_init__(self) -> None:
+        """Begin: a session of the paper's method takes an idle frame without a request."""
+        self._unconfirmed = self.session.taring
 
     async def process(self, *frames: Frame) -> None:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
         number, now_ns = frames[0].seq, self.clock.now_ns()
         # A replay tares, takes the held tool and the fingers' motion, and corrects the gain before the same frame.
-        began_ns = min(frame.t_begin_ns for frame in frames)
-        if self._tare.expires(began_ns):
-            self._give_up_tare(number, now_ns)
-        if self._tare.is_due(began_ns):
-            self.session.tare()
-            self._record(InputKind.TARE, now_ns, tare_as_bytes(number))
-            self._unconfirmed = False
-        if self._is_of_held_tool():
-            reason = f"{self.name} has no idle frame: the gripper holds something"
-            structlog.get_logger().warning(reason)
-            self._end_tare(reason, number, now_ns)
+        self._follow_request(min(frame.t_begin_ns for frame in frames), number, now_ns)
+        self._refuse_held_tool(number, now_ns)
         tool = self.gripper.held_tool(now_ns) if self.gripper is not None else None
         if tool != self._held:
             self._held = tool
@@ -191,16 +142,24 @@ class FingertipTask:
             self.gripper.diameters.update(self.name, estimate, now_ns)
         self.publisher.publish(message)
         self.count += 1
-        self._tare.add(message.reason, taring=self.session.taring)
+        if self._zero is not None and self._zero.state is ZeroState.COLLECTING:
+            self._refused.add(message.reason)
+            if not self.session.taring:
+                self._zero.take()
 
     def tare(self, *, confirmed: bool = False) -> None:  # noqa: ARG002 - a fingertip judges by itself whether it is idle
         """Take a new idle frame from frames acquired entirely after now, within `longest_tare_s`."""
-        self._tare.begin(self.clock.now_ns(), self.longest_tare_s)
+        self._request_zero(self.longest_tare_s)
 
     @property
     def taring(self) -> bool:
-        """Whether the next frames belong to a tare that was asked for."""
-        return self._tare.is_under_way(self.clock.now_ns())
+        """Whether the next frames belong to an idle frame that was asked for."""
+        return self._zero is not None and self._zero.is_under_way(self.clock.now_ns())
+
+    def _request_zero(self, within_s: float) -> ZeroRequest:
+        now_ns = self.clock.now_ns()
+        self._zero, self._refused = ZeroRequest(now_ns, now_ns + round(within_s * 1e9), self._zero), _RefusedFrames()
+        return self._zero
 
     def _fingers_moved(self, frames: tuple[Frame, ...]) -> bool:
         """Return whether the fingers moved during any part of the frames' acquisition."""
@@ -210,43 +169,46 @@ class FingertipTask:
         ended_ns = max(2 * frame.t_mid_ns - frame.t_begin_ns for frame in frames)
         return self.gripper.moved_between(min(frame.t_begin_ns for frame in frames), ended_ns)
 
-    def _give_up_tare(self, number: int, now_ns: int) -> None:
-        """Leave a tare that no frame has completed in time: later frames could be of any load."""
-        reason = f"the idle frame of {self.name} was not taken: {self._tare.reasons or 'no frame came in time'}"
-        structlog.get_logger().warning(reason)
-        if self._tare.begun and self.session.taring:
-            self._end_tare(reason, number, now_ns)
+    def _follow_request(self, began_ns: int, number: int, now_ns: int) -> None:
+        """Begin or give up the session's tare as the request for it says, before a frame that began then."""
+        zero = self._zero
+        if zero is None:
+            return
+        if zero.is_too_late(began_ns):
+            why = self._refused.sentence or "no frame came in time"
+            zero.expire(f"the idle frame of {self.name} was not taken: {why}")
+            structlog.get_logger().warning(zero.reason)
+        if zero.state is ZeroState.REQUESTED and began_ns >= zero.from_ns:
+            zero.collect()
+            self.session.tare()
+            self._record(InputKind.TARE, now_ns, tare_as_bytes(number))
+            self._unconfirmed = False
+        elif zero.state is ZeroState.EXPIRED and self.session.taring:
+            # Later frames could be of any load.
+            self._give_up_tare(number, now_ns)
 
-    def _is_of_held_tool(self) -> bool:
-        """Return whether the idle frame is one of a held tool, as far as the gripper says."""
-        # A session of the paper's method begins with an idle frame, without a request.
-        if self._unconfirmed is None:
-            self._unconfirmed = self.session.taring
+    def _refuse_held_tool(self, number: int, now_ns: int) -> None:
+        """Give up an idle frame that is one of a held tool, as far as the gripper says."""
         holding = self.gripper.is_holding if self.gripper is not None else None
         if holding is None:
-            return False
-        found = holding and (self.session.taring or self._unconfirmed)
+            return
+        if holding and (self.session.taring or self._unconfirmed):
+            reason = f"{self.name} has no idle frame: the gripper holds something"
+            structlog.get_logger().warning(reason)
+            if self._zero is not None:
+                self._zero.fail(reason)
+            self._give_up_tare(number, now_ns)
         self._unconfirmed = False
-        return found
 
-    def _end_tare(self, reason: str, number: int, now_ns: int) -> None:
-        self._tare.fail(reason)
+    def _give_up_tare(self, number: int, now_ns: int) -> None:
         self.session.give_up_tare()
         self._record(InputKind.TARE, now_ns, tare_as_bytes(number, given_up=True))
 
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new idle frame and wait until it is complete; return None, or why it is not."""
-        self._tare.begin(self.clock.now_ns(), within_s)
-        try:
-            async with timeout(within_s):
-                await self._tare.done.wait()
-        except TimeoutError:
-            what = f"the idle frame of {self.name} could not be taken within {within_s:.3g} s"
-            return f"{what}: {self._tare.reasons or 'no frame came'}"
-        finally:
-            # Frames that come later could be of any load.
-            self._tare.give_up(self.clock.now_ns())
-        return self._tare.failure
+        what = f"the idle frame of {self.name} could not be taken within {within_s:.3g} s"
+        zero = self._request_zero(within_s)
+        return await zero.wait(within_s, lambda: f"{what}: {self._refused.sentence or 'no frame came'}")
 
     async def adapt(self, reference: str) -> None:
         """Correct the gain by this source's torque during this grip; raises ActionError."""

@@ -1,6 +1,5 @@
 """The load cell's task: reads it, publishes its torque, takes its zero."""
 
-import asyncio
 import contextlib
 from collections.abc import Mapping, Sequence
 
@@ -10,9 +9,9 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
+from shearloop.daemon.sensing.zero_request import ZeroRequest
 from shearloop.daemon.torques import CONFIRM_TARE, LOAD_CELL, LOADED_NM, SensorListener, TorqueSample, loaded_sentence
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
-from shearloop.timeouts import timeout
 
 # Two seconds at 10.9 Hz.
 ZERO_SAMPLES = 22
@@ -34,15 +33,13 @@ class LoadCellTask:
         self._publisher = publisher
         self._clock = clock
         self._loop = loop
-        # The raw values of a zero in progress, and the times between which it is taken.
-        self._zeroing: list[float] | None = None
-        self._zero_from_ns = self._zero_until_ns = 0
-        self._zero_error: str | None = None
+        # The latest request for a zero, its raw values, and whether the operator has confirmed that nothing is loaded.
+        self._zero: ZeroRequest | None = None
+        self._raw: list[float] = []
         self._confirmed = False
         # A new zero is judged by this one: of the daemon's start, or of the last confirmed tare. Judged by the latest,
         # small loads in one tare after the other would add up.
         self._judged_by: LoadCalibration | None = None
-        self._sampled = asyncio.Event()
         self._latest: LoadSample | None = None
 
     async def run(self) -> None:
@@ -63,8 +60,6 @@ class LoadCellTask:
             torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
             self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, message.reason, sample.t_mid_ns, now_ns))
         self._take_zero(sample)
-        self._sampled.set()
-        self._sampled.clear()
 
     def tare(self, *, confirmed: bool = False) -> None:
         """Make the mean of samples measured from now on the zero; samples under way belong to the load before.
@@ -72,79 +67,73 @@ class LoadCellTask:
         A mean that is a load is refused unless the operator has `confirmed` that nothing is loaded. It is judged by the
         zero of the last confirmed tare, else by the one at the daemon's start.
         """
-        self._zeroing, self._zero_error, self._confirmed = [], None, confirmed
+        self._request_zero(confirmed=confirmed)
+
+    @property
+    def taring(self) -> bool:
+        """Whether the next readings belong to a zero that was asked for."""
+        return self._zero is not None and self._zero.is_under_way(self._clock.now_ns())
+
+    async def tare_and_wait(self, within_s: float) -> str | None:
+        """Take a new zero and wait until it is done; return None, or why it was not taken."""
+        zero, within_s = self._request_zero(confirmed=False), min(self._timeout_s, within_s)
+        return await zero.wait(within_s, lambda: self._not_taken(zero, within_s))
+
+    def _request_zero(self, *, confirmed: bool) -> ZeroRequest:
         if self._loop is not None:
             # A request for a zero means that the one before is not trusted.
             self._loop.on_zero(LOAD_CELL, known=False)
         now_ns = self._clock.now_ns()
         # The middle of the first settled reading.
-        self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self._period_s * 1e9)
-        self._zero_until_ns = now_ns + round(self._timeout_s * 1e9)
-
-    @property
-    def taring(self) -> bool:
-        """Whether the next readings belong to a zero that was asked for."""
-        return self._zeroing is not None and self._clock.now_ns() <= self._zero_until_ns
-
-    async def tare_and_wait(self, within_s: float) -> str | None:
-        """Take a new zero and wait until it is done; return None, or why it was not taken."""
-        self.tare()
-        own, within_s = self._zeroing, min(self._timeout_s, within_s)
-        try:
-            async with timeout(within_s):
-                # A later tare is awaited too.
-                while self._zeroing is not None:
-                    await self._sampled.wait()
-        except TimeoutError:
-            return self._not_taken(within_s)
-        finally:
-            if self._zeroing is own:
-                # A zero taken later could be of any load.
-                self._zeroing = None
-        return self._zero_error
+        from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self._period_s * 1e9)
+        self._zero = ZeroRequest(from_ns, now_ns + round(self._timeout_s * 1e9), self._zero)
+        self._raw, self._confirmed = [], confirmed
+        return self._zero
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the board's values for `health`."""
         found = self._board.diagnostics()
         other_unit = self._latest.other_unit if self._latest is not None else ""
-        own = self._zero_error or other_unit or found["last_refusal"]
+        zero_error = self._zero.reason if self._zero is not None else ""
+        own = zero_error or other_unit or found["last_refusal"]
         error = own if found["connected"] else found["last_loss"]
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
-    def _not_taken(self, within_s: float) -> str:
+    def _not_taken(self, zero: ZeroRequest, within_s: float) -> str:
         latest, reason = self._latest, ""
         # A reading from before says nothing of the time since.
-        if latest is not None and latest.t_mid_ns >= self._zero_from_ns:
+        if latest is not None and latest.t_mid_ns >= zero.from_ns:
             reason = _reason(latest)
         reason = reason or "no usable reading came"
         return f"the load cell's zero could not be taken within {within_s:.3g} s: {reason}"
 
     def _take_zero(self, sample: LoadSample) -> None:
-        if self._zeroing is None:
+        zero = self._zero
+        if zero is None or not zero.is_open:
             return
-        if sample.t_arrival_ns > self._zero_until_ns:
-            self._zeroing = None
-            self._zero_error = self._not_taken(self._timeout_s)
-            structlog.get_logger().warning(self._zero_error)
+        if zero.is_too_late(sample.t_arrival_ns):
+            zero.expire(self._not_taken(zero, self._timeout_s))
+            structlog.get_logger().warning(zero.reason)
             return
-        if sample.trusted and sample.t_mid_ns >= self._zero_from_ns:
-            self._zeroing.append(sample.raw)
-        if len(self._zeroing) == ZERO_SAMPLES:
-            samples, self._zeroing = self._zeroing, None
-            self._end_zero(samples)
+        if sample.trusted and sample.t_mid_ns >= zero.from_ns:
+            zero.collect()
+            self._raw.append(sample.raw)
+        if len(self._raw) == ZERO_SAMPLES:
+            self._end_zero(zero, self._raw)
 
-    def _end_zero(self, samples: Sequence[float]) -> None:
+    def _end_zero(self, zero: ZeroRequest, samples: Sequence[float]) -> None:
         """Make the mean of raw samples the zero, unless they are of a load, or of one that came or went."""
         raw = sum(samples) / len(samples)
         if why_not := self._why_no_zero(raw, samples):
-            self._zero_error = f"the load cell's zero was not taken: {why_not}"
-            structlog.get_logger().warning(self._zero_error)
+            zero.fail(f"the load cell's zero was not taken: {why_not}")
+            structlog.get_logger().warning(zero.reason)
             return
         self._board.tare(raw)
         if self._confirmed:
             self._judged_by = self._board.calibration
         if self._loop is not None:
             self._loop.on_zero(LOAD_CELL)
+        zero.take()
 
     def _why_no_zero(self, raw: float, samples: Sequence[float]) -> str:
         """Return why the mean of raw samples is no zero, or an empty string.

@@ -29,6 +29,7 @@ MIN_NOISE = 2e-5
 MAX_COMMON_CHANGE = 0.015
 # A skin that changed more since its calibration is refused: a quarter of a newton.
 MAX_CHANGE = 0.02
+_NOT_IN_TIME = "it took too long; tare again with nothing on the skin"
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,12 +165,23 @@ class SkinEstimator:
         self._last: tuple[SkinZero, float] | None = None
         self.tare()
 
-    def tare(self, from_ns: int = 0) -> None:
-        """Take a new zero from samples measured after `from_ns` (monotonic clock)."""
-        self._zero_from_ns = from_ns
+    def tare(self, from_ns: int = 0, until_ns: int | None = None) -> None:
+        """Take a new zero from samples measured after `from_ns` that arrive until `until_ns` (monotonic clock)."""
+        self._zero_from_ns, self._zero_until_ns = from_ns, until_ns
         self._taker = SkinZeroTaker(self._zero_samples, self._calibration.rest_ohm, self._calibration.slope_per_n)
         self.zero: SkinZero | None = None
         self.refused: str | None = None
+        self.given_up = False
+
+    def give_up_zero(self) -> None:
+        """Take no zero until the next tare: later samples could be of any load."""
+        if self.zero is None:
+            self.given_up = True
+
+    @property
+    def is_collecting(self) -> bool:
+        """Whether samples of the next zero have come."""
+        return bool(self._taker.samples)
 
     @property
     def fixed(self) -> dict[str, object]:
@@ -183,9 +195,13 @@ class SkinEstimator:
 
     def update(self, sample: SkinSample) -> SkinReading:
         """Return the reading of a sample; an invalid one comes with reasons."""
+        if self._zero_until_ns is not None and sample.t_arrival_ns > self._zero_until_ns:
+            self.give_up_zero()
         if sample.r1_ohm is None or sample.r2_ohm is None:
             self._forget_direction()
             return SkinReading(reasons=tuple(map(str, sample.faults)))
+        if self.given_up:
+            return SkinReading(reasons=("no zero: " + (self.refused or _NOT_IN_TIME),))
         if self.zero is None:
             # The measurement lasts as long before its middle as after it.
             if 2 * sample.t_mid_ns - sample.t_arrival_ns < self._zero_from_ns:

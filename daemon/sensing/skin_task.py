@@ -1,10 +1,11 @@
 """The shear skin's task: builds instruments and estimator, publishes the shear force, takes the zero, replays."""
 
-import asyncio
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+
+import structlog
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
@@ -13,6 +14,7 @@ from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.sensing.snapshots import record_state, restored
+from shearloop.daemon.sensing.zero_request import ZeroRequest, ZeroState
 from shearloop.daemon.torques import SensorListener, TorqueSample, TorqueSource
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
@@ -37,7 +39,6 @@ from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, S
 from shearloop.errors import UserError
 from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
 from shearloop.estimation.skin.membrane import joule_heating_k
-from shearloop.timeouts import timeout
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.
@@ -46,6 +47,8 @@ SKIN_CURRENT, SKIN_DAQ = f"{SKIN}.source", f"{SKIN}.daq"
 ZERO_TIMEOUT_S = 15.0
 # The paper's bound.
 MAX_WARMING_K = 5.0
+# The recorded data where a zero is given up before its time is over, because nobody waits for it any longer.
+_GIVEN_UP = b"given up"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +96,9 @@ class SkinTask:
         self._loop = loop
         self._inputs = inputs.get(SKIN)
         self._radius_m = _radius_m(config)
-        self._zero_timeout_s = max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples * config.daq.sample_period_s)
-        self._sampled = asyncio.Event()
-        # When the latest zero was asked for, None before the first.
-        self._asked_ns: int | None = None
+        self._zero_timeout_s = zero_timeout_s(config)
+        # The latest request for a zero. The first zero is taken without one.
+        self._zero: ZeroRequest | None = None
         self._reason = ""
         self._valid = 0
 
@@ -105,42 +107,65 @@ class SkinTask:
         async with contextlib.aclosing(self._skin.batches()) as batches:
             async for samples in batches:
                 for sample in samples:
+                    self._expire_zero(sample)
                     self._publish(sample, self._estimator.update(sample))
-                    self._sampled.set()
-                    self._sampled.clear()
+                    self._follow_estimator()
                 if self._inputs is not None and self._inputs.wants_state:
                     state = {**self._skin.state, "estimator": self._estimator}
                     record_state(self._inputs, state, self._estimator.fixed, self._clock.now_ns())
 
     def tare(self, *, confirmed: bool = False) -> None:  # noqa: ARG002 - the skin judges by its gauges at rest
         """Take a new zero from samples measured from now on."""
-        now_ns = self._clock.now_ns()
-        self._asked_ns = now_ns
-        if self._inputs is not None:
-            self._inputs.record(RawEvent(InputKind.TARE, now_ns))
-        self._skin.restart_average()
-        self._estimator.tare(now_ns)
+        self._request_zero()
 
     @property
     def taring(self) -> bool:
         """Whether the next samples belong to a zero that was asked for a short time ago."""
-        if self._asked_ns is None:
-            return False
-        waited_s = (self._clock.now_ns() - self._asked_ns) / 1e9
-        return self._estimator.zero is None and not self._estimator.refused and waited_s < self._zero_timeout_s
+        return self._zero is not None and self._zero.is_under_way(self._clock.now_ns())
 
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new zero and wait until it is done; return None, or why it was not taken."""
-        self.tare()
-        within_s = min(self._zero_timeout_s, within_s)
+        zero, within_s = self._request_zero(), min(self._zero_timeout_s, within_s)
         try:
-            async with timeout(within_s):
-                while self._estimator.zero is None and not self._estimator.refused:
-                    await self._sampled.wait()
-        except TimeoutError:
-            reason = self._reason or "nothing came"
-            return f"the skin's zero could not be taken within {within_s:.3g} s: {reason}"
-        return f"the skin's zero was refused: {self._estimator.refused}" if self._estimator.refused else None
+            return await zero.wait(within_s, lambda: self._not_taken(within_s))
+        finally:
+            if zero is self._zero and zero.state is ZeroState.EXPIRED and not self._estimator.given_up:
+                self._record(self._clock.now_ns(), _GIVEN_UP)
+                self._estimator.give_up_zero()
+
+    def _request_zero(self) -> ZeroRequest:
+        now_ns = self._clock.now_ns()
+        self._zero = ZeroRequest(now_ns, now_ns + _ns(self._zero_timeout_s), self._zero)
+        self._record(now_ns)
+        self._skin.restart_average()
+        self._estimator.tare(now_ns, self._zero.until_ns)
+        return self._zero
+
+    def _expire_zero(self, sample: SkinSample) -> None:
+        """End a request for which this sample comes too late; the estimator gives up by the same time."""
+        if self._zero is not None and self._zero.is_too_late(sample.t_arrival_ns):
+            self._zero.expire(self._not_taken(self._zero_timeout_s))
+            structlog.get_logger().warning(self._zero.reason)
+
+    def _follow_estimator(self) -> None:
+        """Bring the request for a zero up to the estimator, which has taken the next sample."""
+        zero, estimator = self._zero, self._estimator
+        if zero is None or not zero.is_open:
+            return
+        if estimator.zero is not None:
+            zero.take()
+        elif estimator.refused:
+            # The estimator takes it again until the request's end.
+            zero.fail(f"the skin's zero was refused: {estimator.refused}")
+        elif estimator.is_collecting:
+            zero.collect()
+
+    def _not_taken(self, within_s: float) -> str:
+        return f"the skin's zero could not be taken within {within_s:.3g} s: {self._reason or 'nothing came'}"
+
+    def _record(self, now_ns: int, data: bytes = b"") -> None:
+        if self._inputs is not None:
+            self._inputs.record(RawEvent(InputKind.TARE, now_ns, data))
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values of voltages, zero and force for `health`."""
@@ -178,6 +203,7 @@ class ReplayedSkin:
         self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
         self._averager = SampleAverager(config.daq.averaged)
         self._radius_m = _radius_m(config)
+        self._zero_timeout_ns = _ns(zero_timeout_s(config))
         self._source = ReplayedInstrument({READ: read_elements, OUTPUT: read_output})
         adc = config.daq.adc
         self._daq: ReplayedInstrument[Voltages] | PairParser = (
@@ -205,9 +231,11 @@ class ReplayedSkin:
                 for sample in map(self._averager.add, samples)
                 if sample is not None
             ]
+        elif event.kind is InputKind.TARE and event.data == _GIVEN_UP:
+            self._estimator.give_up_zero()
         elif event.kind is InputKind.TARE:
             self._averager.restart()
-            self._estimator.tare(event.t_ns)
+            self._estimator.tare(event.t_ns, event.t_ns + self._zero_timeout_ns)
         return []
 
 
@@ -278,6 +306,15 @@ def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:
         )
     if scanner is not None and gauge_v > scanner.range_v:
         raise UserError(f"{at_end} `skin.daq.scanner.range_v` is {scanner.range_v:g}; take the next range")
+
+
+def zero_timeout_s(config: SkinConfig) -> float:
+    """Return the longest time of a zero that was asked for."""
+    return max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples * config.daq.sample_period_s)
+
+
+def _ns(time_s: float) -> int:
+    return round(time_s * 1e9)
 
 
 def _radius_m(config: SkinConfig) -> float | None:

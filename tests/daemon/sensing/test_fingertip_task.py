@@ -367,6 +367,30 @@ async def test_tare_that_times_out_says_why_its_frames_were_refused():
     assert session.tared_before == [2], "a later frame may be of a gripped tool"
 
 
+async def test_a_wait_for_a_tare_that_ends_without_one_leaves_a_later_tare():
+    clock, session = FixedClock(), FakeSession()
+    task = estimates("right", RecordingPublisher(), session, clock)
+    async with running(task.tare_and_wait(0.01)) as (waiting,):
+        await asyncio.sleep(0)
+        task.tare()
+        assert (await waiting).endswith("no frame came")
+    await task.process(frame(0, clock.t_ns + 2 * PERIOD_NS))
+    assert session.tared_before == [0]
+
+
+async def test_a_session_that_begins_with_an_idle_frame_takes_none_after_a_tare_that_no_frame_came_for(log):
+    """The paper's method takes its first frames for idle; these come after the time of a tare, and could be loaded."""
+    clock, session, raw = FixedClock(), Taring(), list[RawEvent]()
+    task = estimates("right", RecordingPublisher(), session, clock, inputs=SimpleNamespace(record=raw.append))
+    task.tare()
+    clock.t_ns += round(task.longest_tare_s * 1e9) + 1
+    for number in (0, 1):
+        await task.process(frame(number, clock.t_ns + PERIOD_NS + 80 * MS))
+    assert session.given_up == 1
+    assert [tare_from_bytes(one.data) for one in raw] == [(0, True)], "as a replay finds it"
+    assert log.said == ["the idle frame of right was not taken: no frame came in time"]
+
+
 async def test_a_tare_of_a_fingertip_that_is_not_there_is_not_taken_at_the_load_of_a_later_hour(log):
     clock, session, raw = FixedClock(), FakeSession(), list[RawEvent]()
     task = estimates("right", RecordingPublisher(), session, clock, inputs=SimpleNamespace(record=raw.append))

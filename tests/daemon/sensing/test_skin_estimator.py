@@ -187,6 +187,29 @@ def test_a_zero_under_load_is_refused_until_the_load_is_off(bench):
     assert not bench.estimator.refused
 
 
+@pytest.mark.parametrize("refused", [False, True])
+def test_a_zero_that_is_not_taken_in_time_is_not_taken_at_the_load_of_a_later_hour(bench, refused):
+    asked_ns, n_early = bench.number * PERIOD_NS, 30 if refused else 10
+    bench.estimator.tare(asked_ns, asked_ns + n_early * PERIOD_NS)
+    for _ in range(n_early):
+        # A load refuses the zero.
+        assert not bench.estimator.given_up
+        bench.at(0.8 if refused else 0.0)
+    for _ in range(30):
+        # This load is too small to refuse one.
+        (reason,) = bench.at(0.1).reasons
+        assert reason.startswith("no zero: ")
+        assert ("would look like that" in reason) is refused
+    assert bench.estimator.zero is None
+    bench.estimator.tare()
+    assert bench.zeroed().estimator.zero is not None
+
+
+def test_a_zero_that_was_taken_is_not_given_up(bench):
+    bench.estimator.give_up_zero()
+    assert bench.at(0.0).valid
+
+
 def test_a_sample_that_was_under_way_when_a_zero_was_asked_for_is_not_of_it(bench):
     asked_ns = round(bench.time_s * 1e9) + 3 * PERIOD_NS // 4
     bench.estimator.tare(asked_ns)

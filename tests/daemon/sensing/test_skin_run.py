@@ -177,6 +177,25 @@ async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path, monkeypatc
         await bench.says("gauge 2 is open")
         with pytest.raises(ActionError, match=r"could not be taken within 0\.3 s.*gauge 2 is open"):
             await tare_all(bench.daemon.sensors.tareable.values())
+        bench.instruments.command("normal")
+        await bench.says("no zero: it took too long")
+
+
+async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_later_hour(tmp_path, monkeypatch, log):
+    monkeypatch.setattr("shearloop.daemon.sensing.skin_task.ZERO_TIMEOUT_S", 0.3)
+    async with played(tmp_path) as bench:
+        await bench.valid()
+        skin = bench.daemon.sensors.tareable["skin"]
+        bench.instruments.command("open 2")
+        await bench.says("gauge 2 is open")
+        assert (await bench.command("tare", source="skin"))["ok"]
+        assert skin.taring
+        await bench.until(lambda _: not skin.taring)
+        bench.instruments.command("normal")
+        await bench.says("no zero: it took too long")
+        assert "the skin's zero could not be taken within 0.3 s: gauge 2 is open" in "\n".join(log.said)
+        assert (await bench.command("tare", source="skin"))["ok"]
+        await bench.valid()
 
 
 async def test_one_daemon_carries_a_fingertip_and_a_skin(config):

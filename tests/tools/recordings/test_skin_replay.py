@@ -100,3 +100,23 @@ def test_each_of_a_daemons_recordings_gives_equal_forces(tmp_path, socket, avera
         assert comparison.different == Counter(), (path, comparison.examples)
         # The pushes are in the third.
         assert comparison.compared["skin.shear"] >= (PUSHES if "third" in path.stem else 1)
+
+
+def test_a_zero_that_was_given_up_early_is_given_up_in_the_replay(tmp_path):
+    async def record() -> None:
+        async with played(tmp_path, daemon={"recording": {"folder": "recordings"}}) as bench:
+            await bench.valid()
+            bench.instruments.command("open 1")
+            await bench.says("gauge 1 is open")
+            why_not = await bench.daemon.sensors.tareable["skin"].tare_and_wait(0.05)
+            assert "could not be taken within 0.05 s" in (why_not or "")
+            bench.instruments.command("normal")
+            await bench.says("no zero: it took too long")
+            assert (await bench.command("tare", source="skin"))["ok"]
+            await bench.valid()
+
+    asyncio.run(record())
+    (path,) = (tmp_path / "recordings").iterdir()
+    again, comparison = asyncio.run(replayed(path, math.inf))
+    assert comparison.different == Counter(), comparison.examples
+    assert any("no zero" in content["reason"] for topic, content in again if topic == "skin.shear")

@@ -5,5 +5,6 @@ step moves and needs, for the operator's questions and the plan. `control_loop` 
 `control_output`, from `inputs`, `creep`, `fault_detection` with `safety`, and `wrist_controller` with
 `torque_controller`. `identification` measures the tool; `margins` refuses unstable controllers. The others do I/O:
 `loop_runner` takes the robot's states and carries out each output, `command_sender` sends wrist speeds,
-`action_executor` moves, grips and tares, `gripper_task` has the gripper, `state_publisher` publishes.
+`action_executor` grips and tares, `straight_moves` moves the arm, `operator_action` unlocks and releases,
+`gripper_task` has the gripper, `state_publisher` publishes.
 """

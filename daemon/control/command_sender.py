@@ -1,4 +1,4 @@
-"""Sends wrist speeds and stops to the worker, and keeps the speed that it accepted last."""
+"""Sends wrist speeds and stops to the worker, keeps the speed that it accepted last, and waits for the arm to rest."""
 
 import asyncio
 from dataclasses import dataclass
@@ -13,6 +13,11 @@ from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.supervisor import error_text
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import CommandReply, Stop, WristSpeed
+from shearloop.errors import ActionError
+from shearloop.timeouts import timeout
+
+# The arm rests within this time after a stop, unless something else moves it.
+COMES_TO_REST_S = 2.0
 
 
 @dataclass(slots=True)
@@ -43,6 +48,20 @@ class CommandSender:
             acceleration_rad_per_s2 = self.control_loop.config.wrist_acceleration_rad_per_s2
             self._send(WristSpeed(rad_per_s, acceleration_rad_per_s2, decided_ns))
 
+    async def wait_for_rest(self) -> None:
+        """Wait until no motion is under way; raises ActionError.
+
+        Resting joints are not enough: after a stop the worker is busy a little longer, and refuses a move.
+        """
+        try:
+            async with timeout(COMES_TO_REST_S):
+                state = await self.robot.next_state()
+                while self.sent_rad_per_s or self.unanswered or state.motion != "idle" or not state.rests:
+                    state = await self.robot.next_state()
+        except TimeoutError:
+            what = f"the arm did not come to rest within {COMES_TO_REST_S:g} s"
+            raise ActionError(f"{what}; find what moves it, such as freedrive or another program") from None
+
     def _send(self, command: WristSpeed | Stop) -> None:
         self.unanswered += 1
         try:
@@ -71,3 +90,9 @@ class CommandSender:
     def _fail(self, error: Exception) -> None:
         structlog.get_logger().exception("a command to the robot failed")
         self.control_loop.on_fault(FaultCode.TASK_DIED, f"loop: {error_text(error)}")
+
+
+def raise_if_refused(reply: CommandReply) -> None:
+    """Raise ActionError for a command that the worker refused."""
+    if not reply.accepted:
+        raise ActionError(reply.refusal)

@@ -6,18 +6,21 @@ from contextlib import suppress
 import structlog
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.action_executor import UNLOCKING, ActionExecutor, WriteState, no_state
+from shearloop.daemon.control.action_executor import ActionExecutor, WriteState, no_state
 from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.control_output import Drive, End, StandStill
 from shearloop.daemon.control.experiment import Experiment, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
+from shearloop.daemon.control.fingers import Fingers
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.inputs import ArmStatus
+from shearloop.daemon.control.operator_action import UNLOCKING, OperatorAction
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.state_publisher import StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
+from shearloop.daemon.control.straight_moves import StraightMoves
 from shearloop.daemon.control.wrench import WrenchMean, publish_every
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import error_text
@@ -59,7 +62,12 @@ class ControlLoopRunner:
         self._clock = clock
         self._timeline = StopTimeline()
         self._sender = CommandSender(robot, control_loop, self._timeline, clock)
-        self.actions = ActionExecutor(robot, gripper, sensors, self._sender, control_loop, write_state)
+        self.fingers = Fingers(gripper)
+        self.straight_moves = StraightMoves(robot, self._sender)
+        self.operator_action = OperatorAction(robot, self.fingers)
+        self.actions = ActionExecutor(
+            robot, self.fingers, sensors, self._sender, self.straight_moves, control_loop, write_state
+        )
         self.states = StatePublisher(publisher, control_loop, publish_every(robot.settings.rate_hz))
         self._wrench = WrenchMean(robot.settings.rate_hz)
         self._running = False
@@ -108,7 +116,7 @@ class ControlLoopRunner:
         The next start waits for `unlock`. `also_idle`: also where nothing moves.
         """
         self._stop_count += 1
-        experiment, stopped = self._control_loop.running, self.stop_unlocking()
+        experiment, stopped = self._control_loop.running, self._stop_operator_action()
         if experiment is not None:
             stopped = experiment.file.name
         if stopped is not None or also_idle:
@@ -147,7 +155,7 @@ class ControlLoopRunner:
         """Return why no experiment at all can begin, or None."""
         if self._closed:
             return ENDING
-        if self.actions.unlocking:
+        if self.operator_action.under_way:
             return UNLOCKING
         return self._control_loop.operator.start_refusal() or self._taring()
 
@@ -162,7 +170,7 @@ class ControlLoopRunner:
         """Return what moves or may move now, in words, or None."""
         if (experiment := self._control_loop.running) is not None:
             return f"the experiment {experiment.file.name!r} is running"
-        if self.actions.unlocking or self.actions.finishing:
+        if self.operator_action.under_way or self.actions.finishing:
             return "the gripper or the robot is being moved"
         state = self._robot.state
         if self._timeline.pending or (state is not None and state.motion != "idle"):
@@ -188,7 +196,7 @@ class ControlLoopRunner:
             return STOPPED_AT_START
         if refusal:
             return refusal
-        if self.actions.unlocking:
+        if self.operator_action.under_way:
             return UNLOCKING
         # The first step could grip a tool, and the tool's torque would become the zero.
         if (refusal := self._taring()) is not None:
@@ -225,9 +233,8 @@ class ControlLoopRunner:
 
     async def halt_and_wait(self) -> None:
         """Halt moving fingers, and wait for the end of the last release or halt, and for the arm's standstill."""
-        self.stop_unlocking()
-        if self.actions.fingers_move:
-            self.actions.cancel()
+        self._stop_operator_action()
+        self.actions.halt_fingers()
         await self.actions.wait_for_final_action()
         with suppress(TimeoutError):
             async with timeout(BRAKE_S):
@@ -240,7 +247,7 @@ class ControlLoopRunner:
             return ENDING
         if (experiment := self._control_loop.running) is not None:
             return f"the experiment {experiment.file.name!r} is running; stop it first"
-        return UNLOCKING if self.actions.unlocking else None
+        return UNLOCKING if self.operator_action.under_way else None
 
     async def unlock(self, *, confirmed: bool = False) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not.
@@ -253,7 +260,7 @@ class ControlLoopRunner:
         self.decide_now()
         waiting = self._control_loop.safety.waiting
         try:
-            await self.actions.unlock(confirmed=confirmed)
+            await self.operator_action.unlock(confirmed=confirmed)
         except (ActionError, DriverError) as error:
             return str(error)
         if another := self._control_loop.operator.why_another_stop(waiting):
@@ -268,7 +275,7 @@ class ControlLoopRunner:
         """
         if self._closed:
             return ENDING
-        if self.actions.unlocking:
+        if self.operator_action.under_way:
             return UNLOCKING
         state = self._robot.state
         if state is not None and not (state.rests and state.motion == "idle"):
@@ -280,16 +287,17 @@ class ControlLoopRunner:
         if (reason := self.release_refusal()) is not None:
             return reason
         try:
-            await self.actions.open_by_operator()
+            await self.operator_action.release()
         except (ActionError, DriverError) as error:
             return str(error)
         self._control_loop.tool.on_release_ended()
         return None
 
-    def stop_unlocking(self) -> str | None:
+    def _stop_operator_action(self) -> str | None:
         """End an unlocking or a release, and halt the fingers that it moves; return the command's name, or None."""
-        stopped = self.actions.stop_unlocking()
+        stopped = self.operator_action.stop()
         if stopped is not None:
+            self.actions.halt_fingers()
             # The worker ends its part.
             self._robot.send(self._sender.stop_command)
         return stopped
@@ -326,13 +334,13 @@ class ControlLoopRunner:
         match output:
             case Drive(rad_per_s, action):
                 self._may_be_moving = True
-                self.actions.may_move.set()
+                self.straight_moves.go_on()
                 if action is not None:
                     self.actions.begin(action)
                 self._turn(rad_per_s, now_ns)
             case StandStill():
                 self._may_be_moving = True
-                if self.actions.interrupt():
+                if self.straight_moves.interrupt():
                     self._sender.stop()
                 self._turn(0.0, now_ns)
             case End(release):

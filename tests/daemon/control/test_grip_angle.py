@@ -279,7 +279,7 @@ async def test_a_release_is_on_the_disk_before_it_is_answered():
 
 async def test_the_operator_says_that_another_tool_is_clamped():
     async with driven(TWIST, cycles=60) as cell:
-        cell.runner.actions.gripper = None
+        cell.runner.fingers.gripper = None
         assert await cell.runner.release() is not None, "an experiment runs"
         cell.runner.stop()
         await cell.cycles(50)

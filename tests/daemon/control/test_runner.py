@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.daemon.control.action_executor import along_tool
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
 from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.straight_moves import along_tool
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.errors import DriverError
@@ -276,10 +276,10 @@ async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pau
         arm.be(wrench=(0.0, 0.0, SETTINGS.limits.force_n.inner + 5.0, 0.0, 0.0, 0.0))
         bench.run(1)
         assert "force" in bench.state.end_reason
-        cell.runner.actions.interrupt()
+        cell.runner.straight_moves.interrupt()
         arm.be(wrench=(0.0,) * 6)
         await cell.cycles(1)
-        cell.runner.actions.may_move.set()
+        cell.runner.straight_moves.go_on()
         await cell.until_ended()
         assert "the move ended early: force" in cell.why
         assert sum(isinstance(command, MoveLinear) for command in cell.robot.commands) == 1
@@ -342,7 +342,7 @@ async def test_what_moves_is_told_until_it_stands():
         await cell.cycles(10)
         assert cell.runner.motion() is None
         cell.gripper.there.clear()
-        releasing = asyncio.create_task(cell.runner.actions.open_by_operator())
+        releasing = asyncio.create_task(cell.runner.operator_action.release())
         await cell.cycles(1)
         assert cell.runner.motion() == "the gripper or the robot is being moved"
         cell.gripper.there.set()

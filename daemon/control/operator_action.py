@@ -1,0 +1,79 @@
+"""What the operator does to robot and gripper while no experiment runs: unlock both, or open the gripper."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from shearloop.daemon.control.command_sender import raise_if_refused
+from shearloop.daemon.control.fingers import Fingers
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import Unlock
+from shearloop.errors import ActionError
+
+UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
+
+
+@dataclass(slots=True)
+class OperatorAction:
+    """Carries out one `unlock` or `release` at a time."""
+
+    robot: UrRobot
+    fingers: Fingers
+    _task: asyncio.Task[None] | None = None
+
+    @property
+    def under_way(self) -> bool:
+        """Whether robot and gripper are being unlocked, or the gripper is being opened."""
+        return self._task is not None and not self._task.done()
+
+    async def unlock(self, *, confirmed: bool = False) -> None:
+        """Enable robot and gripper; raises DriverError and ActionError.
+
+        `confirmed`: the operator says that a tool may drop.
+        """
+        await self._carry_out("unlock", "unlocking", partial(self._unlock, confirmed=confirmed))
+
+    async def release(self) -> None:
+        """Open the gripper, if there is one; raises DriverError and ActionError."""
+        await self._carry_out("release", "the release", self._release)
+
+    def stop(self) -> str | None:
+        """End the action under way, but not the fingers that it moves; return its command's name, or None."""
+        if self._task is None or not self._task.cancel():
+            return None
+        return self._task.get_name()
+
+    async def _carry_out(self, command: str, name: str, act: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        if self.under_way:
+            raise ActionError(UNLOCKING)
+        task = self._task = asyncio.create_task(act(), name=command)
+        # After the caller is cancelled, a failure has no receiver.
+        task.add_done_callback(lambda done: done.cancelled() or done.exception())
+        await asyncio.wait([task])
+        if task.cancelled():
+            raise ActionError(f"{name} was stopped; send `{command}` again")
+        task.result()
+
+    async def _unlock(self, *, confirmed: bool) -> None:
+        raise_if_refused(await self.robot.send(Unlock()))
+        gripper = self.fingers.gripper
+        if gripper is None:
+            return
+        # An activation opens and closes the fingers.
+        self.fingers.may_be_moving = True
+        try:
+            await gripper.unlock(confirmed=confirmed)
+        except (ActionError, DriverError) as error:
+            raise ActionError(f"the robot is unlocked and may move again, and the gripper is not: {error}") from error
+        self.fingers.may_be_moving = False
+
+    async def _release(self) -> None:
+        gripper = self.fingers.gripper
+        if gripper is None:
+            return
+        self.fingers.may_be_moving = True
+        await gripper.open_by_operator()
+        self.fingers.may_be_moving = False

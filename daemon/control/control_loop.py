@@ -340,8 +340,11 @@ class ControlLoop:
         torque_nm = latest.torque_nm if latest is not None and not held else None
         stands = held or self._awaited_torques(experiment, t_ns) is not None
         experiment.update(t_ns, wrist_rad - origin_rad, torque_nm, gripped_at_rad=origin_rad, held=stands)
-        # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now.
-        if _turns(experiment.command) and not self.tool.expected and (uncertain := self.tool.uncertain):
+        # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now. A `grip` that
+        # may meet nothing allows turns, although a tool as wide as its target is not felt.
+        gripper = self.inputs.gripper
+        unfelt = gripper is not None and gripper.unfelt
+        if _turns(experiment.command) and not (self.tool.expected or unfelt) and (uncertain := self.tool.uncertain):
             self._fail(experiment, f"{uncertain}; put a `grip` or a `release` before it")
 
     def _begin_command(self, experiment: Experiment, wrist_rad: float, origin_rad: float, t_ns: int) -> Action | None:

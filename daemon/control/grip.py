@@ -33,7 +33,7 @@ class Grip:
         """Return why the gripper does not have this grip, or an empty string; moving fingers do not show it."""
         if gripper.moving:
             return ""
-        if not (gripper.holding or gripper.uncertain):
+        if not (gripper.holding or gripper.uncertain or gripper.unfelt):
             return "its fingers hold nothing"
         if self.width_mm is not None and abs(gripper.width_mm - self.width_mm) > SAME_WIDTH_MM:
             return f"its fingers are {gripper.width_mm:.1f} mm apart, and were {self.width_mm:.1f} mm apart then"

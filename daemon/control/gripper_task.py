@@ -35,6 +35,8 @@ OPENING = opening(LARGEST_STROKE_MM, 100.0)
 OPEN_WITHIN_MM = 10.0
 # A release that opens the fingers by less may not let go: about three of the gripper's positions.
 LEAST_OPENING_MM = 2.0
+# Fingertips that touch are closer together than this number of standard deviations of a measured width.
+TOUCHING_STDS = 3.0
 # A release or halt is retried for longer than a reconnection takes.
 TRIED_FOR_S, TRIED_AGAIN_S = 5.0, 0.1
 
@@ -79,9 +81,10 @@ class GripperTask:
         if state.object is ObjectStatus.CONTACT_OPENING and state.width_mm < widest_mm - OPEN_WITHIN_MM:
             stopped = f"the fingers met something as they opened, and stopped at {state.width_mm:.1f} mm"
             raise ActionError(f"{stopped}; clear their way")
-        if target.expect_object and state.diameter_mm is None:
-            closed = f"the fingers closed to {state.width_mm:.1f} mm and met nothing"
-            raise ActionError(f"{closed}; put the tool between them, or correct `width_mm`")
+        if target.expect_object and not self._holds(state):
+            closed = f"the fingers closed to {state.width_mm:.1f} mm and met nothing wider"
+            thinner = "put the tool between them, or make `width_mm` some millimetres less than the tool"
+            raise ActionError(f"{closed}; {thinner}")
 
     async def _width_of(self, target: GripStep) -> float | None:
         """Return the width that the fingers have to move to, None where they are open already; raises DriverError.
@@ -92,16 +95,16 @@ class GripperTask:
         """
         state = await self.gripper.read()
         if isinstance(target, Opening):
-            if state.object is not ObjectStatus.AT_TARGET:
+            if state.object is not ObjectStatus.AT_TARGET or self._unfelt(state):
                 return target.width_mm if target.width_mm > state.width_mm + LEAST_OPENING_MM else LARGEST_STROKE_MM
             if state.width_mm >= target.width_mm:
                 self._take(state)
                 return None
             return target.width_mm
-        # Fingers that are nearly open hold nothing.
-        may_hold = state.object is not ObjectStatus.AT_TARGET
-        may_hold = may_hold and state.width_mm < self.gripper.model.stroke_mm - OPEN_WITHIN_MM
-        if may_hold and target.width_mm > state.width_mm:
+        may_hold = state.object is not ObjectStatus.AT_TARGET or self._unfelt(state)
+        # In counts: the fingers may stand less than one count from the target.
+        opens = self.gripper.calibration.counts(target.width_mm) < state.position_counts
+        if opens and may_hold and not self._nearly_open(state):
             # Fingers that another program moves have to be halted.
             refused = ActionError if state.object is ObjectStatus.MOVING else NotBegunError
             raise refused(
@@ -133,9 +136,9 @@ class GripperTask:
         state = await self.gripper.read()
         if not state.fault.needs_activation:
             return
-        status = status_of(state)
+        status = self.status_of(state)
         self.control_loop.on_gripper(status)
-        if not confirmed and (status.holding or status.moving or status.uncertain):
+        if not confirmed and status.may_hold:
             what = f"its fingers are {status.width_mm:.1f} mm apart, and hold something or may hold it"
             raise ActionError(f"{activation_sentence(what)}; confirm it with `shearloop command unlock --yes`")
         with self._motion.commanded(self.clock.now_ns()):
@@ -145,14 +148,14 @@ class GripperTask:
     def is_holding(self) -> bool | None:
         """Whether its latest state shows something between the fingers; None before the first state."""
         state = self.gripper.latest
-        return None if state is None else state.diameter_mm is not None
+        return None if state is None else self._holds(state)
 
     def held_tool(self, t_ns: int) -> Measured | None:
         """Return the diameter in mm of the held tool at t_ns, or None."""
         state = self.gripper.latest
         if state is None or not self.measures_diameters or t_ns - state.t_ns > GRIPPER_STALE_S * 1e9:
             return None
-        return gripped_diameter(state)
+        return self._diameter(state)
 
     def moved_between(self, from_ns: int, to_ns: int) -> bool:
         """Return whether the fingers moved at any time of an interval, as far as is known."""
@@ -164,17 +167,60 @@ class GripperTask:
 
     def _take(self, state: GripperState) -> None:
         self._motion.take(state)
-        self.control_loop.on_gripper(status_of(state))
+        self.control_loop.on_gripper(self.status_of(state))
+
+    def status_of(self, state: GripperState) -> GripperStatus:
+        """Return what the control loop knows of a gripper's state."""
+        return GripperStatus(
+            state.t_ns,
+            state.width_mm,
+            holding=self._holds(state),
+            moving=state.object is ObjectStatus.MOVING,
+            fault=state.fault.sentence if state.fault.needs_activation else "",
+            # The gripper detects objects only on its way to a target (gGTO) and there. A reset or a loss of power
+            # leaves the fingers where they are, possibly on a tool.
+            uncertain=state.object is ObjectStatus.UNKNOWN,
+            unfelt=self._unfelt(state),
+            requested_counts=state.requested_counts,
+            others_requests=state.others_requests,
+            inactive=state.activation is not ActivationStatus.ACTIVE,
+            too_hot=state.fault.too_hot,
+        )
+
+    def _holds(self, state: GripperState) -> bool:
+        """Return whether the fingers hold something: fingertips that touch each other do not, if that is measured."""
+        if state.diameter_mm is None:
+            return False
+        return not self.measures_diameters or state.width_mm > TOUCHING_STDS * state.width_std_mm
+
+    def _unfelt(self, state: GripperState) -> bool:
+        """Return whether the fingers have closed to their target: they may hold an object of just that width.
+
+        The detection of objects "is precise only to the order of a few mm" (manual of the 2F-140, object detection).
+        """
+        at_target = state.object is ObjectStatus.AT_TARGET or state.diameter_mm is not None
+        return at_target and not (state.opened or self._nearly_open(state) or self._holds(state))
+
+    def _nearly_open(self, state: GripperState) -> bool:
+        """Return whether the fingers are so far apart that they hold nothing."""
+        return state.width_mm >= self.gripper.model.stroke_mm - OPEN_WITHIN_MM
+
+    def _diameter(self, state: GripperState) -> Measured | None:
+        """Return the held tool's diameter from the gripper alone; None while nothing is held."""
+        if not self._holds(state) or state.diameter_std_mm is None:
+            return None
+        return Measured(state.width_mm, TWO_SIDED_95 * state.diameter_std_mm)
 
     def _publish(self, state: GripperState) -> None:
-        tool = combine(own, self.diameters.latest(state.t_ns)) if (own := gripped_diameter(state)) is not None else None
+        own = self._diameter(state)
+        tool = combine(own, self.diameters.latest(state.t_ns)) if own is not None else None
         self.publisher.publish(
             GripperStateMessage(
                 source="gripper",
                 t_mono_ns=state.t_ns,
                 width_mm=state.width_mm,
-                diameter_mm=state.diameter_mm,
-                diameter_std_mm=state.diameter_std_mm,
+                diameter_mm=state.diameter_mm if own is not None else None,
+                diameter_std_mm=state.diameter_std_mm if own is not None else None,
                 tool_diameter_mm=tool.value if tool is not None else None,
                 tool_diameter_std_mm=tool.half_width / TWO_SIDED_95 if tool is not None else None,
                 current_ma=state.current_ma,
@@ -195,28 +241,3 @@ async def _tried(act: Callable[[], Awaitable[None]]) -> None:
             if asyncio.get_running_loop().time() > tries_until_s:
                 raise
         await asyncio.sleep(TRIED_AGAIN_S)
-
-
-def gripped_diameter(state: GripperState) -> Measured | None:
-    """Return the held tool's diameter from the gripper alone; None while nothing is held."""
-    if state.diameter_mm is None or state.diameter_std_mm is None:
-        return None
-    return Measured(state.diameter_mm, TWO_SIDED_95 * state.diameter_std_mm)
-
-
-def status_of(state: GripperState) -> GripperStatus:
-    """Return what the control loop knows of a gripper's state."""
-    return GripperStatus(
-        state.t_ns,
-        state.width_mm,
-        holding=state.diameter_mm is not None,
-        moving=state.object is ObjectStatus.MOVING,
-        fault=state.fault.sentence if state.fault.needs_activation else "",
-        # The gripper detects objects only on its way to a target (gGTO) and there. A reset or a loss of power leaves
-        # the fingers where they are, possibly on a tool.
-        uncertain=state.object is ObjectStatus.UNKNOWN,
-        requested_counts=state.requested_counts,
-        others_requests=state.others_requests,
-        inactive=state.activation is not ActivationStatus.ACTIVE,
-        too_hot=state.fault.too_hot,
-    )

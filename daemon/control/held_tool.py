@@ -172,10 +172,16 @@ class HeldTool:
     def uncertain(self) -> str | None:
         """Why the gripper cannot say whether it holds a tool, or None."""
         gripper = self.inputs.gripper
-        if not self.has_gripper or gripper is None or not (gripper.uncertain or gripper.moving):
+        if not self.has_gripper or gripper is None:
             return None
-        left = "stand where a stop, an activation or a lack of power has left them"
-        doubt = "are moving" if gripper.moving else left
+        if gripper.moving:
+            doubt = "are moving"
+        elif gripper.uncertain:
+            doubt = "stand where a stop, an activation or a lack of power has left them"
+        elif gripper.unfelt:
+            doubt = "have closed to their target, where a tool of that width is not felt"
+        else:
+            return None
         width = f"{gripper.width_mm:.1f} mm apart"
         return f"the gripper does not know whether it holds a tool: its fingers, {width}, {doubt}"
 
@@ -195,7 +201,7 @@ class HeldTool:
         gripper = self.inputs.gripper
         if gripper is None:
             return self._on_judged is not None or self.grip.force_n is not None
-        return gripper.holding or gripper.moving or gripper.uncertain
+        return gripper.may_hold
 
     def may_be_loaded(self) -> bool:
         """Return whether a tool may load the sensors: a held one, or a clamped one whose angle counts."""

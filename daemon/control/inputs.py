@@ -33,7 +33,8 @@ class GripperStatus:
     """State of the gripper, as far as the loop needs it.
 
     `uncertain`: the gripper cannot say whether it holds an object, because it is inactive, lost its power, or was
-    stopped on its way. `requested_counts`: the position of the last request of any program. `others_requests`: the
+    stopped on its way. `unfelt`: the fingers have closed to their target, and an object as wide as that would not be
+    felt. `requested_counts`: the position of the last request of any program. `others_requests`: the
     number of requests of other programs. `inactive`: it activates before its next motion, which opens and closes
     the fingers once. `too_hot`: it refuses a grip, and activates before it opens.
     """
@@ -44,10 +45,16 @@ class GripperStatus:
     moving: bool
     fault: str = ""
     uncertain: bool = False
+    unfelt: bool = False
     requested_counts: int | None = None
     others_requests: int = 0
     inactive: bool = False
     too_hot: bool = False
+
+    @property
+    def may_hold(self) -> bool:
+        """Whether the fingers hold an object, or may."""
+        return self.holding or self.moving or self.uncertain or self.unfelt
 
     @property
     def fingers(self) -> str:
@@ -59,7 +66,8 @@ class GripperStatus:
             return f"its fingers move, {width} apart"
         if self.uncertain:
             return f"its fingers stand {width} apart, and it cannot say whether they hold something"
-        return f"its fingers are {width} apart with nothing between them"
+        nothing = "nothing wider between them" if self.unfelt else "nothing between them"
+        return f"its fingers are {width} apart with {nothing}"
 
 
 @dataclass(slots=True)

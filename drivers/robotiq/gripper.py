@@ -63,6 +63,9 @@ class RobotiqGripper:
     # The latest readout since the last request, and its beginning.
     _latest: tuple[messages.Readout, int] | None = field(default=None, init=False)
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False)
+    # The latest position over this connection, and whether the latest change of it has opened the fingers.
+    _position: int | None = field(default=None, init=False)
+    _opened: bool = field(default=False, init=False)
 
     @property
     def model(self) -> GripperModel:
@@ -80,6 +83,7 @@ class RobotiqGripper:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
         await self._exchange(self.client.connect)
         self.connected, self._loss = True, None
+        self._position, self._opened = None, False
         self._requests.on_connection()
         return await self.read()
 
@@ -247,9 +251,16 @@ class RobotiqGripper:
     async def _read(self, *, whole: bool = False) -> tuple[messages.Readout, int]:
         self._latest = await self._exchange(partial(self.client.read, whole=whole))
         self._requests.take(*self._latest)
+        self._follow(self._latest[0].pos)
         self._news.set()
         self._news.clear()
         return self._latest
+
+    def _follow(self, position: int) -> None:
+        """Note which way the fingers have moved; more counts are closer together."""
+        if self._position is not None and position != self._position:
+            self._opened = position < self._position
+        self._position = position
 
     async def _recent(self) -> tuple[messages.Readout, int]:
         """Return the latest readout where `states` keeps it fresh, else a new one: each delays the next state."""
@@ -314,6 +325,7 @@ class RobotiqGripper:
             fault=messages.fault_of(readout.flt),
             requested_counts=readout.pre,
             others_requests=self._requests.others,
+            opened=self._opened,
         )
         self._seq += 1
         return state

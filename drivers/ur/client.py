@@ -92,7 +92,8 @@ class UrRobot:
         self._number = 0
         self._warning = ""
         # Tasks that wait for the next state.
-        self._waiting: set[asyncio.Future[messages.RobotState]] = set()
+        # In the order of their calls: who waits first decides first.
+        self._waiting: list[asyncio.Future[messages.RobotState]] = []
 
     @property
     def wrench_zero(self) -> Six:
@@ -126,12 +127,12 @@ class UrRobot:
     async def next_state(self) -> messages.RobotState:
         """Return the next state, also after a loss of the connection."""
         waiting: asyncio.Future[messages.RobotState] = asyncio.get_running_loop().create_future()
-        self._waiting.add(waiting)
+        self._waiting.append(waiting)
         try:
             return await waiting
         finally:
             # A waiter that gave up stays for no later state: a robot may be off for days.
-            self._waiting.discard(waiting)
+            self._waiting.remove(waiting)
 
     def send(self, command: messages.Command) -> asyncio.Future[messages.CommandReply]:
         """Send a command at once and return its reply; if the worker dies first, the reply is a refusal."""

@@ -335,6 +335,7 @@ def test_a_grip_of_an_earlier_process_that_another_program_changes_is_not_the_pr
     [
         ({"moving": True}, "its fingers move, 30.0 mm apart"),
         ({"uncertain": True}, "its fingers stand 30.0 mm apart, and it cannot say whether they hold something"),
+        ({"unfelt": True}, "its fingers are 30.0 mm apart with nothing wider between them"),
         ({}, "its fingers are 30.0 mm apart with nothing between them"),
     ],
 )
@@ -350,6 +351,7 @@ def test_a_grip_that_is_lost_says_what_the_fingers_do(sense, does):
     ("sense", "what"),
     [
         ({"uncertain": True}, "stand where a stop, an activation or a lack of power has left them"),
+        ({"unfelt": True}, "have closed to their target, where a tool of that width is not felt"),
         ({"moving": True}, "are moving"),
     ],
 )
@@ -374,6 +376,15 @@ def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(sen
     stop(rig)
     rig.control_loop.acknowledge()
     assert refused({"do": "release"}, turning) is None
+
+
+def test_a_grip_that_may_meet_nothing_allows_turns_after_it():
+    rig = Rig(new_loop())
+    rig.hand, rig.force_n = replace(rig.hand, unfelt=True), 0.0
+    started(rig, {**GRIP, "expect_object": False}, TWIST_NOW, torque_source="load_cell")
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    assert "have closed to their target" in (rig.control_loop.tool.may_still_hold or "")
 
 
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])

@@ -130,8 +130,51 @@ async def test_cancelled_activation_stops_the_fingers(way, tmp_path):
         for _ in range(200):
             await asyncio.sleep(0)
         assert rig.model.width_mm == halted_mm
-        with pytest.raises(ActionError, match=r"closed to 0\.0 mm and met nothing; put the tool between them"):
+        with pytest.raises(ActionError, match=r"closed to 0\.0 mm and met nothing wider; put the tool between them"):
             await task.grip(GRIP)
+
+
+@WAYS
+@pytest.mark.parametrize("target_mm", [20.0, 60.0])
+async def test_a_tool_as_wide_as_the_target_may_be_held_although_it_is_not_felt(way, tmp_path, target_mm):
+    """The gripper reports "at target", as with nothing between its fingers."""
+    to_target = GRIP.model_copy(update={"width_mm": target_mm, "expect_object": False})
+    async with reading(way, tmp_path) as (rig, task, felt):
+        await task.release()
+        assert not felt[-1].may_hold
+        # Within one count.
+        rig.model.object_mm = target_mm - 0.6
+        await task.grip(to_target)
+        assert (felt[-1].unfelt, felt[-1].holding, felt[-1].may_hold) == (True, False, True)
+        with pytest.raises(ActionError, match="met nothing wider"):
+            await task.grip(to_target.model_copy(update={"expect_object": True}))
+        with pytest.raises(NotBegunError, match="would open them and drop it"):
+            await task.grip(to_target.model_copy(update={"width_mm": target_mm + 10.0}))
+        # Above its width, and not well above it: such a release opens fully.
+        await task.grip(opening(target_mm + 1.0, 100.0))
+        assert rig.model.width_mm > 130.0
+        assert not felt[-1].may_hold
+        # Fingers that have opened to a width between hold nothing.
+        rig.model.object_mm = None
+        await task.grip(to_target)
+        await task.grip(opening(target_mm + 20.0, 100.0))
+        assert not felt[-1].may_hold
+
+
+@WAYS
+@pytest.mark.parametrize("measured", [True, False])
+async def test_fingertips_that_touch_hold_nothing_where_that_is_measured(way, tmp_path, measured):
+    """Soft fingertips meet before the fingers' end, which the gripper takes for an object."""
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        task = task_of(rig, measures_diameters=measured)
+        rig.model.object_mm = 0.9
+        if measured:
+            with pytest.raises(ActionError, match="met nothing wider"):
+                await task.grip(GRIP)
+        else:
+            await task.grip(GRIP)
+        status = task.status_of(await rig.driver.read())
+        assert (status.holding, status.may_hold) == (not measured, True)
 
 
 @WAYS
@@ -207,7 +250,7 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_pat
             await asyncio.sleep(0)
         assert rig.model.width_mm == held_mm
         rig.model.fail(12)
-        assert "internal fault" in gripper_task.status_of(await rig.driver.read()).fault
+        assert "internal fault" in task.status_of(await rig.driver.read()).fault
         dropped = r"a tool in it drops; its fingers are 40\.\d mm apart.*`shearloop command unlock --yes`"
         with pytest.raises(ActionError, match=dropped):
             await task.unlock()

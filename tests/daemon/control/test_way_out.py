@@ -135,7 +135,7 @@ def commands_with(rig: RigOfDaemon, sensors: dict[str, Any] | None = None) -> An
     return Commands(rig, SimpleNamespace(tareable=sensors), None, health, asyncio.Event(), rig.tare_refusal).handlers()
 
 
-@pytest.mark.parametrize("hand", [{"holding": True}, {"uncertain": True}, {"moving": True}])
+@pytest.mark.parametrize("hand", [{"holding": True}, {"uncertain": True}, {"unfelt": True}, {"moving": True}])
 @pytest.mark.parametrize("befalls", [None, emergency_stop])
 async def test_an_unlock_that_would_drop_a_tool_asks_before_anything_is_unlocked(hand, befalls):
     async with with_gripper() as cell:
@@ -290,7 +290,7 @@ def test_after_a_grip_fingers_that_were_halted_may_still_hold_the_tool(gripped):
     assert ("does not know whether it holds a tool" in said) if gripped else said is None
 
 
-@pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
+@pytest.mark.parametrize("sense", [{"uncertain": True}, {"unfelt": True}, {"moving": True}])
 def test_a_tare_with_an_uncertain_gripper_has_to_be_confirmed(sense):
     rig = held(**sense)
     assert "does not know whether it holds a tool" in (rig.control_loop.operator.tare_refusal() or "")

@@ -15,6 +15,9 @@ from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
+# A gripper feels a tool that is wider than its target by this much: its manual says "only to the order of a few mm".
+FELT_MM = 5.0
+
 
 @dataclass(frozen=True, slots=True)
 class StepPlan:
@@ -264,6 +267,9 @@ def _ways(angles_rad: tuple[float, ...]) -> list[str]:
 
 def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None) -> Iterator[str]:
     """Yield what a step's limits and the robot's change."""
+    if isinstance(step, steps.GripStep) and file.tool_mm is not None and step.width_mm > file.tool_mm - FELT_MM:
+        most_mm = max(0.0, file.tool_mm - FELT_MM)
+        yield f"the gripper may not feel the tool of {file.tool_mm:g} mm: make `width_mm` at most {most_mm:g}"
     if isinstance(step, steps.TwistingStep):
         limits = file.limits_of(step)
         if step.limits is not None:

@@ -9,7 +9,8 @@ import structlog
 from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.experiment_schema import ApproachStep
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.messages import ARRIVED, STOPPED_ON_COMMAND, MoveLinear, tool_axis
+from shearloop.drivers.ur.messages import ARRIVED, STOPPED_ON_COMMAND, MoveLinear
+from shearloop.drivers.ur.poses import tool_axis
 from shearloop.drivers.ur.settings import Six
 from shearloop.errors import ActionError
 

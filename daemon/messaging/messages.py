@@ -169,7 +169,7 @@ class RobotStateMessage(Message):
     tcp_speed_m_per_s: float = column("m/s", "speed of the tool centre")
     wrench: tuple[float, ...] = column(
         "N, N·m",
-        "force and torque at the tool centre, relative to its last zero; without a tare it may be off by any load",
+        "force and torque from the controller, relative to its last zero; without a tare it may be off by any load",
     )
     wrist_rad: float = column("rad", "angle of wrist 3, about which the tool twists")
     wrist_speed_rad_per_s: float = column("rad/s", "its speed")

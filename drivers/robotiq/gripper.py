@@ -30,7 +30,7 @@ RobotiqClient: TypeAlias = "SocketClient | ModbusClient"
 POLL_S = 0.1
 # Without a readout of `states` for this number of poll periods, a command reads by itself.
 _POLLS_WAITED = 3
-# The pause between reset and activation that Robotiq's own clients keep.
+# The pause between reset and activation that Robotiq's own clients keep, and after which a reset is repeated.
 PAUSE_NS = 500_000_000
 RESET_DEADLINE_NS = 3_000_000_000
 # The fingers open and close once; a real gripper takes two to four seconds.
@@ -124,7 +124,10 @@ class RobotiqGripper:
         await self._write(messages.GripperAction.RESET)
         not_reset = "The gripper does not take the reset; check that nothing else commands it."
         await self._wait_until(
-            lambda now: not now.act and now.sta is messages.ActivationStatus.RESET, RESET_DEADLINE_NS, not_reset
+            lambda now: not now.act and now.sta is messages.ActivationStatus.RESET,
+            RESET_DEADLINE_NS,
+            not_reset,
+            again=messages.GripperAction.RESET,
         )
         resume_ns = time.monotonic_ns() + PAUSE_NS
         await self._wait_until(lambda _: time.monotonic_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
@@ -172,16 +175,26 @@ class RobotiqGripper:
         )
 
     async def _wait_until(
-        self, done: Callable[[messages.Readout], bool], deadline_ns: int, failure: str
+        self,
+        done: Callable[[messages.Readout], bool],
+        deadline_ns: int,
+        failure: str,
+        again: messages.GripperAction | None = None,
     ) -> messages.GripperState:
-        """Return the first state that is `done`; GripperFaultError after the deadline."""
-        since_ns = next_ns = time.monotonic_ns()
+        """Return the first state that is `done`; GripperFaultError after the deadline.
+
+        `again` is a request that some grippers do not take at once, and that is repeated.
+        """
+        since_ns = next_ns = sent_ns = time.monotonic_ns()
         while True:
             readout, t_ns = await self._readout_after(next_ns)
             if done(readout):
                 return self._state(readout, t_ns)
             if t_ns - since_ns > deadline_ns:
                 raise messages.GripperFaultError(failure)
+            if again is not None and t_ns - sent_ns > PAUSE_NS:
+                await self._write(again)
+                sent_ns = t_ns
             next_ns = t_ns + 1
 
     async def halt(self) -> None:

@@ -132,8 +132,9 @@ class SocketClient:
             self._connection = await TcpPort.connect(self._host, self._port)
         except OSError as error:  # a timeout is one
             raise DeviceNotFoundError(
-                f"There is no gripper socket at {self.name} ({system_reason(error)}); check the robot's address and "
-                "that the Robotiq URCap is installed and runs."
+                f"There is no gripper socket at {self.name} ({system_reason(error)}); check the robot's address, that "
+                "the Robotiq URCap is installed and runs, and on an e-Series from PolyScope 5.17 on that Settings → "
+                "Security → General allows this computer and the port."
             ) from error
 
     async def close(self) -> None:

@@ -75,7 +75,9 @@ class UrArm:
         watchdog_ns = 1e9 / settings.watchdog_hz
         # The thread that ur-rtde starts here inherits the slack; 0 gives this one its default again.
         _set_timer_slack(min(_LONGEST_POLL_SLACK_NS, int(watchdog_ns / _SLACKS_PER_WATCHDOG)))
-        flags = int(kind.FLAG_NO_WAIT) | (int(kind.FLAG_UPPER_RANGE_REGISTERS) if registers.first else 0)
+        # Without FLAG_NO_EXT_FT it takes the input of external force sensors, which their URCaps write.
+        flags = int(kind.FLAG_NO_WAIT) | int(kind.FLAG_NO_EXT_FT)
+        flags |= int(kind.FLAG_UPPER_RANGE_REGISTERS) if registers.first else 0
         self._control = kind(settings.host, settings.rate_hz, flags)
         _set_timer_slack(0)
         lose_dead_peers_of_ports()

@@ -93,12 +93,15 @@ def query_controller(host: str, timeout_s: float) -> ControllerInfo:
         robot_mode.removeprefix("Robotmode: "),
         safety_mode.removeprefix("Safetymode: "),
         {"true": True, "false": False}.get(remote.lower()),
-        free_registers(host, timeout_s),
+        free_registers(host, timeout_s, version),
     )
 
 
 def check_ports(host: str, timeout_s: float) -> None:
-    """Raise RobotLostError, with the menu, where a controller is there and does not serve every port that is needed."""
+    """Raise RobotLostError where a controller is there and does not serve every port that is needed.
+
+    The error names the menu that opens a port, or a version that cannot be driven.
+    """
     found = probe_ports(host, timeout_s)
     closed = [port for port, reason in found.items() if reason]
     if closed and len(closed) < len(found):
@@ -111,7 +114,11 @@ def _known_version(host: str, timeout_s: float) -> tuple[int, ...]:
         (answer,) = ask_dashboard(host, timeout_s, ("PolyscopeVersion",))
         if found := re.search(r"(\d+)\.(\d+)", answer):
             return int(found[1]), int(found[2])
-    with suppress(DriverError):
+    try:
         major, minor, *_ = probe_controller(host, timeout_s).split(".")
-        return int(major), int(minor)
-    return ()
+    except RobotLostError as error:
+        # A controller that cannot be driven, such as PolyScope X, has no menu for these ports.
+        if error.kind == "version":
+            raise
+        return ()
+    return int(major), int(minor)

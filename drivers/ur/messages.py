@@ -4,13 +4,13 @@ On the pipe each message is a line: its number, its type's name, and its fields 
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Final, Literal, get_args
 
 from pydantic import TypeAdapter
 
 from shearloop.drivers.errors import DeviceLostError, ProtocolError
+from shearloop.drivers.ur.poses import tool_axis
 from shearloop.drivers.ur.settings import REST_RAD_PER_S, Six, Three, UrSettings
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
@@ -281,17 +281,6 @@ class RtdeSample(RtdeOutputs):
         x, y, z = tool_axis(self.tcp_pose)
         _, _, _, torque_x, torque_y, torque_z = self.wrench
         return x * torque_x + y * torque_y + z * torque_z
-
-
-def tool_axis(pose: Sequence[float]) -> Three:
-    """Return the direction of the tool's z axis: the third column of the pose's rotation, by Rodrigues' formula."""
-    x, y, z = pose[3:]
-    angle_rad = math.hypot(x, y, z)
-    if angle_rad == 0.0:
-        return 0.0, 0.0, 1.0
-    x, y, z = x / angle_rad, y / angle_rad, z / angle_rad
-    sine, versine = math.sin(angle_rad), 1.0 - math.cos(angle_rad)
-    return x * z * versine + y * sine, y * z * versine - x * sine, 1.0 - (x * x + y * y) * versine
 
 
 @dataclass(frozen=True)

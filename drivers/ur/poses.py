@@ -25,3 +25,14 @@ def _quaternion(pose: Sequence[float]) -> tuple[float, float, float, float]:
     # sin(a)/(2 a) is 1/2 at 0.
     part = math.sin(half_rad) / (2.0 * half_rad) if half_rad else 0.5
     return math.cos(half_rad), part * x, part * y, part * z
+
+
+def tool_axis(pose: Sequence[float]) -> tuple[float, float, float]:
+    """Return the direction of the tool's z axis: the third column of the pose's rotation, by Rodrigues' formula."""
+    x, y, z = pose[3:]
+    angle_rad = math.hypot(x, y, z)
+    if angle_rad == 0.0:
+        return 0.0, 0.0, 1.0
+    x, y, z = x / angle_rad, y / angle_rad, z / angle_rad
+    sine, versine = math.sin(angle_rad), 1.0 - math.cos(angle_rad)
+    return x * z * versine + y * sine, y * z * versine - x * sine, 1.0 - (x * x + y * y) * versine

@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 _RETRY_S = 1.0
 # A program without heartbeats has ended by its watchdog after this time.
 ENDS_ITSELF_S = 2.0
-# A program that does not play within this time after its first upload does not start with this worker.
-STARTS_WITHIN_S = 2.0
+# A program that does not play within this time after its first upload does not start with this worker. A slow
+# controller takes seconds, and each upload ends a program that is starting.
+STARTS_WITHIN_S, UPLOAD_AGAIN_S = 6.0, 3.0
 # An arm that does not come to rest has no load that could be measured for longer than this.
 LOAD_WITHIN_S = 5.0
 
@@ -48,6 +49,8 @@ class Recovery:
         self._arm = arm
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
         self._timeout_s = timeout_s
+        # The deadline begins again with each step of powering up.
+        self._robot_mode: int | None = None
         self._load_by_ns = now_ns + int(LOAD_WITHIN_S * 1e9)
         self._asked_ns: dict[str, int] = {}
         self._cleared = False
@@ -78,11 +81,14 @@ class Recovery:
         Raises:
             RobotLostError: the control program cannot be sent, or does not start.
         """
+        if sample.robot_mode != self._robot_mode:
+            self._robot_mode = sample.robot_mode
+            self._deadline_ns = now_ns + int(self._timeout_s * 1e9)
         if self.refusal is None and now_ns > self._deadline_ns:
             self.refusal = (
-                f"The robot did not get ready within {self._timeout_s:g} s (robot mode: {sample.robot_mode_name}, "
-                f"safety mode: {sample.safety_mode_name}, program: {sample.runtime_name}). {self._answered}Look at the "
-                "teach pendant."
+                f"The robot did not get ready: it made no step within {self._timeout_s:g} s (robot mode: "
+                f"{sample.robot_mode_name}, safety mode: {sample.safety_mode_name}, program: {sample.runtime_name}). "
+                f"{self._answered}Look at the teach pendant."
             )
         if self.refusal is None and recent:
             try:
@@ -122,7 +128,7 @@ class Recovery:
                 # A heartbeat, for a script that arms its watchdog before its loop.
                 self._arm.clear_command()
             # The controller may be busy and drop an upload.
-            if self._is_due("upload", now_ns):
+            if self._is_due("upload", now_ns, UPLOAD_AGAIN_S):
                 self._arm.upload(held=self.held)
 
     def _make_safe(self, sample: RtdeSample, now_ns: int, safe: bool) -> None:
@@ -153,9 +159,9 @@ class Recovery:
         if self._is_due(requests[0], now_ns) and (refused := self._arm.ask_dashboard(*requests)):
             self._answered = f"{refused}. "
 
-    def _is_due(self, step: str, now_ns: int) -> bool:
+    def _is_due(self, step: str, now_ns: int, period_s: float = _RETRY_S) -> bool:
         """Return whether a step is due, and note that it is taken: the robot may not follow a request at once."""
-        due = now_ns >= self._asked_ns.get(step, -(1 << 62)) + int(_RETRY_S * 1e9)
+        due = now_ns >= self._asked_ns.get(step, -(1 << 62)) + int(period_s * 1e9)
         if due:
             self._asked_ns[step] = now_ns
         return due

@@ -11,7 +11,7 @@ from typing import Final
 from shearloop.drivers.defaults import RTDE_PORT
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.ports import connected
-from shearloop.drivers.ur.script import LOWER, NO_MOTION_TICKS, UPPER, ScriptRegisters
+from shearloop.drivers.ur.script import FIRST_WITH_LOWER_ALONE, LOWER, NO_MOTION_TICKS, UPPER, ScriptRegisters
 
 # Each package begins with its size in bytes, and its kind.
 HEADER: Final = struct.Struct(">HB")
@@ -47,9 +47,13 @@ def _receive_exactly(connection: socket.socket, size: int) -> bytes:
     return data
 
 
-def free_registers(host: str, timeout_s: float) -> ScriptRegisters | None:
-    """Return the half of the input registers that no other client writes, the upper one first; None for neither."""
-    for registers in (UPPER, LOWER):
+def free_registers(host: str, timeout_s: float, version: str) -> ScriptRegisters | None:
+    """Return the half of the input registers that no other client writes, the upper one first; None for neither.
+
+    `version` is the controller's, as 5.17.3.0: on a new one, ur-rtde can use the lower half alone.
+    """
+    major, minor, *_ = map(int, version.split("."))
+    for registers in (LOWER,) if (major, minor) >= FIRST_WITH_LOWER_ALONE else (UPPER, LOWER):
         # A register belongs to a connection: closing it gives the register back.
         with connected(host, RTDE_PORT, timeout_s, "asking for its registers") as connection:
             agree_on_protocol(connection)

@@ -34,7 +34,7 @@ class ScriptRegisters:
 
     @property
     def last(self) -> int:
-        """The number of our registers; ur-rtde 1.6.5 uses the first fifteen or so."""
+        """The number of our registers; ur-rtde 1.6.5 uses the first eighteen."""
         return self.first + 23
 
     @property
@@ -67,12 +67,14 @@ class ScriptRegisters:
         """All inputs that ur-rtde and we write."""
         return (
             *(f"input_int_register_{self.first + number}" for number in range(8)),
-            *(f"input_double_register_{self.first + number}" for number in range(14)),
+            *(f"input_double_register_{self.first + number}" for number in range(18)),
             self.deadline,
         )
 
 
 UPPER, LOWER = ScriptRegisters(24), ScriptRegisters(0)
+# From this PolyScope on, ur-rtde 1.6.5 uses the lower half alone.
+FIRST_WITH_LOWER_ALONE: Final = (5, 23)
 # The clock starts at 0, so with this deadline no motion begins or continues.
 NO_MOTION_TICKS = -1
 # The largest further distance of a deadline: a cycle of the slowest controller, for rounding.

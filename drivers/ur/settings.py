@@ -14,6 +14,7 @@ from pydantic import Field
 from shearloop.drivers import ranges
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.hosts import is_loopback_host, why_no_host
+from shearloop.drivers.ur.poses import tool_axis
 
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
@@ -53,6 +54,8 @@ REST_RAD_PER_S = 0.01
 Generation = Literal["e-series", "cb3"]
 
 
+# A tool centre point within these counts as on the axis of wrist 3.
+MOST_ASIDE_M, MOST_TILT_RAD = 0.01, 0.05
 # A torque of the wrench is the mean of at least this number of states.
 WRENCH_STATES: Final = 16
 
@@ -250,9 +253,9 @@ class UrLimits(_Checked):
     linear_acceleration_m_per_s2: AccelerationBound
     """Acceleration of the tool centre point."""
     force_n: ForceBound
-    """Force on the tool centre point."""
+    """Force as the controller reports it."""
     torque_nm: TorqueBound
-    """Torque on the tool centre point."""
+    """Torque as the controller reports it."""
 
     @property
     def box(self) -> Workspace:
@@ -277,6 +280,11 @@ class InstalledTool(_Checked):
         """Refuse values that no controller reports."""
         if not self.reported and len(self.absent) < len(self._values):
             raise ValueError(f"`reported: false` compares nothing: take {' and '.join(self._values)} out")
+        if self.tcp_offset is not None and (beside := _beside_the_axis(self.tcp_offset)):
+            raise ValueError(
+                f"tcp_offset: the tool centre point {beside}, and the torque about wrist 3 is then not the one on the "
+                "tool: put it onto the axis, at the teach pendant too"
+            )
 
     @property
     def _values(self) -> dict[str, object]:
@@ -286,6 +294,17 @@ class InstalledTool(_Checked):
     def absent(self) -> list[str]:
         """The keys without a value."""
         return [key for key, value in self._values.items() if value is None]
+
+
+def _beside_the_axis(tcp_offset: Six) -> str:
+    """Return how a tool centre point leaves the axis of wrist 3, or an empty string."""
+    aside_m = math.hypot(*tcp_offset[:2])
+    tilt_rad = math.acos(min(1.0, max(-1.0, tool_axis(tcp_offset)[2])))
+    if aside_m > MOST_ASIDE_M:
+        return f"lies {1e3 * aside_m:.0f} mm beside the axis of wrist 3"
+    if tilt_rad > MOST_TILT_RAD:
+        return f"is tilted by {tilt_rad:.2f} rad against the axis of wrist 3"
+    return ""
 
 
 @dataclass(frozen=True, slots=True)

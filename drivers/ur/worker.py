@@ -153,7 +153,7 @@ def connect(pipe: Pipe, settings: UrSettings, receiver: type[RtdeReceiver] = Rtd
         (answer,) = ask_dashboard(host, settings.connect_timeout_s / 4, (SERIAL_NUMBER,))
         controller = version, serial_number_in(answer)
         primary = PrimaryPort(host, settings.connect_timeout_s / 8)
-        registers = free_registers(host, settings.connect_timeout_s / 8)
+        registers = free_registers(host, settings.connect_timeout_s / 8, version)
         if registers is None:
             raise registers_in_use(host)
         warning = " ".join(filter(None, (untested_sentence(version), primary.warning)))

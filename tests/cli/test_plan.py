@@ -119,6 +119,14 @@ def test_a_tare_before_any_release_is_pointed_out(before, warned, tmp_path, caps
     assert ("put a `release` before it" in capsys.readouterr().out) is warned
 
 
+@pytest.mark.parametrize(("tool_mm", "noted"), [(14.0, True), (16.0, False), (None, False)])
+def test_a_grip_whose_target_is_nearly_the_tool_is_pointed_out(tool_mm, noted, tmp_path, result_of):
+    keys = {} if tool_mm is None else {"tool_mm": tool_mm}
+    path = written(tmp_path, {"do": "grip", "width_mm": 10.0}, **keys)
+    notes = "".join(result_of("check", path)["plan"]["steps"][0]["notes"])
+    assert ("may not feel the tool of 14 mm: make `width_mm` at most 9" in notes) is noted
+
+
 def test_turns_that_add_up_to_more_than_the_limit_are_pointed_out(tmp_path, result_of):
     path = written(tmp_path, GRIP, TIGHTEN, TIGHTEN, limits={"angle_rad": 3.0})
     assert "4 rad (229°) from the grip: the limit stops it at 3 rad" in "".join(

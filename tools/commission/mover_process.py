@@ -29,8 +29,8 @@ from shearloop.drivers.ur.messages import (
     Stop,
     Unlock,
     WristSpeed,
-    tool_axis,
 )
+from shearloop.drivers.ur.poses import tool_axis
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.tools.commission.bounds import LARGEST_M
 from shearloop.tools.commission.failing_worker import CLOSE_RTDE, NO_DEADLINES

@@ -7,7 +7,8 @@ from typing import Final, Protocol
 
 from shearloop.daemon.commissioning import Line, Supplied
 from shearloop.drivers.ur.client import WORKER
-from shearloop.drivers.ur.messages import SAFETY_NORMAL, SAFETY_REDUCED, tool_axis
+from shearloop.drivers.ur.messages import SAFETY_NORMAL, SAFETY_REDUCED
+from shearloop.drivers.ur.poses import tool_axis
 from shearloop.drivers.ur.settings import Six
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S, LARGEST_RAD

@@ -9,7 +9,7 @@ from shearloop.bank.channels import ChannelTable
 from shearloop.daemon.commissioning import Line
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
-from shearloop.drivers.ur.messages import tool_axis
+from shearloop.drivers.ur.poses import tool_axis
 from shearloop.tools.commission.curves import scanned_step_s, step_s
 from shearloop.tools.commission.limits import REAL
 from shearloop.tools.commission.observer import Seen

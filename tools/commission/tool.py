@@ -9,7 +9,7 @@ from typing import Final
 from shearloop.daemon.commissioning import Line, Supplied
 from shearloop.daemon.control.experiment_schema import SIGNS
 from shearloop.drivers.load_cell import LoadSample
-from shearloop.drivers.ur.messages import tool_axis
+from shearloop.drivers.ur.poses import tool_axis
 from shearloop.errors import UserError
 from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.boards import put_between

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shearloop.daemon.control.wrench import WrenchMean, publish_every, wrench_source
-from shearloop.drivers.ur.messages import tool_axis
+from shearloop.drivers.ur.poses import tool_axis
 from shearloop.drivers.ur.settings import GENERATIONS, WRENCH_STATES
 from shearloop.emulators.ur_robot import Robot
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -68,6 +69,17 @@ async def test_activation_is_a_reset_a_pause_and_a_rising_edge(connect):
     assert (reset, activate) == (messages.GripperAction.RESET, messages.GripperAction.ACTIVATE)
     assert activate_ns - reset_ns >= PAUSE_NS
     assert client.readouts == [ACTIVE]
+
+
+async def test_a_reset_that_is_not_taken_at_once_is_repeated(connect):
+    client = Client(*[ACTIVE] * 8, *[RESET] * 12, ACTIVATING, ACTIVE)
+    await connect(client).activate(operator_confirmed=True)
+    requests = [request for request, _ in client.requests]
+    assert requests[-1] is messages.GripperAction.ACTIVATE
+    assert set(requests[:-1]) == {messages.GripperAction.RESET}
+    times_ns = [t_ns for _, t_ns in client.requests]
+    assert len(requests) > 2
+    assert min(later - earlier for earlier, later in pairwise(times_ns)) >= PAUSE_NS
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ SIX = (0.0,) * 6
 class Client:
     """Connects to nothing, takes every call of ur-rtde's and answers True or from `answers`; `calls` names them."""
 
-    FLAG_NO_WAIT, FLAG_UPPER_RANGE_REGISTERS = 16, 8
+    FLAG_NO_WAIT, FLAG_UPPER_RANGE_REGISTERS, FLAG_NO_EXT_FT = 16, 8, 64
     answers: ClassVar[dict[str, object]] = {}
 
     # The latest one.
@@ -152,7 +152,7 @@ def test_register_is_cleared_once_the_client_knows_that_no_program_runs(arm):
 def test_sent_script_arms_its_watchdog(arm, monkeypatch):
     sent: list[str] = []
     monkeypatch.setattr(arm.ScriptPort, "send", lambda _, program: sent.append(program))
-    for registers, number, flags in ((UPPER, 24, 24), (LOWER, 0, 16)):
+    for registers, number, flags in ((UPPER, 24, 16 + 8 + 64), (LOWER, 0, 16 + 64)):
         one = arm.UrArm(SETTINGS, registers)
         one.upload()
         armed = f'rtde_set_watchdog("input_int_register_{number}", {SETTINGS.watchdog_hz:g}, "stop")'

@@ -301,6 +301,16 @@ async def test_unsupported_controller_does_not_restart_the_worker(controller, li
         assert robot.losses == {"version": 1}
 
 
+async def test_a_new_controller_is_driven_by_the_half_of_the_registers_that_ur_rtde_takes_there(controller):
+    """From 5.23 on, ur-rtde 1.6.5 takes the lower half, whatever it is asked for."""
+    await controller.fault("version 5.23.0.0")
+    info = await asyncio.to_thread(query_controller, controller.host, 3.0)
+    assert info.registers == LOWER
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+
+
 async def test_controller_that_is_newer_than_the_tested_ones_is_driven_with_a_warning(controller, link):
     await controller.fault("version 5.18.0.0")
     async with running(settings_for(controller.host), link) as robot:

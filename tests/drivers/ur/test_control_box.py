@@ -75,6 +75,14 @@ async def test_a_controller_that_serves_all_or_none_of_its_ports():
         await asyncio.to_thread(probe_controller, HOST, TIMEOUT_S)
 
 
+async def test_a_controller_without_a_dashboard_that_cannot_be_driven_is_named_by_its_version():
+    """PolyScope X has no such port, and no menu for it."""
+    async with serving(closed_ports=(29999,)) as controller:
+        controller.command("version 10.11.0.0")
+        with pytest.raises(RobotLostError, match=r"has PolyScope 10\.11\.0\.0, which cannot be driven"):
+            await asyncio.to_thread(check_ports, HOST, TIMEOUT_S)
+
+
 @pytest.mark.parametrize(
     ("generation", "version", "cure"),
     [("e-series", "3.15.8.0", "generation: cb3"), ("cb3", "5.17.3.0", "generation: e-series")],

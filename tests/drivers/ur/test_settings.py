@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.settings import read_settings
+from shearloop.drivers.ur.settings import InstalledTool, read_settings
 
 DELIVERED = Path(__file__).parents[3] / "config" / "ur.yaml"
 # The workspace is commented out there, with other numbers.
@@ -140,3 +140,22 @@ def test_a_controller_that_reports_no_payload_needs_no_tool(tmp_path) -> None:
     added = "host: 192.168.1.10\ntool: {reported: false}"
     assert read_settings(changed(tmp_path, ("host: 192.168.1.10", added))).left_open() == {}
     assert "tool" in next(iter(read_settings(changed(tmp_path)).left_open()))
+
+
+@pytest.mark.parametrize(
+    ("tcp_offset", "said"),
+    [
+        ([0.0, 0.0, 0.15, 0.0, 0.0, 1.5], None),
+        ([0.003, -0.004, 0.2, 0.01, 0.0, 0.0], None),
+        ([0.05, 0.0, 0.15, 0.0, 0.0, 0.0], "lies 50 mm beside the axis of wrist 3"),
+        ([0.0, 0.0, 0.15, 0.0, 0.785, 0.0], "is tilted by 0.79 rad against the axis of wrist 3"),
+        ([0.0, 0.0, 0.15, 3.14159, 0.0, 0.0], "is tilted by 3.14 rad"),
+    ],
+)
+def test_a_tool_beside_the_axis_of_wrist_3_is_refused(tcp_offset, said):
+    """The torque about wrist 3 is then not the one on the tool, and differs from CB3 to e-Series."""
+    if said is None:
+        assert tuple(InstalledTool(payload_kg=1.0, tcp_offset=tcp_offset).tcp_offset) == tuple(tcp_offset)
+        return
+    with pytest.raises((ValueError, DriverError), match=said):
+        InstalledTool(payload_kg=1.0, tcp_offset=tcp_offset)

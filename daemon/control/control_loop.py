@@ -18,7 +18,7 @@ from shearloop.daemon.control.experiment_schema import (
     IdentifyStep,
     TareStep,
 )
-from shearloop.daemon.control.fault_detection import Grasp, Watched, compared_for_s, detect_faults
+from shearloop.daemon.control.fault_detection import Grasp, RunningStep, Watched, compared_for_s, detect_faults
 from shearloop.daemon.control.held_tool import HeldTool
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.operator_view import OperatorView
@@ -31,6 +31,8 @@ from shearloop.daemon.torques import TorqueSample, TorqueSource, beyond_noise
 
 # An `adapt` step compares the fingertip with the torques of this time.
 ADAPTED_OVER_S = 600.0
+# Torques are reported as beyond these before the first experiment.
+DEFAULT_LIMITS = ExperimentLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +77,12 @@ class ControlLoop:
         self._wrists = {
             name: WristController(source, config, compute) for name, source in sources.items() if source.measures_torque
         }
-        # The wrist's controller for the driving torque, and the faults to watch for.
+        # The wrist's controller for the driving torque, and what is watched with it.
         self.wrist = next(iter(self._wrists.values()))
         self._watched = Watched(
             driving=self.wrist.source,
             supervising=self._others(self.wrist.source),
-            limits=ExperimentLimits(),
+            config=config,
             required=required,
             patience=patience,
         )
@@ -206,8 +208,8 @@ class ControlLoop:
         if (reason := self.operator.why_no_source(file)) is not None:
             return reason
         driving = self._sources[file.torque_source]
-        watched = replace(self._watched, driving=driving, supervising=self._others(driving), limits=file.limits)
-        faults = detect_faults(self.inputs, watched, self.config, t_ns)
+        watched = replace(self._watched, driving=driving, supervising=self._others(driving))
+        faults = detect_faults(self.inputs, watched, file.limits, None, t_ns)
         refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
         if refusals:
             return " ".join(refusals)
@@ -263,7 +265,9 @@ class ControlLoop:
             self.wrist.sent(sent_rad_per_s)
         running, arm = self.running, self.inputs.arm
         self.inputs.late_s = late_s
-        found = [*detect_faults(self.inputs, self._watched_now(t_ns), self.config, t_ns), *self._reported]
+        limits = self.experiment.limits if self.experiment is not None else DEFAULT_LIMITS
+        step = self._running_step(running, t_ns) if running is not None else None
+        found = [*detect_faults(self.inputs, self._watched, limits, step, t_ns), *self._reported]
         self._reported.clear()
         self.inputs.unjudged.clear()
         if self.tool.release_error is not None:
@@ -278,22 +282,16 @@ class ControlLoop:
             return self._ended(decision)
         return self._run_step(running, decision, arm.wrist_rad, t_ns)
 
-    def _watched_now(self, t_ns: int) -> Watched:
-        """Return the limits to watch: those of the latest experiment and, while it runs, of its command."""
-        if self.experiment is None:
-            return self._watched
-        watched = replace(self._watched, limits=self.experiment.limits)
-        if (running := self.running) is None:
-            return watched
+    def _running_step(self, running: Experiment, t_ns: int) -> RunningStep:
+        """Return what the experiment needs and expects at t_ns."""
         command, controller = running.command, self.wrist.controller
         grasp = Grasp.HELD if self.tool.expected else Grasp.NONE
         grasp = Grasp.CHANGING if isinstance(command.action, GripStep) else grasp
         needed = grasp is Grasp.HELD and _turns(command) and not self._awaited_torques(running, t_ns)
         runs = running.phase is ExperimentPhase.RUNNING
-        return replace(
-            watched,
-            grasp=grasp,
+        return RunningStep(
             torque_needed=needed and runs,
+            grasp=grasp,
             twisted_rad=self.tool.twisted_rad,
             expected_nm=controller.torque_nm if controller is not None else None,
             not_following=controller.filter.not_following if controller is not None and runs else "",

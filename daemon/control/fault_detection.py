@@ -1,7 +1,7 @@
 """Fault detection: from the loop's inputs to the faults of the safety table, with their present numbers."""
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 
@@ -35,24 +35,31 @@ class Grasp(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Watched:
-    """The sources, the limits, and the present needs of the experiment and of the daemon."""
+    """What is watched for as long as an experiment lasts: the sources and the devices, by which rules."""
 
     driving: TorqueSource
     supervising: tuple[TorqueSource, ...]
-    limits: ExperimentLimits
+    config: LoopConfig
     required: tuple[str, ...] = ()
-    # The wrist is driven by the torque, or twists under its limit.
-    torque_needed: bool = False
-    grasp: Grasp = Grasp.NONE
-    twisted_rad: float = 0.0
-    expected_nm: float | None = None
-    # How the torque has moved without the wrist, where that is too much.
-    not_following: str = ""
-    overdue: str | None = None
-    # Requests of other programs to the gripper before the experiment; None while none runs.
-    others_requests: int | None = None
     # Factor on the deadlines for states and decisions: above 1 on an emulated rig alone, which cannot hurt.
     patience: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunningStep:
+    """What a running experiment needs and expects in one tick."""
+
+    # The wrist is driven by the torque, or twists under its limit.
+    torque_needed: bool
+    grasp: Grasp
+    twisted_rad: float
+    # The torque that the closed loop expects, None without one.
+    expected_nm: float | None
+    # How the torque has moved without the wrist, where that is too much.
+    not_following: str
+    overdue: str | None
+    # Requests of other programs to the gripper before the experiment.
+    others_requests: int
 
 
 def compared_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> float:
@@ -60,46 +67,65 @@ def compared_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> float
     return max(one.fresh_s(config) + 2.0 * max(one.window_s, one.period_s) for one in sources)
 
 
-def detect_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:
-    """Return every fault that the inputs show at t_ns; `ControlLoop.tick` adds those that were reported to it."""
+def detect_faults(
+    inputs: LatestInputs, watched: Watched, limits: ExperimentLimits, step: RunningStep | None, t_ns: int
+) -> list[Fault]:
+    """Return every fault that the inputs show at t_ns; `step` is None while no experiment runs.
+
+    `ControlLoop.tick` adds the faults that were reported to it.
+    """
     found: list[Fault] = []
-    if watched.torque_needed:
-        found += _torque_faults(inputs, watched, config, t_ns)
-    limit_nm, limit_rad = watched.limits.torque_nm, watched.limits.angle_rad
+    if step is not None and step.torque_needed:
+        found += _torque_faults(inputs, watched, step, t_ns)
+    grasp = step.grasp if step is not None else Grasp.NONE
+    found += _torque_limit_faults(inputs, watched, limits.torque_nm, grasp, t_ns)
+    if step is not None and grasp is Grasp.HELD and abs(step.twisted_rad) > limits.angle_rad:
+        found.append(_angle_limit_fault(inputs, watched, limits.angle_rad, step.twisted_rad))
+    found += _device_faults(inputs, watched, step, t_ns)
+    for name, reason in inputs.died.items():
+        found.append(Fault(FaultCode.TASK_DIED, f"{name}: {reason}"))
+    found += _lateness_faults(inputs.late_s, watched.patience)
+    if inputs.recording_error:
+        found.append(Fault(FaultCode.RECORDING_FAILED, inputs.recording_error))
+    if step is not None and step.not_following:
+        found.append(Fault(FaultCode.NOT_FOLLOWING, step.not_following, t_ns=t_ns))
+    if step is not None and step.overdue is not None:
+        found.append(Fault(FaultCode.STEP_OVERDUE, step.overdue))
+    return found
+
+
+def _torque_limit_faults(
+    inputs: LatestInputs, watched: Watched, limit_nm: float, grasp: Grasp, t_ns: int
+) -> Iterator[Fault]:
     for source in (watched.driving, *watched.supervising):
         torque = _largest(inputs, source)
         if torque is None or torque.torque_nm is None or abs(torque.torque_nm) <= limit_nm + source.noise_nm:
             continue
-        if watched.grasp is Grasp.CHANGING and source.warm_up_s:
+        if grasp is Grasp.CHANGING and source.warm_up_s:
             continue
-        if t_ns - torque.t_ns <= source.fresh_s(config) * 1e9:
+        if t_ns - torque.t_ns <= source.fresh_s(watched.config) * 1e9:
             beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
             if source.noise_nm:
                 beyond += f" and its noise {source.noise_nm:g} N·m"
-            found.append(Fault(FaultCode.TORQUE_LIMIT, beyond, t_ns=torque.t_mid_ns))
-    if watched.grasp is Grasp.HELD and abs(watched.twisted_rad) > limit_rad:
-        clamped = "gripper" not in watched.required
-        since = "its angle began to count" if clamped else "the grip"
-        turned = f"turned by {watched.twisted_rad:+.3f} rad since {since}, the limit is {limit_rad:g} rad"
-        if clamped:
-            turned += "; if another tool has been clamped, `shearloop command release --yes` lets it count from 0"
-        found.append(Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None))
-    found += _device_faults(inputs, watched, t_ns)
-    for name, reason in inputs.died.items():
-        found.append(Fault(FaultCode.TASK_DIED, f"{name}: {reason}"))
-    longest_hang_s = watched.patience * LONGEST_HANG_S
-    if inputs.late_s > longest_hang_s - LONGEST_TICK_S:
-        stood = f"it stood still for {inputs.late_s + LONGEST_TICK_S:.1f} s, and {longest_hang_s:g} s are allowed"
-        found.append(Fault(FaultCode.DAEMON_PAUSED, stood))
-    elif inputs.late_s > watched.patience * LATEST_LOOP_S:
-        found.append(Fault(FaultCode.LOOP_LATE, f"the loop ran {inputs.late_s * 1e3:.0f} ms late"))
-    if inputs.recording_error:
-        found.append(Fault(FaultCode.RECORDING_FAILED, inputs.recording_error))
-    if watched.not_following:
-        found.append(Fault(FaultCode.NOT_FOLLOWING, watched.not_following, t_ns=t_ns))
-    if watched.overdue is not None:
-        found.append(Fault(FaultCode.STEP_OVERDUE, watched.overdue))
-    return found
+            yield Fault(FaultCode.TORQUE_LIMIT, beyond, t_ns=torque.t_mid_ns)
+
+
+def _angle_limit_fault(inputs: LatestInputs, watched: Watched, limit_rad: float, twisted_rad: float) -> Fault:
+    clamped = "gripper" not in watched.required
+    since = "its angle began to count" if clamped else "the grip"
+    turned = f"turned by {twisted_rad:+.3f} rad since {since}, the limit is {limit_rad:g} rad"
+    if clamped:
+        turned += "; if another tool has been clamped, `shearloop command release --yes` lets it count from 0"
+    return Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None)
+
+
+def _lateness_faults(late_s: float, patience: float) -> Iterator[Fault]:
+    longest_hang_s = patience * LONGEST_HANG_S
+    if late_s > longest_hang_s - LONGEST_TICK_S:
+        stood = f"it stood still for {late_s + LONGEST_TICK_S:.1f} s, and {longest_hang_s:g} s are allowed"
+        yield Fault(FaultCode.DAEMON_PAUSED, stood)
+    elif late_s > patience * LATEST_LOOP_S:
+        yield Fault(FaultCode.LOOP_LATE, f"the loop ran {late_s * 1e3:.0f} ms late")
 
 
 def _largest(inputs: LatestInputs, source: TorqueSource) -> TorqueSample | None:
@@ -108,8 +134,8 @@ def _largest(inputs: LatestInputs, source: TorqueSource) -> TorqueSample | None:
     return max(found, key=lambda one: abs(one.torque_nm or 0.0), default=inputs.torques.get(source.name))
 
 
-def _torque_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t_ns: int) -> list[Fault]:
-    source = watched.driving
+def _torque_faults(inputs: LatestInputs, watched: Watched, step: RunningStep, t_ns: int) -> list[Fault]:
+    source, config = watched.driving, watched.config
     # The age of a robot's torque is checked with its state.
     judged = (*(one for one in watched.supervising if not one.from_robot), source)
     faults = [_unusable(inputs, one, one.fresh_s(config), t_ns) for one in judged]
@@ -117,11 +143,11 @@ def _torque_faults(inputs: LatestInputs, watched: Watched, config: LoopConfig, t
     latest = inputs.torques.get(source.name)
     if faults[-1] is not None or latest is None or latest.torque_nm is None:
         return found
-    if watched.expected_nm is not None and abs(latest.torque_nm - watched.expected_nm) > config.max_innovation_nm:
-        jumped = f"{source.name} measured {latest.torque_nm:+.3f} N·m where {watched.expected_nm:+.3f} N·m was expected"
+    if step.expected_nm is not None and abs(latest.torque_nm - step.expected_nm) > config.max_innovation_nm:
+        jumped = f"{source.name} measured {latest.torque_nm:+.3f} N·m where {step.expected_nm:+.3f} N·m was expected"
         found.append(Fault(FaultCode.ESTIMATE_JUMPED, jumped, t_ns=latest.t_mid_ns))
     for other in watched.supervising:
-        found += _disagreement(inputs, other, watched, config, t_ns)
+        found += _disagreement(inputs, other, watched, t_ns)
     return found
 
 
@@ -153,11 +179,9 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, allowed_s: float, t_ns
     return None
 
 
-def _disagreement(
-    inputs: LatestInputs, other: TorqueSource, watched: Watched, config: LoopConfig, t_ns: int
-) -> list[Fault]:
+def _disagreement(inputs: LatestInputs, other: TorqueSource, watched: Watched, t_ns: int) -> list[Fault]:
     """Compare the driving torque with another, over the window of the slower source's latest sample."""
-    slow, fast = watched.driving, other
+    slow, fast, config = watched.driving, other, watched.config
     if slow.period_s < fast.period_s:
         slow, fast = fast, slow
     latest = inputs.torques.get(slow.name)
@@ -195,7 +219,7 @@ def _torque_at(inputs: LatestInputs, source: TorqueSource, t_ns: int, half_s: fl
     return torques_nm[nearest] if abs(times_ns[nearest] - t_ns) <= farthest_ns else None
 
 
-def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fault]:
+def _device_faults(inputs: LatestInputs, watched: Watched, step: RunningStep | None, t_ns: int) -> list[Fault]:
     arm, gripper, lost = inputs.arm, inputs.gripper, inputs.lost
     has_gripper = "gripper" in watched.required
     found: list[Fault] = []
@@ -221,7 +245,7 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
             code = FaultCode.ROBOT_UNCONTROLLED if arm.late else FaultCode.ROBOT_BLOCKED
             found.append(Fault(code, arm.blocked, t_ns=arm.t_ns))
     if gripper is not None and has_gripper:
-        found += _gripper_faults(gripper, watched, t_ns)
+        found += _gripper_faults(gripper, step, watched.patience, t_ns)
     for name, reason in lost.items():
         if name in watched.required and name not in awaited:
             gone = (FaultCode.ROBOT_LOST, reason) if name == "robot" else (FaultCode.DEVICE_LOST, f"{name}: {reason}")
@@ -229,15 +253,17 @@ def _device_faults(inputs: LatestInputs, watched: Watched, t_ns: int) -> list[Fa
     return found
 
 
-def _gripper_faults(gripper: GripperStatus, watched: Watched, t_ns: int) -> list[Fault]:
+def _gripper_faults(gripper: GripperStatus, step: RunningStep | None, patience: float, t_ns: int) -> list[Fault]:
     age_s = (t_ns - gripper.t_ns) / 1e9
-    if age_s > watched.patience * GRIPPER_STALE_S:
+    if age_s > patience * GRIPPER_STALE_S:
         silent = f"the gripper last reported its state {age_s:.1f} s ago"
         return [Fault(FaultCode.STATE_STALE, silent, t_ns=gripper.t_ns)]
     if gripper.fault:
         return [Fault(FaultCode.GRIPPER_FAULT, gripper.fault, t_ns=gripper.t_ns)]
-    if watched.others_requests not in (None, gripper.others_requests):
+    if step is None:
+        return []
+    if gripper.others_requests != step.others_requests:
         return [Fault(FaultCode.GRIPPER_COMMANDED, gripper.fingers, t_ns=gripper.t_ns)]
-    if watched.grasp is Grasp.HELD and not gripper.holding:
+    if step.grasp is Grasp.HELD and not gripper.holding:
         return [Fault(FaultCode.GRIP_LOST, gripper.fingers, t_ns=gripper.t_ns)]
     return []

@@ -27,9 +27,9 @@ def codes(patience: float, **changes: object) -> set[FaultCode]:
     """Return what is found of states that are half a second old."""
     arm, gripper = ArmStatus(0.0, 0), GripperStatus(0, 20.0, holding=False, moving=False)
     inputs = LatestInputs(10.0, arm=arm, gripper=gripper, **changes)
-    limits = ExperimentLimits()
-    watched = Watched(driving=EIT, supervising=(), limits=limits, required=("robot", "gripper"), patience=patience)
-    return {fault.code for fault in detect_faults(inputs, watched, LoopConfig(), SECOND // 2)}
+    required = ("robot", "gripper")
+    watched = Watched(driving=EIT, supervising=(), config=LoopConfig(), required=required, patience=patience)
+    return {fault.code for fault in detect_faults(inputs, watched, ExperimentLimits(), None, SECOND // 2)}
 
 
 @pytest.mark.parametrize(("late_s", "code"), [(0.2, FaultCode.LOOP_LATE), (0.5, FaultCode.DAEMON_PAUSED)])

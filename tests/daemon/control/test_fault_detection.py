@@ -4,7 +4,14 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
-from shearloop.daemon.control.fault_detection import ARM_STALE_S, Grasp, Watched, compared_for_s, detect_faults
+from shearloop.daemon.control.fault_detection import (
+    ARM_STALE_S,
+    Grasp,
+    RunningStep,
+    Watched,
+    compared_for_s,
+    detect_faults,
+)
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.safety import TABLE, Fault, FaultCode, Response
 from shearloop.daemon.control.wrench import publish_every, wrench_source
@@ -32,11 +39,16 @@ def faults(
     driving: TorqueSource = EIT,
     supervising: tuple[TorqueSource, ...] = (),
     t_ns: int = NOW_NS,
+    required: tuple[str, ...] = (),
     **changes: Any,
 ) -> list[Fault]:
     """Return what is detected while a gripped tool is twisted, unless something else is said."""
-    needs = {"limits": ExperimentLimits(), "torque_needed": True, "grasp": Grasp.HELD, **changes}
-    return detect_faults(senses, Watched(driving=driving, supervising=supervising, **needs), LoopConfig(), t_ns)
+    watched = Watched(driving=driving, supervising=supervising, config=LoopConfig(), required=required)
+    step = RunningStep(
+        torque_needed=True, grasp=Grasp.HELD, twisted_rad=0.0, expected_nm=None, not_following="", overdue=None,
+        others_requests=0,
+    )  # fmt: skip
+    return detect_faults(senses, watched, ExperimentLimits(), replace(step, **changes), t_ns)
 
 
 def found(

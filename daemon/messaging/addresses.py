@@ -15,6 +15,8 @@ LARGEST_PORT = 65535
 LONGEST_IPC = 107
 # Of the stop socket's name, which has the same bound.
 _NAME_BYTES = 80
+# The key of the address that a client of the stop socket asks for, and of a reply from a daemon at another one.
+ASKED, ELSEWHERE = "address", "elsewhere"
 # A running daemon answers within milliseconds.
 COMMAND_TIMEOUT_S = 2.0
 # The robot may have to power up, release its brakes and start its program, and the gripper to activate.
@@ -92,3 +94,22 @@ def network_refusal(address: str, key: str) -> str:
 def stop_name(address: str) -> bytes:
     """Return the abstract name of the stop socket of a daemon, by the port or the path of its `commands`."""
     return b"\0shearloop-stop-" + os.fsencode(address.rpartition(":")[2])[-_NAME_BYTES:]
+
+
+def is_reached(bound: str, asked: str) -> bool:
+    """Return whether a client of this machine that asks for an address reaches the server that is bound to another one.
+
+    Only the hosts are compared: another loopback address with the same port is another daemon's.
+    """
+    if not bound.startswith("tcp://"):
+        return True
+    own, host = urlsplit(bound).hostname, urlsplit(asked).hostname
+    if own in ("*", host):
+        return True
+    try:
+        ip = ipaddress.ip_address(own or "")
+        if ip.is_unspecified:
+            return True
+        return ip.is_loopback if host == "localhost" else ip == ipaddress.ip_address(host or "")
+    except ValueError:
+        return False

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import msgpack
 
-from shearloop.daemon.messaging.addresses import stop_name
+from shearloop.daemon.messaging.addresses import ASKED, ELSEWHERE, stop_name
 from shearloop.errors import UserError
 
 _IpAddress: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
@@ -84,7 +84,7 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
         client.bind("")
         try:
             # Without `connect`, after which only the bound socket itself could reply.
-            client.sendto(msgpack.packb(content), stop_name(address))
+            client.sendto(msgpack.packb({**content, ASKED: address}), stop_name(address))
         except ConnectionError:
             return None
         data, ancillary, _, _ = client.recvmsg(_LARGEST_REPLY_BYTES, socket.CMSG_SPACE(_CREDENTIALS.size))
@@ -99,9 +99,10 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
                 )
     try:
         # It has no arrays; `messages.decode` would import numpy.
-        return dict(msgpack.unpackb(data))
+        reply = dict(msgpack.unpackb(data))
     except (TypeError, ValueError) as error:
         raise foreign_reply(address, error) from error
+    return None if reply.get(ELSEWHERE) else reply
 
 
 def foreign_reply(address: str, error: Exception) -> UserError:

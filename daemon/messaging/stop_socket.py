@@ -11,8 +11,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from shearloop.daemon.messaging.addresses import stop_name
-from shearloop.daemon.messaging.command_server import Handler, Reply, RequestExecutor
+from shearloop.daemon.messaging.addresses import ASKED, ELSEWHERE, is_reached, stop_name
+from shearloop.daemon.messaging.command_server import Handler, Reply, Request, RequestExecutor
 from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.errors import UserError
@@ -25,6 +25,7 @@ class StopSocket:
 
     def __init__(self, address: str, handlers: Mapping[str, Handler], refusals: Refusals) -> None:
         """Bind the stop socket of the command address; raises UserError if another daemon has it."""
+        self._address = address
         self._requests = RequestExecutor(handlers, refusals)
         self._refusals = refusals
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -45,10 +46,17 @@ class StopSocket:
             # A datagram that has already arrived does not yield to other tasks.
             await asyncio.sleep(0)
             checked = self._requests.check(os.fsencode(client or ""), [data], time.monotonic_ns())
-            reply = checked if isinstance(checked, dict) else await self._requests.execute(*checked)
+            reply = checked if isinstance(checked, dict) else await self._execute(*checked)
             # A client without a name wants no reply.
             if client:
                 self._reply(client, reply)
+
+    async def _execute(self, name: str, request: Request) -> Reply:
+        """Carry out a request that is meant for this daemon: one at another address may have the same port."""
+        asked = request.get(ASKED)
+        if isinstance(asked, str) and not is_reached(self._address, asked):
+            return {"ok": False, "reason": f"this daemon is at {self._address}", ELSEWHERE: True}
+        return await self._requests.execute(name, {key: value for key, value in request.items() if key != ASKED})
 
     def _reply(self, client: Any, reply: Reply) -> None:
         try:

@@ -118,6 +118,26 @@ async def test_the_stop_socket_answers_in_a_flood_of_datagrams():
     assert stop_name("tcp://0.0.0.0:7762") == stop_name("tcp://127.0.0.1:7762")
 
 
+@pytest.mark.parametrize(
+    ("bound", "asked", "reached"),
+    [
+        ("tcp://127.0.0.22:{port}", "tcp://127.0.0.22:{port}", True),
+        ("tcp://127.0.0.22:{port}", "tcp://127.0.0.99:{port}", False),
+        ("tcp://127.0.0.22:{port}", "tcp://127.0.0.1:{port}", False),
+        ("tcp://0.0.0.0:{port}", "tcp://127.0.0.99:{port}", True),
+        ("tcp://127.0.0.1:{port}", "tcp://localhost:{port}", True),
+        ("tcp://[::1]:{port}", "tcp://[0:0:0:0:0:0:0:1]:{port}", True),
+    ],
+)
+async def test_a_stop_reaches_the_daemon_at_its_address_alone(bound, asked, reached):
+    """The stop socket's name has only the port."""
+    port = free_port()
+    async with stop_socket(bound.format(port=port), Refusals()):
+        request = {"command": "stop"}
+        reply = await asyncio.to_thread(send_to_stop_socket, asked.format(port=port), request, DEADLINE_S)
+        assert reply == ({"ok": True, "stopped": "test"} if reached else None)
+
+
 async def test_a_client_that_reads_no_replies_does_not_keep_those_of_others(capsys):
     address = f"tcp://127.0.0.1:{free_port()}"
     async with stop_socket(address, Refusals()):

@@ -11,15 +11,28 @@ if TYPE_CHECKING:
     from shearloop.estimation.fitting import adapt, fit
     from shearloop.estimation.load_delay import TRUSTED, LoadTiming, measure_timing
     from shearloop.estimation.session import Session
-    from shearloop.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, combine, torque_at
+    from shearloop.estimation.values import (
+        BeforeFrame,
+        Estimate,
+        FrameSeries,
+        HeldTool,
+        KnownTorques,
+        Measured,
+        TactileFrame,
+        combine,
+        torque_at,
+    )
 
 __all__ = [
     "TRUSTED",
     "Adaptation",
+    "BeforeFrame",
     "Calibration",
     "Estimate",
     "Estimator",
     "FrameSeries",
+    "HeldTool",
+    "KnownTorques",
     "LoadTiming",
     "Measured",
     "Physics",
@@ -34,10 +47,13 @@ __all__ = [
 
 _HOMES = {
     "Adaptation": "shearloop.estimation.adaptation:Adaptation",
+    "BeforeFrame": "shearloop.estimation.values:BeforeFrame",
     "Calibration": "shearloop.estimation.calibration:Calibration",
     "Estimate": "shearloop.estimation.values:Estimate",
     "Estimator": "shearloop.estimation.estimator:Estimator",
     "FrameSeries": "shearloop.estimation.values:FrameSeries",
+    "HeldTool": "shearloop.estimation.values:HeldTool",
+    "KnownTorques": "shearloop.estimation.values:KnownTorques",
     "LoadTiming": "shearloop.estimation.load_delay:LoadTiming",
     "Measured": "shearloop.estimation.values:Measured",
     "Physics": "shearloop.estimation.estimator:Physics",

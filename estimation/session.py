@@ -28,7 +28,7 @@ from shearloop.estimation.frame_checks import ChannelChecks, FrameTimer
 from shearloop.estimation.grip_memory import GripMemory
 from shearloop.estimation.grip_strength import strength_reasons
 from shearloop.estimation.idle_frames import IdleFrames
-from shearloop.estimation.values import Estimate, Measured, ProcessedFrame, TactileFrame
+from shearloop.estimation.values import BeforeFrame, Estimate, Measured, ProcessedFrame, TactileFrame
 from shearloop.words import counted
 
 if TYPE_CHECKING:
@@ -78,6 +78,25 @@ class Session:
         self._matcher = matcher or calibration.matcher(bank)
         self.set_tool(None)
         self.reset()
+
+    def prepare(self, before: BeforeFrame) -> Adaptation | Exception | None:
+        """Apply what comes before the next frame: first the tare, then the tool, then the gain.
+
+        Return the correction of the gain, if there is one, or why it failed: the frame does not depend on that. Give
+        `before.fingers_moved` to `estimate`, as a part of the frame.
+        """
+        if before.begins_tare:
+            self.tare()
+        if before.gives_up_tare:
+            self.give_up_tare()
+        if before.tool is not None:
+            self.set_tool(before.tool.diameter)
+        if before.known_torques is None:
+            return None
+        try:
+            return self.adapt(before.known_torques.torque_nm)
+        except Exception as error:  # noqa: BLE001 - whoever asked for the correction is told
+            return error
 
     def set_tool(self, tool: Measured | None) -> None:
         """Set the diameter in mm of the held tool, None where unknown."""
@@ -142,9 +161,14 @@ class Session:
     def adapt(self, torque_nm: FloatArray) -> Adaptation:
         """Correct the gain until the next grip or tare, by torques (n,) measured at `grip_t_s`, NaN where unknown.
 
-        Raises CalibrationError as `GripGain.correct` does, for a tool without a torque, and for a grip of a strength
-        that the calibration does not hold for: twists do not cure that.
+        Raises CalibrationError as `GripGain.correct` does, for a tool without a torque, for torques that are not of
+        this grip, and for a grip of a strength that the calibration does not hold for: twists do not cure that.
         """
+        if len(torque_nm) != len(self._gain.frames):
+            raise CalibrationError(
+                f"{len(torque_nm)} known torques do not match the {len(self._gain.frames)} frames of this grip; twist "
+                "again, then adapt"
+            )
         if self._tool_reasons:
             raise CalibrationError(self._tool_reasons[0])
         if reasons := strength_reasons(self._strengths):

@@ -145,6 +145,47 @@ class TactileFrame:
         return cls(t_s, channels, usable, fingers_moved=fingers_moved)
 
 
+@dataclass(frozen=True, slots=True)
+class HeldTool:
+    """What the fingers hold: the tool's diameter in mm, None where unknown."""
+
+    diameter: Measured | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownTorques:
+    """Torques (n,) in N·m of another source, `reference`, at the frames of this grip; NaN where unknown."""
+
+    reference: str
+    torque_nm: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeforeFrame:
+    """What a session has to know before a frame, and the frame does not contain. `Session.prepare` applies it.
+
+    begins_tare: the next frames are of untouched fingertips and make the idle frame. gives_up_tare: they do not, or not
+    any longer. tool: it has changed; None if not. fingers_moved: during a part of the frame's acquisition.
+    known_torques correct the gain of this grip.
+    """
+
+    begins_tare: bool = False
+    gives_up_tare: bool = False
+    tool: HeldTool | None = None
+    fingers_moved: bool = False
+    known_torques: KnownTorques | None = None
+
+    def with_later(self, later: "BeforeFrame") -> "BeforeFrame":
+        """Return both together: what this one and a later one say of the same frame."""
+        return BeforeFrame(
+            begins_tare=self.begins_tare or later.begins_tare,
+            gives_up_tare=self.gives_up_tare or later.gives_up_tare,
+            tool=later.tool or self.tool,
+            fingers_moved=self.fingers_moved or later.fingers_moved,
+            known_torques=later.known_torques or self.known_torques,
+        )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ProcessedFrame:
     """A frame after the session's checks, with the reasons against it.

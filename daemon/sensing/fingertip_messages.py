@@ -1,4 +1,4 @@
-"""Messages and recorded inputs of the EIT fingertips."""
+"""Messages of the EIT fingertips."""
 
 import asyncio
 from dataclasses import asdict
@@ -6,12 +6,9 @@ from operator import attrgetter
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.messaging.messages import EitAdapted, EitEstimate, EitFrame, EitHeatmap
 from shearloop.drivers.eit_kit import Frame
-from shearloop.estimation import Adaptation, Estimate, Measured, Session
-
-_GIVEN_UP = " given up"
+from shearloop.estimation import Adaptation, Estimate, Session
 
 
 def frame_message(name: str, frame: Frame) -> EitFrame:
@@ -45,28 +42,6 @@ async def heatmap_message(name: str, frame: Frame, session: Session) -> EitHeatm
         model=search.model,
         frame=frame.seq,
     )
-
-
-def torques_as_bytes(frame: int, reference: str, torque_nm: FloatArray) -> bytes:
-    """Return the raw event's data: the known torques (n,) of the grip that correct the gain from a frame on."""
-    return " ".join([str(frame), reference, *map(repr, torque_nm.tolist())]).encode()
-
-
-def torques_from_bytes(data: bytes) -> tuple[int, str, FloatArray]:
-    """Return the frame, the source and the torques (n,) of a raw event; raises ValueError for other data."""
-    frame, reference, *torques = data.decode().split()
-    return int(frame), reference, np.array(torques, dtype=np.float64)
-
-
-def tare_as_bytes(frame: int, *, given_up: bool = False) -> bytes:
-    """Return the raw event's data: the frame that a tare begins with, or before which an incomplete one is given up."""
-    return f"{frame}{_GIVEN_UP if given_up else ''}".encode()
-
-
-def tare_from_bytes(data: bytes) -> tuple[int, bool]:
-    """Return the frame of a tare, and whether it is given up there; raises ValueError for other data."""
-    text = data.decode()
-    return int(text.removesuffix(_GIVEN_UP)), text.endswith(_GIVEN_UP)
 
 
 def adapted_message(name: str, frames: tuple[Frame, ...], reference: str, adaptation: Adaptation) -> EitAdapted:
@@ -106,27 +81,3 @@ def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, n
         frame=frames[0].seq,
         latency_s=(now_ns - max(map(attrgetter("t_arrival_ns"), frames))) / 1e9,
     )
-
-
-def moved_as_bytes(frame: int) -> bytes:
-    """Return the raw event's data: a frame during which the gripper's fingers moved."""
-    return str(frame).encode()
-
-
-def moved_from_bytes(data: bytes) -> int:
-    """Return the frame of a raw event; raises ValueError for other data."""
-    return int(data.decode())
-
-
-def tool_as_bytes(frame: int, tool: Measured | None) -> bytes:
-    """Return the raw event's data: the tool that is held from a frame on."""
-    return (str(frame) if tool is None else f"{frame} {tool.value!r} {tool.half_width!r}").encode()
-
-
-def tool_from_bytes(data: bytes) -> tuple[int, Measured | None]:
-    """Return the frame and the tool of a raw event; raises ValueError for other data."""
-    frame, *tool = data.decode().split()
-    if not tool:
-        return int(frame), None
-    value, half_width = map(float, tool)
-    return int(frame), Measured(value, half_width)

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -11,21 +11,25 @@ import structlog
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.fingertip_messages import (
-    adapted_message,
-    estimate_message,
-    moved_as_bytes,
-    tare_as_bytes,
-    tool_as_bytes,
-    torques_as_bytes,
-)
+from shearloop.daemon.sensing.fingertip_messages import adapted_message, estimate_message
+from shearloop.daemon.sensing.session_inputs import session_inputs
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.sensing.zero_request import ZeroRequest, ZeroState
 from shearloop.daemon.torques import LONGEST_TARE_S, SensorListener, TorqueSample
 from shearloop.drivers.eit_kit import Frame
-from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
+from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.errors import ActionError
-from shearloop.estimation import Estimate, Measured, Session, TactileFrame, torque_at
+from shearloop.estimation import (
+    Adaptation,
+    BeforeFrame,
+    Estimate,
+    HeldTool,
+    KnownTorques,
+    Measured,
+    Session,
+    TactileFrame,
+    torque_at,
+)
 from shearloop.timeouts import timeout
 from shearloop.words import counted
 
@@ -110,27 +114,16 @@ class FingertipTask:
 
     async def process(self, *frames: Frame) -> None:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
-        number, now_ns = frames[0].seq, self.clock.now_ns()
-        # A replay tares, takes the held tool and the fingers' motion, and corrects the gain before the same frame.
-        self._follow_request(min(frame.t_begin_ns for frame in frames), number, now_ns)
-        self._refuse_held_tool(number, now_ns)
-        tool = self.gripper.held_tool(now_ns) if self.gripper is not None else None
-        if tool != self._held:
-            self._held = tool
-            self.session.set_tool(tool)
-            self._record(InputKind.TOOL, now_ns, tool_as_bytes(number, tool))
-        moved = self._fingers_moved(frames)
-        if moved:
-            self._record(InputKind.MOVED, now_ns, moved_as_bytes(number))
-        if self._adapting is not None:
-            reference, ended = self._adapting
-            if not ended.done():
-                try:
-                    self._adapt(reference, frames, now_ns)
-                    ended.set_result(None)
-                except Exception as error:  # noqa: BLE001 - it fails the step, and the frames go on
-                    ended.set_exception(error)
-        estimate = await estimate_frames(self.session, frames, fingers_moved=moved)
+        now_ns = self.clock.now_ns()
+        before = self._before(frames, now_ns)
+        corrected = self.session.prepare(before)
+        if isinstance(corrected, Exception):
+            # The gain is as before, for a replay too.
+            before = replace(before, known_torques=None)
+        self._record(frames, before, now_ns)
+        if corrected is not None:
+            self._end_correction(frames, corrected)
+        estimate = await estimate_frames(self.session, frames, fingers_moved=before.fingers_moved)
         now_ns = self.clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
         if self.loop is not None:
@@ -161,6 +154,59 @@ class FingertipTask:
         self._zero, self._refused = ZeroRequest(now_ns, now_ns + round(within_s * 1e9), self._zero), _RefusedFrames()
         return self._zero
 
+    def _before(self, frames: tuple[Frame, ...], now_ns: int) -> BeforeFrame:
+        """Return what the session has to know before frames, and bring the request for an idle frame up to them."""
+        begins, gives_up = self._follow_request(min(frame.t_begin_ns for frame in frames))
+        gives_up |= self._refuse_held_tool(taring=begins or (self.session.taring and not gives_up))
+        return BeforeFrame(
+            begins_tare=begins,
+            gives_up_tare=gives_up,
+            tool=self._changed_tool(now_ns),
+            fingers_moved=self._fingers_moved(frames),
+            known_torques=self._known_torques(),
+        )
+
+    def _follow_request(self, began_ns: int) -> tuple[bool, bool]:
+        """Bring the request for an idle frame up to a frame that began then.
+
+        Return whether the session's tare begins before the frame, and whether it is given up.
+        """
+        zero = self._zero
+        if zero is None:
+            return False, False
+        if zero.is_too_late(began_ns):
+            why = self._refused.sentence or "no frame came in time"
+            zero.expire(f"the idle frame of {self.name} was not taken: {why}")
+            structlog.get_logger().warning(zero.reason)
+        begins = zero.state is ZeroState.REQUESTED and began_ns >= zero.from_ns
+        if begins:
+            zero.collect()
+            self._unconfirmed = False
+        # Later frames could be of any load.
+        return begins, zero.state is ZeroState.EXPIRED and self.session.taring
+
+    def _refuse_held_tool(self, *, taring: bool) -> bool:
+        """Return whether the idle frame, which is being taken or unconfirmed, is one of a held tool; fail its request.
+
+        The gripper may not say yet.
+        """
+        holding = self.gripper.is_holding if self.gripper is not None else None
+        if holding is None:
+            return False
+        refused = holding and (taring or self._unconfirmed)
+        self._unconfirmed = False
+        if refused:
+            reason = f"{self.name} has no idle frame: the gripper holds something"
+            structlog.get_logger().warning(reason)
+            if self._zero is not None:
+                self._zero.fail(reason)
+        return refused
+
+    def _changed_tool(self, now_ns: int) -> HeldTool | None:
+        """Return what the gripper holds, None if it is what it was before the last frame."""
+        before, self._held = self._held, self.gripper.held_tool(now_ns) if self.gripper is not None else None
+        return None if self._held == before else HeldTool(self._held)
+
     def _fingers_moved(self, frames: tuple[Frame, ...]) -> bool:
         """Return whether the fingers moved during any part of the frames' acquisition."""
         if self.gripper is None:
@@ -169,40 +215,26 @@ class FingertipTask:
         ended_ns = max(2 * frame.t_mid_ns - frame.t_begin_ns for frame in frames)
         return self.gripper.moved_between(min(frame.t_begin_ns for frame in frames), ended_ns)
 
-    def _follow_request(self, began_ns: int, number: int, now_ns: int) -> None:
-        """Begin or give up the session's tare as the request for it says, before a frame that began then."""
-        zero = self._zero
-        if zero is None:
-            return
-        if zero.is_too_late(began_ns):
-            why = self._refused.sentence or "no frame came in time"
-            zero.expire(f"the idle frame of {self.name} was not taken: {why}")
-            structlog.get_logger().warning(zero.reason)
-        if zero.state is ZeroState.REQUESTED and began_ns >= zero.from_ns:
-            zero.collect()
-            self.session.tare()
-            self._record(InputKind.TARE, now_ns, tare_as_bytes(number))
-            self._unconfirmed = False
-        elif zero.state is ZeroState.EXPIRED and self.session.taring:
-            # Later frames could be of any load.
-            self._give_up_tare(number, now_ns)
+    def _known_torques(self) -> KnownTorques | None:
+        """Return the torques for the correction of the gain that somebody waits for, None without one."""
+        if self._adapting is None or self._adapting[1].done():
+            return None
+        reference, _ = self._adapting
+        times_ns, torques_nm = self.loop.torques_of(reference) if self.loop is not None else ([], [])
+        of_grip = torque_at(self.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
+        return KnownTorques(reference, of_grip)
 
-    def _refuse_held_tool(self, number: int, now_ns: int) -> None:
-        """Give up an idle frame that is one of a held tool, as far as the gripper says."""
-        holding = self.gripper.is_holding if self.gripper is not None else None
-        if holding is None:
+    def _end_correction(self, frames: tuple[Frame, ...], corrected: Adaptation | Exception) -> None:
+        """Publish a correction of the gain that begins with these frames; tell whoever waits for it how it ended."""
+        if self._adapting is None:
+            raise RuntimeError("nobody waits for a correction of the gain")
+        reference, ended = self._adapting
+        if isinstance(corrected, Exception):
+            # It fails the step, and the frames go on.
+            ended.set_exception(corrected)
             return
-        if holding and (self.session.taring or self._unconfirmed):
-            reason = f"{self.name} has no idle frame: the gripper holds something"
-            structlog.get_logger().warning(reason)
-            if self._zero is not None:
-                self._zero.fail(reason)
-            self._give_up_tare(number, now_ns)
-        self._unconfirmed = False
-
-    def _give_up_tare(self, number: int, now_ns: int) -> None:
-        self.session.give_up_tare()
-        self._record(InputKind.TARE, now_ns, tare_as_bytes(number, given_up=True))
+        self.publisher.publish(adapted_message(self.name, frames, reference, corrected))
+        ended.set_result(None)
 
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new idle frame and wait until it is complete; return None, or why it is not."""
@@ -224,13 +256,6 @@ class FingertipTask:
         finally:
             self._adapting = None
 
-    def _adapt(self, reference: str, frames: tuple[Frame, ...], now_ns: int) -> None:
-        times_ns, torques_nm = self.loop.torques_of(reference) if self.loop is not None else ([], [])
-        torque_nm = torque_at(self.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
-        adaptation = self.session.adapt(torque_nm)
-        self._record(InputKind.ADAPT, now_ns, torques_as_bytes(frames[0].seq, reference, torque_nm))
-        self.publisher.publish(adapted_message(self.name, frames, reference, adaptation))
-
     @property
     def wants_state(self) -> bool:
         """Whether a recording needs the state."""
@@ -242,9 +267,10 @@ class FingertipTask:
             state = {**others, "session": self.session}
             record_state(self.inputs, state, self.session.fixed, self.clock.now_ns())
 
-    def _record(self, kind: InputKind, t_ns: int, data: bytes) -> None:
+    def _record(self, frames: tuple[Frame, ...], before: BeforeFrame, t_ns: int) -> None:
         if self.inputs is not None:
-            self.inputs.record(RawEvent(kind, t_ns, data))
+            for event in session_inputs(frames[0].seq, before, t_ns):
+                self.inputs.record(event)
 
 
 def tactile_frame(frames: tuple[Frame, ...], *, fingers_moved: bool = False) -> TactileFrame:

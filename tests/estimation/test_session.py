@@ -8,7 +8,20 @@ import pytest
 from shearloop.bank.arrays import BoolArray
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import TRUSTED, Estimate, FrameSeries, Measured, Session, TactileFrame, fit, fitting
+from shearloop.estimation import (
+    TRUSTED,
+    Adaptation,
+    BeforeFrame,
+    Estimate,
+    FrameSeries,
+    HeldTool,
+    KnownTorques,
+    Measured,
+    Session,
+    TactileFrame,
+    fit,
+    fitting,
+)
 from shearloop.estimation.fingertip_validator import mask_unmeasured
 from shearloop.estimation.gain import ToolLaw
 from shearloop.estimation.session import FINGERS_MOVED
@@ -406,6 +419,41 @@ def test_a_session_settles_with_one_twist_and_adapts_by_the_next(motion_calibrat
     correction = session.adapt(torque_of_grip()).correction
     assert correction.twists == 1
     assert correction.factors.mean() == pytest.approx(1.3, abs=0.1)
+
+
+def test_what_comes_before_a_frame_is_applied_tool_first_and_gain_last(motion_calibration):
+    whole = twisting(seed=5)
+    half = len(whole.t_s) // 2
+    sessions = [Session(replace(motion_calibration, tools=LAW)) for _ in range(2)]
+    apart, together = sessions
+    for session in sessions:
+        session.set_tool(Measured(20.0, 0.5))
+        follow(session, whole.between(0, half))
+    known = KnownTorques("load_cell", 1.2 * np.interp(apart.grip_t_s, whole.torque_t_s, whole.torque_nm))
+    tool = Measured(30.0, 0.5)
+    apart.set_tool(tool)
+    expected = apart.adapt(known.torque_nm)
+    found = together.prepare(BeforeFrame(tool=HeldTool(tool), known_torques=known))
+    assert isinstance(found, Adaptation)
+    assert (found.correction.factors == expected.correction.factors).all()
+    rest = whole.between(half, len(whole.t_s))
+    assert follow(together, rest) == follow(apart, rest)
+    assert any(one.valid for one in follow(together, rest))
+
+
+def test_torques_of_a_grip_that_a_tare_ends_correct_no_gain(motion_calibration):
+    session = Session(motion_calibration)
+    whole = twisting(seed=5)
+    follow(session, whole.between(0, 60))
+    known = KnownTorques("load_cell", np.interp(session.grip_t_s, whole.torque_t_s, whole.torque_nm))
+    failed = session.prepare(BeforeFrame(begins_tare=True, known_torques=known))
+    assert isinstance(failed, CalibrationError)
+    assert "known torques do not match the 0 frames of this grip" in str(failed)
+    assert session.taring, "the tare does not depend on that"
+    assert session.prepare(BeforeFrame(gives_up_tare=True)) is None
+    assert not session.taring
+    session.prepare(BeforeFrame(begins_tare=True, gives_up_tare=True))
+    assert not session.taring, "the idle frame would be of a held tool"
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from pydantic_core import from_json
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.recorder import schema
-from shearloop.daemon.sensing.fingertip_messages import moved_from_bytes, tool_from_bytes
+from shearloop.daemon.sensing.session_inputs import before_frame
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import Measured
 from shearloop.tools.recordings.reader import open_recording, reading, unusable
@@ -112,10 +112,13 @@ class _Messages:
 
     def add_input(self, side: str, t_ns: int, content: Mapping[str, Any]) -> None:
         """Take the inputs of a side's estimator that are not frames."""
-        if content["kind"] == InputKind.TOOL.value:
-            self.tools.append((t_ns, tool_from_bytes(schema.input_event(content).data)[1]))
-        elif content["kind"] == InputKind.MOVED.value:
-            self.moved[side].add(moved_from_bytes(schema.input_event(content).data))
+        if content["kind"] not in (InputKind.TOOL.value, InputKind.MOVED.value):
+            return
+        number, before = before_frame(schema.input_event(content))
+        if before.tool is not None:
+            self.tools.append((t_ns, before.tool.diameter))
+        if before.fingers_moved:
+            self.moved[side].add(number)
 
     def left_out(self) -> Iterator[str]:
         """Yield how many readings of the load cell, and frames of each side, were not read, and why."""

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import structlog
 
-from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.clock import Clock, ClockReading
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging import messages
@@ -30,14 +29,11 @@ from shearloop.daemon.sensing.fingertip_messages import (
     estimate_message,
     frame_message,
     heatmap_message,
-    moved_from_bytes,
-    tare_from_bytes,
-    tool_from_bytes,
-    torques_from_bytes,
 )
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.load_cell_task import load_message
+from shearloop.daemon.sensing.session_inputs import SESSION_KINDS, before_frame
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session
 from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
 from shearloop.daemon.sensing.snapshots import SnapshotError, restored
@@ -47,7 +43,7 @@ from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
-from shearloop.estimation import Session
+from shearloop.estimation import BeforeFrame, HeldTool, Session
 from shearloop.mistakes import validated
 from shearloop.tools.recordings.message_content import ContentError
 from shearloop.tools.recordings.reader import open_recording, reading
@@ -74,15 +70,42 @@ class RecordedEvent:
 
 
 class ReplayEvents(NamedTuple):
-    """What frames do not contain: tares, tools, motion of the fingers, and known torques, by source with the frame.
+    """What the frames do not contain: by source, what comes before each.
 
     `frame_numbers` holds the frames' numbers by source and arrival, `sample_numbers` the skin samples' numbers by
     their time; they continue from file to file.
     """
 
-    before_frames: dict[str, list[tuple[int, InputKind, Any]]]
+    before_frames: dict[str, "RecordedBefore"]
     frame_numbers: dict[str, dict[int, int]]
     sample_numbers: dict[int, int]
+
+
+class RecordedBefore:
+    """What a recording says of one source's frames, by their numbers: what comes before each."""
+
+    def __init__(self) -> None:
+        self._before: dict[int, BeforeFrame] = {}
+        self._tools: list[tuple[int, HeldTool]] = []
+
+    def add(self, number: int, before: BeforeFrame) -> None:
+        """Take the next input."""
+        if before.tool is not None:
+            self._tools.append((number, before.tool))
+        self._before[number] = self._before.get(number, BeforeFrame()).with_later(replace(before, tool=None))
+
+    @property
+    def tares(self) -> list[int]:
+        """The numbers of the frames that tares begin with."""
+        return [number for number, before in self._before.items() if before.begins_tare]
+
+    def of(self, number: int, last: int) -> BeforeFrame:
+        """Return what comes before a frame and after the `last` one.
+
+        A later file of a run begins with the tool that is held then, and with the number of that tool's first frame.
+        """
+        tools = [tool for first, tool in self._tools if last < first <= number]
+        return replace(self._before.get(number, BeforeFrame()), tool=tools[-1] if tools else None)
 
 
 class RecordedRun:
@@ -148,9 +171,8 @@ class RecordedRun:
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
-        found = ReplayEvents(defaultdict(list), defaultdict(dict), {})
+        found = ReplayEvents(defaultdict(RecordedBefore), defaultdict(dict), {})
         for event in self.events() if self.has_inputs else ():
-            before = found.before_frames[event.source]
             with reading(self.path):
                 match event:
                     case RecordedEvent(topic=messages.EitFrame.topic, content=content):
@@ -158,18 +180,11 @@ class RecordedRun:
                         found.frame_numbers[event.source][arrival_ns] = content["frame"]
                     case RecordedEvent(topic=messages.SkinShear.topic, content=content):
                         found.sample_numbers[event.t_mono_ns] = content["sample"]
-                    # A load cell's has a raw value, and the skin's is empty.
-                    case RecordedEvent(raw=RawEvent(kind=InputKind.TARE, data=data)) if data.split(b" ")[0].isdigit():
-                        number, given_up = tare_from_bytes(data)
-                        before.append((number, InputKind.TARE, given_up))
-                    case RecordedEvent(raw=RawEvent(kind=InputKind.TOOL, data=data)):
-                        number, tool = tool_from_bytes(data)
-                        before.append((number, InputKind.TOOL, tool))
-                    case RecordedEvent(raw=RawEvent(kind=InputKind.MOVED, data=data)):
-                        before.append((moved_from_bytes(data), InputKind.MOVED, None))
-                    case RecordedEvent(raw=RawEvent(kind=InputKind.ADAPT, data=data)):
-                        number, *known = torques_from_bytes(data)
-                        before.append((number, InputKind.ADAPT, known))
+                    # The tares of the load cell and of the skin are of no frame.
+                    case RecordedEvent(source=source, raw=RawEvent(kind=kind) as raw) if (
+                        kind in SESSION_KINDS and source not in (LOAD_CELL, SKIN)
+                    ):
+                        found.before_frames[source].add(*before_frame(raw))
         return found
 
 
@@ -410,23 +425,20 @@ class Replay:
         return replace(message, sample=message.sample + self._number_offset[SKIN])
 
     async def _estimate(self, source: str, *frames: Frame) -> None:
-        session, number, moved = self._sessions[source], frames[0].seq, False
-        for first, kind, value in self._events.before_frames.get(source, ()):
-            # Of a later file's tools, the first may be held since the file before.
-            if kind is InputKind.TOOL and self._latest_frame.get(source, -1) < first <= number:
-                session.set_tool(value)
-            elif kind is InputKind.TARE and first == number:
-                # `value`: whether one that is not complete is given up.
-                if value:
-                    session.give_up_tare()
-                else:
-                    session.tare()
-            elif kind is InputKind.MOVED and first == number:
-                moved = True
-            elif kind is InputKind.ADAPT and first == number:
-                self._adapt(source, frames, *value)
+        session, number = self._sessions[source], frames[0].seq
+        before = self._events.before_frames[source].of(number, self._latest_frame.get(source, -1))
         self._latest_frame[source] = number
-        estimate = await estimate_frames(session, frames, fingers_moved=moved)
+        known = before.known_torques
+        if known is not None and len(known.torque_nm) != len(session.grip_t_s):
+            reason = "the recording begins in the middle of the grip, so the correction of its gain is left out"
+            structlog.get_logger().warning(reason, source=source, frame=number)
+            before = replace(before, known_torques=None)
+        corrected = session.prepare(before)
+        if isinstance(corrected, Exception):
+            raise corrected
+        if known is not None and corrected is not None:
+            self._publisher.publish(adapted_message(source, frames, known.reference, corrected))
+        estimate = await estimate_frames(session, frames, fingers_moved=before.fingers_moved)
         # The replayed latency is 0; the recording holds the live one.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)
         self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))
@@ -435,14 +447,6 @@ class Replay:
         heatmap = await heatmap_message(source, frame, self._sessions[source])
         if heatmap is not None:
             self._publisher.publish(heatmap)
-
-    def _adapt(self, source: str, frames: tuple[Frame, ...], reference: str, torque_nm: FloatArray) -> None:
-        session = self._sessions[source]
-        if len(session.grip_t_s) != len(torque_nm):
-            reason = "the recording begins in the middle of the grip, so the correction of its gain is left out"
-            structlog.get_logger().warning(reason, source=source, frame=frames[0].seq)
-            return
-        self._publisher.publish(adapted_message(source, frames, reference, session.adapt(torque_nm)))
 
 
 def _live_event(topic: str, content: dict[str, Any]) -> RecordedEvent:

@@ -16,9 +16,9 @@ from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.finger_motion import FingerMotion
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes
-from shearloop.daemon.sensing.fingertip_messages import moved_from_bytes, tare_from_bytes
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
+from shearloop.daemon.sensing.session_inputs import before_frame
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.defaults import FRAME_PERIOD_S
@@ -26,7 +26,7 @@ from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperState, ObjectStatus, fault_of
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import ActionError
-from shearloop.estimation import Estimate, TactileFrame
+from shearloop.estimation import Estimate, Session, TactileFrame
 from tests.running import running
 
 MS = 1_000_000
@@ -73,6 +73,8 @@ class FakeSession:
         self.search = None if waits < 0 else self
         self.tared_before: list[int] = []
         self._tared = False
+
+    prepare = Session.prepare
 
     def tare(self) -> None:
         self._tared = True
@@ -135,6 +137,13 @@ def estimates(
     name: str, publisher: RecordingPublisher, session: FakeSession, clock: Clock | None = None, **options: Any
 ) -> FingertipTask:
     return FingertipTask(name, session, publisher, clock or Clock(), **options)
+
+
+def tare_in(event: RawEvent) -> tuple[int, str]:
+    """Return the frame of a recorded tare, and whether it begins or is given up before it."""
+    number, before = before_frame(event)
+    assert before.begins_tare is not before.gives_up_tare
+    return number, "begins" if before.begins_tare else "given up"
 
 
 def gripper_state(t_ns: int, status: ObjectStatus) -> GripperState:
@@ -387,7 +396,7 @@ async def test_a_session_that_begins_with_an_idle_frame_takes_none_after_a_tare_
     for number in (0, 1):
         await task.process(frame(number, clock.t_ns + PERIOD_NS + 80 * MS))
     assert session.given_up == 1
-    assert [tare_from_bytes(one.data) for one in raw] == [(0, True)], "as a replay finds it"
+    assert [tare_in(one) for one in raw] == [(0, "given up")], "as a replay finds it"
     assert log.said == ["the idle frame of right was not taken: no frame came in time"]
 
 
@@ -415,10 +424,7 @@ async def test_a_tare_that_lost_its_board_on_the_way_gives_no_estimate_until_the
     for number in (1, 2):
         await task.process(frame(number, clock.t_ns + PERIOD_NS + 80 * MS))
     assert session.given_up == 1
-    assert [(one.kind, tare_from_bytes(one.data)) for one in raw] == [
-        (InputKind.TARE, (0, False)),
-        (InputKind.TARE, (1, True)),
-    ], "as a replay finds it"
+    assert [tare_in(one) for one in raw] == [(0, "begins"), (1, "given up")], "as a replay finds it"
     assert log.said == ["the idle frame of right was not taken: 1 frame: nothing"]
 
 
@@ -433,7 +439,7 @@ async def test_no_idle_frame_is_of_a_gripped_tool(complete, said, log):
         # It may have been completed before the gripper was connected.
         session.taring = session.taring and not complete
     assert session.given_up == 1
-    assert [tare_from_bytes(one.data) for one in raw] == [(len(said) - 1, True)], "as a replay finds it"
+    assert [tare_in(one) for one in raw] == [(len(said) - 1, "given up")], "as a replay finds it"
     assert log.said == ["right has no idle frame: the gripper holds something"]
 
 
@@ -481,7 +487,7 @@ async def test_a_frame_is_of_moving_fingers_if_they_moved_during_any_part_of_its
     task = estimates(COMBINED, RecordingPublisher(), Seeing(), clock, gripper=gripper, inputs=inputs)
     await task.process(frame(7, arrives_ns), frame(7, arrives_ns))
     assert seen == [moved]
-    assert [(one.kind, moved_from_bytes(one.data)) for one in raw] == [(InputKind.MOVED, 7)] * moved
+    assert [(one.kind, before_frame(one)[0]) for one in raw] == [(InputKind.MOVED, 7)] * moved
 
 
 async def test_a_pair_is_of_moving_fingers_if_one_of_its_frames_is():

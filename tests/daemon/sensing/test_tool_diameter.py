@@ -1,10 +1,7 @@
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from shearloop.daemon.control.fingertip_diameters import STALE_AFTER_NS, FingertipDiameters
-from shearloop.daemon.sensing.fingertip_messages import tool_as_bytes, tool_from_bytes
-from shearloop.estimation import Estimate, Measured
+from shearloop.estimation import Estimate
 
 
 def estimate(diameter_mm: float, half_width_mm: float) -> Estimate:
@@ -42,17 +39,3 @@ def test_what_is_old_or_taken_back_is_no_diameter():
     assert diameters.latest(STALE_AFTER_NS + 1) is None
     diameters.update("right", Estimate(valid=False), 1)
     assert diameters.latest(1) is None
-
-
-POSITIVE = st.floats(0.0, allow_nan=False, allow_infinity=False)
-
-
-@given(st.integers(0), st.none() | st.builds(Measured, POSITIVE, POSITIVE))
-def test_a_tool_is_read_from_a_recording_as_it_was_written(frame, tool):
-    assert tool_from_bytes(tool_as_bytes(frame, tool)) == (frame, tool)
-
-
-@pytest.mark.parametrize("text", [b"", b"x", b"3 20", b"3 20 x", b"3 20 1 1"])
-def test_what_is_no_tool_is_none(text):
-    with pytest.raises(ValueError):  # noqa: PT011 - the recording's reader says where
-        tool_from_bytes(text)

@@ -281,7 +281,7 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     live = asyncio.run(record_experiments(config(recording={"folder": "recordings"})))
     (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
     before = RecordedRun(later).replay_events().before_frames["right"]
-    (zeroed,) = (frame for frame, kind, _ in before if kind is InputKind.TARE)
+    (zeroed,) = before.tares
     assert zeroed >= ZEROED
     held: list[object] = []
     set_tool = Session.set_tool

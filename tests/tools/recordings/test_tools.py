@@ -10,10 +10,10 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
 from shearloop.daemon.recorder.recorder import Identity, Recorder
 from shearloop.daemon.recorder.schema import basic_identity
-from shearloop.daemon.sensing.fingertip_messages import moved_as_bytes, tool_as_bytes
+from shearloop.daemon.sensing.session_inputs import session_inputs
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
-from shearloop.estimation import Measured
+from shearloop.estimation import BeforeFrame, HeldTool, Measured
 from shearloop.tools.frame_series import read_series, series_of
 from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.summary import summarise
@@ -46,10 +46,10 @@ def recorded(
         clock.t_ns += PERIOD_NS
         recorder.input_recorder("right").record(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
         if number in values:
-            tool = tool_as_bytes(number, values[number])
-            recorder.input_recorder("right").record(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool))
+            (event,) = session_inputs(number, BeforeFrame(tool=HeldTool(values[number])), clock.t_ns - PERIOD_NS // 2)
+            recorder.input_recorder("right").record(event)
         if number in moved:
-            event = RawEvent(InputKind.MOVED, clock.t_ns, moved_as_bytes(number))
+            (event,) = session_inputs(number, BeforeFrame(fingers_moved=True), clock.t_ns)
             recorder.input_recorder("right").record(event)
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
         t_ns = clock.t_ns - PERIOD_NS // 2

@@ -187,9 +187,9 @@ class Estimator(ABC):
         return np.array([features[:, 0].min(), features[:, 0].max()]) if self.needs == "bank" else np.zeros(0)
 
     def fit_torque(
-        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
+        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, grips: IntArray
     ) -> tuple[Self, IntervalRegressor, float]:
-        """Return the torque's regressor on frames of numbered recordings (n,), and the estimator as it uses them.
+        """Return the torque's regressor on frames of numbered grips (n,), and the estimator as it uses them.
 
         The third value is the share of the torque's variance that a tool's motion leaves unexplained on frames left
         out, 0 where that is not tested.
@@ -206,7 +206,7 @@ class Estimator(ABC):
             limit_features=self.limits_features,
             left_out=later_origins(len(torque_nm)),
             bounds=bounds,
-            recordings=recordings,
+            grips=grips,
             fingertips=len(self.scale),
         )
         return self, regressor, 0.0

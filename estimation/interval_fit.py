@@ -46,7 +46,7 @@ def fit_interval_regressor(
     left_out: LeftOut = (),
     twists: LeftOut = (),
     bounds: tuple[FloatArray, FloatArray] | None = None,
-    recordings: IntArray | None = None,
+    grips: IntArray | None = None,
     fingertips: int = 1,
 ) -> IntervalRegressor:
     """Fit to (n, d) features and (n,) values in time order.
@@ -54,8 +54,8 @@ def fit_interval_regressor(
     `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With `twists`
     instead each pair with a load counts as one error, because the frames of a twist err alike. `bounds` are the least
     and largest value (n,) that each frame may have: intervals extend to the further one. With the number of each row's
-    recording, `recordings` (n,), intervals allow for the gain of another recording of as many `fingertips`. Raises
-    CalibrationError where the data does not determine the fit.
+    grip, `grips` (n,), intervals allow for the gain of another grip of as many `fingertips`. Raises CalibrationError
+    where the data does not determine the fit.
     """
     check_values(values)
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
@@ -90,10 +90,10 @@ def fit_interval_regressor(
         widening = float(intervals.half_widths[-1] / known)
     span = ValueRange(float(values.min()), float(values.max()))
     gain = GainSpread()
-    if recordings is not None:
-        gains = _gains_of_recordings(features, values, recordings, refit)
-        halves = _gains_of_halves(features, values, recordings, refit)
-        gain = _spread_of_gain(values, recordings, rows, reported, gains, halves, fingertips)
+    if grips is not None:
+        gains = _gains_of_grips(features, values, grips, refit)
+        halves = _gains_of_halves(features, values, grips, refit)
+        gain = _spread_of_gain(values, grips, rows, reported, gains, halves, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain)
 
 
@@ -110,11 +110,11 @@ def _inflation_of_twists(values: FloatArray, twists: LeftOut) -> float:
     return student_inflation(sum(bool(np.isin(part, loads).any()) for _, part in twists))
 
 
-def _gains_of_recordings(features: FloatArray, values: FloatArray, recordings: IntArray, refit: Refit) -> list[float]:
-    """Return the logarithm of the gain of each recording that the others can predict."""
+def _gains_of_grips(features: FloatArray, values: FloatArray, grips: IntArray, refit: Refit) -> list[float]:
+    """Return the logarithm of the gain of each grip that the others can predict."""
     gains: list[float] = []
     least = LOADED_SHARE * float(np.abs(values).max())
-    for kept, out in left_out_groups(recordings):
+    for kept, out in left_out_groups(grips):
         if len(kept) and np.ptp(values[kept]) > 0 and np.abs(values[out]).max() > least:
             part = refit(kept)
             gain = loaded_log_gain(reported_values(part, part.predict(features[out])), values[out])
@@ -152,18 +152,18 @@ def _halves(rows: IntArray, twists: Sequence[IntArray]) -> Iterator[tuple[IntArr
 
 def _spread_of_gain(
     values: FloatArray,
-    recordings: IntArray,
+    grips: IntArray,
     rows: IntArray,
     predicted: FloatArray,
     gains: Sequence[float],
     halves: Sequence[float],
     fingertips: int,
 ) -> GainSpread:
-    """Return the spread of the gain from the predictions of left-out rows, and gains of recordings and halves."""
+    """Return the spread of the gain from the predictions of left-out rows, and the gains of grips and half grips."""
     order = np.argsort(rows, kind="stable")
     rows, predicted = rows[order], predicted[order]
-    is_first = first_twists(values, recordings)
-    return GainSpread.fit(predicted, values[rows], recordings[rows], is_first[rows], gains, halves, fingertips)
+    is_first = first_twists(values, grips)
+    return GainSpread.fit(predicted, values[rows], grips[rows], is_first[rows], gains, halves, fingertips)
 
 
 def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:

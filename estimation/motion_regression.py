@@ -192,7 +192,7 @@ class MotionRegression(Estimator):
         return TWO_SIDED_95 * math.sqrt(weights @ weights)
 
     def fit_torque(
-        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, recordings: IntArray
+        self, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, grips: IntArray
     ) -> tuple[Self, IntervalRegressor, float]:
         """Return the torque's regressor, and the estimator with the chosen features."""
         from shearloop.estimation.interval_fit import fit_interval_regressor
@@ -211,7 +211,7 @@ class MotionRegression(Estimator):
         chosen = with_position if _reads_position(alone, with_position, torque_nm) else alone
         regressor = fit_interval_regressor(
             features[:, chosen.columns], torque_nm, chosen.fit_used, strengths=(0.0,), limit_features=True,
-            twists=twists, bounds=bounds, recordings=recordings, fingertips=len(temporal.directions),
+            twists=twists, bounds=bounds, grips=grips, fingertips=len(temporal.directions),
         )  # fmt: skip
         return replace(self, temporal=temporal.reduced(chosen)), regressor, chosen.squared_error / variance
 

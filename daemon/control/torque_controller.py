@@ -174,7 +174,8 @@ class TorqueFilter:
     ) -> None:
         """Begin at a wrist angle and its torque, known as well as the mean of `known_measurements`."""
         self.offset_nm = torque_nm
-        self.creep_nm = 0.0  # per measurement
+        # Of the torque at a fixed angle, from one measurement to the next.
+        self.drift_nm = 0.0
         # The arrival of the latest measurement.
         self.fresh_ns: int | None = None
         # The torque at a fixed angle has moved too far since the loop was closed.
@@ -186,7 +187,7 @@ class TorqueFilter:
         self._settings = settings
         self._reference_nm = torque_nm
         # The offset is a weighted mean of measurements: its variance relative to one measurement, and their mean angle.
-        self._mean = 1.0 / max(known_measurements, _UNKNOWN), angle_rad
+        self._variance_ratio, self._mean_angle_rad = 1.0 / max(known_measurements, _UNKNOWN), angle_rad
         self._jumps = JumpDetector()
         self._t_mid_ns = t_ns
 
@@ -196,9 +197,9 @@ class TorqueFilter:
 
     def std_nm(self, angle_rad: float) -> float:
         """Return the standard deviation of `expected_nm` that noise and the stiffness's error cause."""
-        variance, mean_rad = self._mean
-        from_noise_nm = math.sqrt(variance) * self._settings.noise_nm
-        return math.hypot(from_noise_nm, self._settings.stiffness_std_nm_per_rad * (angle_rad - mean_rad))
+        from_noise_nm = math.sqrt(self._variance_ratio) * self._settings.noise_nm
+        turned_rad = angle_rad - self._mean_angle_rad
+        return math.hypot(from_noise_nm, self._settings.stiffness_std_nm_per_rad * turned_rad)
 
     @property
     def not_following(self) -> str:
@@ -214,42 +215,43 @@ class TorqueFilter:
         It cannot if it is no number, not later than the one before, stamped in the future, too old, or from a time at
         which the wrist angle is not known. The drift is learnt while the loop `integrates`.
         """
-        own = self._settings
+        settings = self._settings
         if torque_nm is None or not math.isfinite(torque_nm) or not self._t_mid_ns < t_mid_ns <= t_ns:
             return False
-        if t_ns - t_mid_ns > own.age_limit_s * 1e9:
+        if t_ns - t_mid_ns > settings.age_limit_s * 1e9:
             return False
-        middle_ns, half_ns = t_mid_ns - int(own.lag_s * 1e9), int(own.window_s * 0.5e9)
+        middle_ns, half_ns = t_mid_ns - int(settings.lag_s * 1e9), int(settings.window_s * 0.5e9)
         angle = self.angles.mean(middle_ns - half_ns, middle_ns + half_ns)
         if angle is None:
             return False
-        missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / own.sample_period_s) - 1, _MOST_MISSED)
+        missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / settings.sample_period_s) - 1, _MOST_MISSED)
         if self.fresh_ns is not None and missed > 0:
-            self.offset_nm += self.creep_nm * missed
+            self.offset_nm += self.drift_nm * missed
         self._correct(torque_nm - self.expected_nm(angle), angle, integrates=integrates)
-        self.slipped |= abs(self.offset_nm - self._reference_nm) > own.offset_limit_nm
+        self.slipped |= abs(self.offset_nm - self._reference_nm) > settings.offset_limit_nm
         self._t_mid_ns, self.fresh_ns = t_mid_ns, t_ns
         return True
 
     def _correct(self, innovation_nm: float, angle_rad: float, *, integrates: bool) -> None:
         """Correct the offset by an innovation at a mean angle: by its Kalman gain, or all of it after a jump."""
-        own = self._settings
-        variance, mean_rad = self._mean
-        if own.noise_nm:
-            uncertain = variance + (own.stiffness_std_nm_per_rad * (angle_rad - mean_rad) / own.noise_nm) ** 2
-            sigmas = innovation_nm / (own.noise_nm * math.sqrt(1.0 + uncertain))
+        settings = self._settings
+        turned_rad = angle_rad - self._mean_angle_rad
+        # s²/σ² of the module's docstring.
+        ratio = self._variance_ratio
+        if settings.noise_nm:
+            ratio += (settings.stiffness_std_nm_per_rad * turned_rad / settings.noise_nm) ** 2
+            sigmas = innovation_nm / (settings.noise_nm * math.sqrt(1.0 + ratio))
             if jumped := self._jumps.add(sigmas, self.offset_nm + innovation_nm):
                 self._jump(jumped, angle_rad)
                 return
-        else:
-            uncertain = variance
-        gain = max(own.kp, uncertain / (1.0 + uncertain))
-        bounded = max(-own.innovation_limit_nm, min(own.innovation_limit_nm, innovation_nm))
-        if gain == own.kp and integrates:
-            most = own.creep_limit_nm_per_s * own.sample_period_s
-            self.creep_nm = max(-most, min(most, self.creep_nm + own.ki * bounded))
-        self.offset_nm += gain * bounded + self.creep_nm
-        self._mean = (1.0 - gain) ** 2 * variance + gain**2, mean_rad + gain * (angle_rad - mean_rad)
+        gain = max(settings.kp, ratio / (1.0 + ratio))
+        bounded = max(-settings.innovation_limit_nm, min(settings.innovation_limit_nm, innovation_nm))
+        if gain == settings.kp and integrates:
+            most = settings.creep_limit_nm_per_s * settings.sample_period_s
+            self.drift_nm = max(-most, min(most, self.drift_nm + settings.ki * bounded))
+        self.offset_nm += gain * bounded + self.drift_nm
+        self._variance_ratio = (1.0 - gain) ** 2 * self._variance_ratio + gain**2
+        self._mean_angle_rad += gain * turned_rad
 
     def _jump(self, offsets_nm: list[float], angle_rad: float) -> None:
         """Restart from the mean of the latest offsets, as many as most likely came after the jump."""
@@ -258,7 +260,8 @@ class TorqueFilter:
             return math.sqrt(count) * abs(fmean(offsets_nm[-count:]) - self.offset_nm)
 
         count = max(range(1, len(offsets_nm) + 1), key=sigmas)
-        self.offset_nm, self._mean = fmean(offsets_nm[-count:]), (1.0 / count, angle_rad)
+        self.offset_nm = fmean(offsets_nm[-count:])
+        self._variance_ratio, self._mean_angle_rad = 1.0 / count, angle_rad
 
 
 class TorqueController:
@@ -289,7 +292,7 @@ class TorqueController:
         self.ramp_nm: float | None = None
         self._angle_rad = angle_rad
         self._t_ns = t_ns
-        self._wanted = self._sent = 0.0
+        self._wanted_rad_per_s = self._sent_rad_per_s = 0.0
         # Less was sent than was wanted; nothing is integrated then.
         self._clipped = False
 
@@ -329,7 +332,7 @@ class TorqueController:
         The torques come after the angle, which their windows need, and before the decision. The speed is 0 while
         anything forbids motion, and never exceeds the limit. It counts as sent until `sent` corrects it.
         """
-        own, tool = self.settings, self.filter
+        settings, tool = self.settings, self.filter
         elapsed_s = min(max(t_ns - self._t_ns, 0), LONGEST_STEP_NS) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
         reasons = []
@@ -349,7 +352,7 @@ class TorqueController:
             reasons.append(ControllerReason.NO_SET_POINT)
         if tool.fresh_ns is None:
             reasons.append(ControllerReason.NOT_MEASURED)
-        elif t_ns - tool.fresh_ns > own.stale_periods * own.sample_period_s * 1e9:
+        elif t_ns - tool.fresh_ns > settings.stale_periods * settings.sample_period_s * 1e9:
             reasons.append(ControllerReason.STALE)
         if tool.slipped:
             reasons.append(ControllerReason.NOT_FOLLOWING)
@@ -360,46 +363,54 @@ class TorqueController:
 
     def sent(self, speed_rad_per_s: float) -> None:
         """Correct the speed that was sent for the last command, after clipping by driver and safety."""
-        self._sent = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
-        self._clipped = abs(self._sent - self._wanted) > 1e-9 and abs(self._sent) < abs(self._wanted)
+        self._sent_rad_per_s = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
+        is_slower = abs(self._sent_rad_per_s) < abs(self._wanted_rad_per_s)
+        self._clipped = is_slower and abs(self._sent_rad_per_s - self._wanted_rad_per_s) > 1e-9
 
     def _rest(self) -> None:
         """Stand still; the next ramp begins at the present torque."""
         self._moving = self._clipped = False
-        self._wanted = self._sent = 0.0
+        self._wanted_rad_per_s = self._sent_rad_per_s = 0.0
         if self.set_point_nm is not None:
             self.ramp_nm = self.torque_nm
 
     def _drive(self, set_point_nm: float, elapsed_s: float) -> WristCommand:
-        own = self.settings
+        settings = self.settings
         before_nm = self.torque_nm if self.ramp_nm is None else self.ramp_nm
-        self.ramp_nm, slope = self._advance_ramp(before_nm, set_point_nm, elapsed_s)
+        self.ramp_nm, slope_nm_per_s = self._advance_ramp(before_nm, set_point_nm, elapsed_s)
         missing_nm = self.ramp_nm - self.torque_nm
-        bound_nm = own.deadband_nm * (_SETTLED_SHARE if self._moving else 1.0)
-        self._moving = slope != 0.0 or abs(missing_nm) > bound_nm
-        wanted = 0.0
+        bound_nm = settings.deadband_nm * (_SETTLED_SHARE if self._moving else 1.0)
+        self._moving = slope_nm_per_s != 0.0 or abs(missing_nm) > bound_nm
+        wanted_rad_per_s = 0.0
         if self._moving:
-            wanted = (own.wrist_bandwidth_per_s * missing_nm + slope) / own.stiffness_nm_per_rad
-        clipped = own.wrist_limit.clip(wanted)
-        reasons = [ControllerReason.SPEED] if clipped != wanted else []
-        speed = own.wrist_limit.speed_up(self._sent, clipped, elapsed_s)
+            wanted_nm_per_s = settings.wrist_bandwidth_per_s * missing_nm + slope_nm_per_s
+            wanted_rad_per_s = wanted_nm_per_s / settings.stiffness_nm_per_rad
+        clipped_rad_per_s = settings.wrist_limit.clip(wanted_rad_per_s)
+        reasons = [ControllerReason.SPEED] if clipped_rad_per_s != wanted_rad_per_s else []
+        speed_rad_per_s = settings.wrist_limit.speed_up(self._sent_rad_per_s, clipped_rad_per_s, elapsed_s)
         # Slow down towards the limit of the travel, so that one period does not overshoot it.
-        travel = self._angle_rad - self.filter.origin_rad
-        room = max(own.travel_limit_rad - travel * math.copysign(1.0, speed), 0.0)
-        brakeable = own.wrist_bandwidth_per_s * room
-        if abs(speed) > brakeable:
+        travel_rad = self._angle_rad - self.filter.origin_rad
+        room_rad = max(settings.travel_limit_rad - travel_rad * math.copysign(1.0, speed_rad_per_s), 0.0)
+        brakeable_rad_per_s = settings.wrist_bandwidth_per_s * room_rad
+        if abs(speed_rad_per_s) > brakeable_rad_per_s:
             reasons.append(ControllerReason.TRAVEL)
-            speed = math.copysign(brakeable, speed)
-        self._wanted, self._sent, self._clipped = wanted, speed, abs(wanted) - abs(speed) > 1e-9
-        return WristCommand(speed, tuple(reasons))
+            speed_rad_per_s = math.copysign(brakeable_rad_per_s, speed_rad_per_s)
+        self._wanted_rad_per_s, self._sent_rad_per_s = wanted_rad_per_s, speed_rad_per_s
+        self._clipped = abs(wanted_rad_per_s) - abs(speed_rad_per_s) > 1e-9
+        return WristCommand(speed_rad_per_s, tuple(reasons))
 
     def _advance_ramp(self, ramp_nm: float, set_point_nm: float, elapsed_s: float) -> tuple[float, float]:
         """Return the ramp, moved no further than the wrist was commanded to turn, and its slope in N·m/s."""
-        own = self.settings
-        blocked = self._sent == 0.0 and self._wanted != 0.0
+        settings = self.settings
+        blocked = self._sent_rad_per_s == 0.0 and self._wanted_rad_per_s != 0.0
         if blocked or elapsed_s <= 0.0:
             return ramp_nm, 0.0
         towards = math.copysign(1.0, set_point_nm - ramp_nm)
-        turning = max(self._sent * towards, 0.0) + own.wrist_limit.acceleration_rad_per_s2 * elapsed_s
-        slope = min(own.ramp_nm_per_s, own.stiffness_nm_per_rad * turning, abs(set_point_nm - ramp_nm) / elapsed_s)
-        return ramp_nm + towards * slope * elapsed_s, towards * slope
+        speed_up_rad_per_s = settings.wrist_limit.acceleration_rad_per_s2 * elapsed_s
+        turning_rad_per_s = max(self._sent_rad_per_s * towards, 0.0) + speed_up_rad_per_s
+        slope_nm_per_s = min(
+            settings.ramp_nm_per_s,
+            settings.stiffness_nm_per_rad * turning_rad_per_s,
+            abs(set_point_nm - ramp_nm) / elapsed_s,
+        )
+        return ramp_nm + towards * slope_nm_per_s * elapsed_s, towards * slope_nm_per_s

@@ -24,9 +24,7 @@ def twisted(gains, seed):
 
 def calibrated():
     numbers = np.zeros(len(TWISTS), dtype=int)
-    return fit_interval_regressor(
-        *twisted([1.0, 1.0], 0), Ridge.fit, strengths=(1e-6,), recordings=numbers, fingertips=2
-    )
+    return fit_interval_regressor(*twisted([1.0, 1.0], 0), Ridge.fit, strengths=(1e-6,), grips=numbers, fingertips=2)
 
 
 def rmse(regressor, features, torque_nm):
@@ -194,7 +192,7 @@ def test_a_gain_that_falls_over_a_grip_is_a_drift(begins_at, drifts):
     gains = np.repeat(np.geomspace(begins_at, 1.0, 10), 8)
     noise = np.random.default_rng(0).normal(0, 5e-4, 80)
     regressor = fit_interval_regressor(
-        (TWISTS / gains + noise)[:, None], TWISTS, CensoredRidge.fit, strengths=(1e-6,), recordings=np.zeros(80, int)
+        (TWISTS / gains + noise)[:, None], TWISTS, CensoredRidge.fit, strengths=(1e-6,), grips=np.zeros(80, int)
     )
     assert (regressor.gain.drift > 0.2) is drifts
     assert drifts or regressor.gain.drift == 0.0
@@ -234,7 +232,7 @@ def test_bounds_that_do_not_bind_count_for_nothing():
     """A lever that does not touch reads 0 however far the gel has turned away from it."""
     features = (TWISTS - np.where(TWISTS > 0, 0.0, 0.04))[:, None] + np.random.default_rng(0).normal(0, 5e-4, (80, 1))
     regressor = fit_interval_regressor(
-        features, TWISTS, CensoredRidge.fit, strengths=(1e-6,), recordings=np.zeros(80, dtype=int)
+        features, TWISTS, CensoredRidge.fit, strengths=(1e-6,), grips=np.zeros(80, dtype=int)
     )
     _, correction = regressor.adapt(features[:16] / 1.4, TWISTS[:16], np.array([0]))
     assert correction.factors[0] == pytest.approx(1.4, abs=0.06)

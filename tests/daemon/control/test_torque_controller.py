@@ -254,11 +254,11 @@ def test_a_drift_is_learnt_by_the_integral_and_bounded():
     for number in range(80):
         bench.advance(0.5)
         bench.measure(0.25 * (bench.seen_rad() - 0.3) - 0.0003 * 0.5 * number)
-    assert bench.controller.filter.creep_nm / 0.5 == pytest.approx(-0.0003, rel=0.05)
+    assert bench.controller.filter.drift_nm / 0.5 == pytest.approx(-0.0003, rel=0.05)
     for number in range(80, 100):
         bench.advance(0.5)
         bench.measure(0.25 * (bench.angle - 0.3) - 0.002 * 0.5 * number)
-    assert bench.controller.filter.creep_nm / 0.5 >= -0.0005 - 1e-12
+    assert bench.controller.filter.drift_nm / 0.5 >= -0.0005 - 1e-12
 
 
 def test_a_jump_is_taken_up_by_the_second_whole_measurement_and_without_noise_by_the_gain_alone():

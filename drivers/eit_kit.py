@@ -176,7 +176,7 @@ class FrameClock:
         # The learned period, or the nominal one until it is learned.
         self.period_ns = nominal_period_ns
         self.learned = False
-        self._period_ns = float(nominal_period_ns)
+        self._exact_period_ns = float(nominal_period_ns)
         # (frame number, arrival) of the last frames across restarts, and the last spacings.
         self._latest: deque[tuple[int, int]] = deque(maxlen=SPACING_FRAMES + 1)
         self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
@@ -197,11 +197,11 @@ class FrameClock:
         number, steps = 0, 1
         if self._seen:
             number, last_ns = self._seen[-1]
-            elapsed = (arrival_ns - self._straight_ns) / self._period_ns
+            elapsed = (arrival_ns - self._straight_ns) / self._exact_period_ns
             steps = max(1, round(elapsed)) if missed and self.learned else 1
             number += steps
             late = elapsed - steps
-            late_before = (last_ns - self._straight_ns) / self._period_ns
+            late_before = (last_ns - self._straight_ns) / self._exact_period_ns
             # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
             # board. Half a period early means that the last one was counted as two.
             paused = min(late, late_before) > 0.5 and late > late_before - 0.5
@@ -215,7 +215,7 @@ class FrameClock:
         self._learn()
         straight_ns = math.inf
         for n, arrival in islice(reversed(self._seen), PHASE_WINDOW):
-            straight_ns = min(straight_ns, arrival + (number - n) * self._period_ns)
+            straight_ns = min(straight_ns, arrival + (number - n) * self._exact_period_ns)
         self._straight_ns = round(straight_ns)
         return self._straight_ns
 
@@ -225,13 +225,13 @@ class FrameClock:
         spacing = median(self._spacings)
         if spacing <= 0:
             return
-        if abs(self._period_ns - spacing) > PLAUSIBLE * spacing:
-            self._period_ns, self.learned = spacing, True
+        if abs(self._exact_period_ns - spacing) > PLAUSIBLE * spacing:
+            self._exact_period_ns, self.learned = spacing, True
         if len(self._seen) >= LEARN_FROM:
             slope = slope_below(self._seen)
             if abs(slope - spacing) <= PLAUSIBLE * spacing:
-                self._period_ns, self.learned = slope, True
-        self.period_ns = round(self._period_ns)
+                self._exact_period_ns, self.learned = slope, True
+        self.period_ns = round(self._exact_period_ns)
 
 
 def slope_below(points: Iterable[tuple[int, int]]) -> float:

@@ -142,7 +142,7 @@ class Gripper:
                 if not self._to_reach:
                     self.flt, self.obj = 0, 3
         elif self.sta == 3 and self.taken.gto and self.flt != OVER_TEMPERATURE:
-            low, high = self.fingers.model.speed_mm_s
+            low, high = self.fingers.model.speed_mm_per_s
             self._approach(float(self.taken.pos), low + (high - low) * self.taken.spe / COUNTS_MAX, dt_s)
 
     def _take_up(self) -> None:
@@ -158,11 +158,11 @@ class Gripper:
             opened, closed = self.fingers.open_counts, self.fingers.closed_counts
             self._to_reach, self.flt = [opened, closed, opened], ACTIVATION_NOT_FINISHED
 
-    def _approach(self, target: float, speed_mm_s: float, dt_s: float) -> bool:
+    def _approach(self, target: float, speed_mm_per_s: float, dt_s: float) -> bool:
         """Move towards a position; return whether the fingers have stopped, there or at an object."""
         fingers = self.fingers
         # The manual gives the speed of the whole stroke.
-        travel = speed_mm_s * dt_s * (fingers.closed_counts - fingers.open_counts) / fingers.model.stroke_mm
+        travel = speed_mm_per_s * dt_s * (fingers.closed_counts - fingers.open_counts) / fingers.model.stroke_mm
         closing = target > self._position
         # The fingers' own stops count as the target: a real gripper that closes on air reports no object.
         stop = target = min(max(target, fingers.open_counts), fingers.closed_counts)

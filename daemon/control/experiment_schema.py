@@ -11,7 +11,7 @@ from shearloop.daemon.commissioning import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD
 from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, FileKind, either, not_of_kind
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
-from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_S
+from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_PER_S
 from shearloop.mistakes import shown
 
 MOST_ANGLES = 1000
@@ -59,7 +59,7 @@ Angles = Annotated[
 
 # What some gripper has; the configured model's own ranges are checked with its configuration.
 FingerWidth = Annotated[float, Field(ge=0, le=LARGEST_STROKE_MM)]
-FingerSpeed = Annotated[float, Field(ge=SPEEDS_MM_S[0], le=SPEEDS_MM_S[1])]
+FingerSpeed = Annotated[float, Field(ge=SPEEDS_MM_PER_S[0], le=SPEEDS_MM_PER_S[1])]
 FingerForce = Annotated[float, Field(ge=FORCES_N[0], le=FORCES_N[1])]
 
 

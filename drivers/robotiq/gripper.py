@@ -251,13 +251,13 @@ class RobotiqGripper:
 
     def request_of(self, command: messages.GripperCommand) -> messages.GripperMove:
         """Return the request of a command, within this gripper's limits; GripperRefusedError if it is not finite."""
-        if not all(map(math.isfinite, (command.width_mm, command.speed_mm_s, command.force_n))):
+        if not all(map(math.isfinite, (command.width_mm, command.speed_mm_per_s, command.force_n))):
             raise messages.GripperRefusedError(
                 f"{command} is no command: width, speed and force must be finite numbers."
             )
         return messages.GripperMove(
             self.calibration.counts(command.width_mm),
-            round(float(np.interp(command.speed_mm_s, self.model.speed_mm_s, (0, COUNTS_MAX)))),
+            round(float(np.interp(command.speed_mm_per_s, self.model.speed_mm_per_s, (0, COUNTS_MAX)))),
             round(float(np.interp(command.force_n, self.model.force_n, (0, COUNTS_MAX)))),
         )
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.models import FORCES_N, SPEEDS_MM_S
+from shearloop.drivers.robotiq.models import FORCES_N, SPEEDS_MM_PER_S
 
 MA_PER_COUNT = 10.0
 # The fingers open by themselves.
@@ -132,7 +132,7 @@ class GripperCommand:
     """A target width, a speed, and the largest force; by default as fast and as gently as the model can."""
 
     width_mm: float
-    speed_mm_s: float = SPEEDS_MM_S[1]
+    speed_mm_per_s: float = SPEEDS_MM_PER_S[1]
     force_n: float = FORCES_N[0]
 
 

@@ -21,17 +21,17 @@ class GripperModel:
 
     name: ModelName
     stroke_mm: float
-    speed_mm_s: tuple[float, float]
+    speed_mm_per_s: tuple[float, float]
     force_n: tuple[float, float]
     bow_mm: float
     open_counts: float = 3.0
     closed_counts: float = 230.0
 
-    def why_beyond(self, width_mm: float, speed_mm_s: float, force_n: float) -> str:
+    def why_beyond(self, width_mm: float, speed_mm_per_s: float, force_n: float) -> str:
         """Return which value this model does not have, with its range, or an empty string."""
         for value, (low, high), name, unit in (
             (width_mm, (0.0, self.stroke_mm), "width", "mm"),
-            (speed_mm_s, self.speed_mm_s, "speed", "mm/s"),
+            (speed_mm_per_s, self.speed_mm_per_s, "speed", "mm/s"),
             (force_n, self.force_n, "force", "N"),
         ):
             if not low <= value <= high:
@@ -50,8 +50,8 @@ MODELS: Mapping[ModelName, GripperModel] = {
 }
 # What some model has.
 LARGEST_STROKE_MM = max(model.stroke_mm for model in MODELS.values())
-SPEEDS_MM_S = (
-    min(model.speed_mm_s[0] for model in MODELS.values()),
-    max(model.speed_mm_s[1] for model in MODELS.values()),
+SPEEDS_MM_PER_S = (
+    min(model.speed_mm_per_s[0] for model in MODELS.values()),
+    max(model.speed_mm_per_s[1] for model in MODELS.values()),
 )
 FORCES_N = min(model.force_n[0] for model in MODELS.values()), max(model.force_n[1] for model in MODELS.values())

@@ -27,7 +27,7 @@ async def test_gripper_activates_moves_and_measures_an_object(way, tmp_path):
         # The fingers opened and closed for it.
         assert active.width_mm == pytest.approx(140, abs=1)
 
-        sent = await driver.move(messages.GripperCommand(60.0, speed_mm_s=250.0, force_n=20.0))
+        sent = await driver.move(messages.GripperCommand(60.0, speed_mm_per_s=250.0, force_n=20.0))
         state = await driver.finish(sent)
         assert state.object is messages.ObjectStatus.AT_TARGET
         assert state.diameter_mm is None
@@ -72,7 +72,7 @@ async def test_a_grip_that_another_program_closes_is_a_grip(way, tmp_path):
 @WAYS
 async def test_a_motion_that_another_program_takes_over_does_not_end_well(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
-        sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
+        sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_per_s=30.0))
         while (await rig.driver.read()).width_mm >= 140:
             pass
         rig.model.write(replace(rig.model.command, pos=3, spe=255))
@@ -83,7 +83,7 @@ async def test_a_motion_that_another_program_takes_over_does_not_end_well(way, t
 @WAYS
 async def test_halted_gripper_reports_no_object(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
-        sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
+        sent = await rig.driver.move(messages.GripperCommand(0.0, speed_mm_per_s=30.0))
         while (await rig.driver.read()).width_mm >= 140:
             pass
         rig.stopped = True
@@ -167,7 +167,7 @@ async def _stays(rig: Rig) -> None:
 async def test_major_fault_needs_the_operators_confirmation(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig:
         driver = rig.driver
-        sent = await driver.move(messages.GripperCommand(0.0, speed_mm_s=30.0))
+        sent = await driver.move(messages.GripperCommand(0.0, speed_mm_per_s=30.0))
         rig.model.fail(14)
         with pytest.raises(messages.GripperFaultError, match="too much current"):
             await driver.finish(sent)
@@ -233,7 +233,7 @@ async def test_activating_an_active_gripper_moves_nothing(way, tmp_path):
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-@pytest.mark.parametrize("name", ["width_mm", "speed_mm_s", "force_n"])
+@pytest.mark.parametrize("name", ["width_mm", "speed_mm_per_s", "force_n"])
 async def test_command_that_is_not_finite_is_refused(bad, name):
     driver = RobotiqGripper(SocketClient("127.0.0.1"), CALIBRATION)
     with pytest.raises(messages.GripperRefusedError, match="no command"):
@@ -242,7 +242,7 @@ async def test_command_that_is_not_finite_is_refused(bad, name):
 
 async def test_commands_are_clipped():
     driver = RobotiqGripper(SocketClient("127.0.0.1"), CALIBRATION)
-    sent = driver.request_of(messages.GripperCommand(500.0, speed_mm_s=1.0, force_n=1e9))
+    sent = driver.request_of(messages.GripperCommand(500.0, speed_mm_per_s=1.0, force_n=1e9))
     assert sent == messages.GripperMove(0, 0, 255)
 
 

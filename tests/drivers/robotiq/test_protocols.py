@@ -170,7 +170,7 @@ def test_counts_of_speed_and_force_are_those_of_the_model(model):
     own, gripper = MODELS[model], RobotiqGripper(SocketClient("localhost"), WidthCalibration.nominal(model))
     for part, counts in ((0.0, 0), (1.0, 255)):
         asked = messages.GripperCommand(
-            own.stroke_mm * (1 - part), *(low + part * (high - low) for low, high in (own.speed_mm_s, own.force_n))
+            own.stroke_mm * (1 - part), *(low + part * (high - low) for low, high in (own.speed_mm_per_s, own.force_n))
         )
         sent = gripper.request_of(asked)
         assert (sent.speed, sent.force) == (counts, counts)

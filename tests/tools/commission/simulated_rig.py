@@ -250,13 +250,13 @@ class SimulatedGripper:
         )
 
     def move(self, command: GripperCommand) -> GripperState:
-        (slow, fast), (low_n, high_n) = self.model.speed_mm_s, self.model.force_n
+        (slow, fast), (low_n, high_n) = self.model.speed_mm_per_s, self.model.force_n
         self._write(
             GripperRegisters(
                 act=True,
                 gto=True,
                 pos=self._calibration.counts(command.width_mm),
-                spe=round(COUNTS_MAX * (command.speed_mm_s - slow) / (fast - slow)),
+                spe=round(COUNTS_MAX * (command.speed_mm_per_s - slow) / (fast - slow)),
                 force=round(COUNTS_MAX * (command.force_n - low_n) / (high_n - low_n)),
             )
         )

@@ -35,7 +35,7 @@ from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.twists import LOADED_SHARE, first_twists, loaded_log_gain
-from shearloop.estimation.values import FrameSeries, Measured, check_finite, distinct
+from shearloop.estimation.values import FrameSeries, GripState, Measured, check_finite, distinct
 from shearloop.words import counted
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
@@ -276,13 +276,13 @@ def _replay(
     estimator, rows, grip = calibration.estimator, [], 0
     for recording, series in enumerate(recordings):
         session = Session(calibration, matcher=matcher)
-        grip, was_held = grip + 1, False
+        grip, before = grip + 1, GripState.NONE
         truths = zip(series.torque_at_frames(), series.diameter_mm, strict=True)
         for i, (frame, truth) in enumerate(zip(series.frames(), truths, strict=True)):
             processed, t_s = session.process(frame), frame.t_s
-            if was_held and not processed.held_frames:
+            if processed.grip is GripState.NONE and before is not GripState.NONE:
                 grip += 1
-            was_held = processed.held_frames > 0
+            before = processed.grip
             if processed.reasons or not np.isfinite(truth[0]):
                 continue
             features = estimator.features(Reading.of(processed, t_s, matcher))

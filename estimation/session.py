@@ -28,7 +28,7 @@ from shearloop.estimation.frame_checks import ChannelChecks, FrameTimer
 from shearloop.estimation.grip_memory import GripMemory
 from shearloop.estimation.grip_strength import strength_reasons
 from shearloop.estimation.idle_frames import IdleFrames
-from shearloop.estimation.values import BeforeFrame, Estimate, Measured, ProcessedFrame, TactileFrame
+from shearloop.estimation.values import BeforeFrame, Estimate, GripState, Measured, ProcessedFrame, TactileFrame
 from shearloop.words import counted
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ class Session:
         if repeats:
             return Estimate(valid=False, reasons=_REPEATED_FRAME if len(frame.channels) == 1 else _REPEATED_SIDE)
         processed = self.process(frame)
-        if not processed.held_frames:
+        if processed.grip is GripState.NONE:
             self._gain = GripGain()
         if processed.reasons:
             return Estimate(valid=False, reasons=processed.reasons)
@@ -292,15 +292,22 @@ class Session:
             reason = f"no grip at the {' and '.join(loose)} fingertip"
             if not idle.complete:
                 reason += f"; {_NEVER_IDLE}"
-            return ProcessedFrame(difference, (reason,), usable, held_frames=0)
+            return ProcessedFrame(difference, (reason,), usable, GripState.NONE)
         memory = self._memory
         # Motion is read in volts: after a release a gel's idle voltages recover for minutes, which is no gain.
         recent = memory.remember(channels, from_idle, difference, missing)
         self._strengths = {one.side: grip.strength.ratio for one, grip in zip(sides, self._grips, strict=True)}
         if reasons := (recent,) if recent else strength_reasons(self._strengths):
-            return ProcessedFrame(difference, reasons, usable)
+            return ProcessedFrame(difference, reasons, usable, GripState.HELD)
         return ProcessedFrame(
-            difference, (), usable, memory.mean_difference, memory.features, memory.held_frames, idle.complete
+            difference,
+            (),
+            usable,
+            GripState.HELD,
+            mean_difference=memory.mean_difference,
+            motion=memory.features,
+            held_frames=memory.held_frames,
+            has_baseline=idle.complete,
         )
 
     def _first_difference(self) -> FloatArray | None:

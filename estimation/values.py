@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Self
 
 import numpy as np
@@ -186,19 +187,27 @@ class BeforeFrame:
         )
 
 
+class GripState(Enum):
+    """What a frame shows of a grip."""
+
+    NONE = "none"
+    HELD = "held"
+    UNKNOWN = "unknown"  # the frame was refused, or its session knows of no grips
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ProcessedFrame:
     """A frame after the session's checks, with the reasons against it.
 
-    difference (m, c) is to the idle frame, mean_difference its mean over the grip's last held_frames, 0 after a
-    release. motion holds features of the last frames' motion. usable (m, c) excludes channels that the board or the
-    frame itself shows to be lost or saturated. has_baseline is whether every fingertip was seen idle, lag_s the lag of
-    an average.
+    difference (m, c) is to the idle frame, mean_difference its mean over the grip's last held_frames. motion holds
+    features of the last frames' motion. usable (m, c) excludes channels that the board or the frame itself shows to be
+    lost or saturated. has_baseline is whether every fingertip was seen idle, lag_s the lag of an average.
     """
 
     difference: FloatArray
     reasons: tuple[str, ...]
     usable: BoolArray
+    grip: GripState = GripState.UNKNOWN
     mean_difference: FloatArray = field(default_factory=lambda: np.zeros(0))
     motion: FloatArray = field(default_factory=lambda: np.zeros(0))
     held_frames: int = 1
@@ -207,7 +216,7 @@ class ProcessedFrame:
 
     @classmethod
     def refused(cls, usable: BoolArray, *reasons: str) -> Self:
-        """Return a frame with reasons against it, without a difference."""
+        """Return a frame with reasons against it, without a difference: it shows nothing of a grip."""
         return cls(np.zeros(usable.shape), reasons, usable)
 
 

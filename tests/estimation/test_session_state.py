@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from shearloop.estimation import Session
-from shearloop.estimation.values import TactileFrame
+from shearloop.estimation.values import GripState, TactileFrame
 
 UP, DOWN = np.linspace(0, 1, 21), np.linspace(1, 0, 21)[1:]
 
@@ -256,3 +256,14 @@ def test_motion_is_read_without_the_gain_of_the_idle_frame(motion_calibration):
     assert np.abs(fresh.motion).max() > 0
     np.testing.assert_allclose(remembered.motion, fresh.motion, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(scaled.motion, 1.1 * fresh.motion, rtol=1e-6, atol=1e-9)
+
+
+def test_a_frame_shows_a_grip_none_or_nothing(motion_calibration, process):
+    session = Session(motion_calibration)
+    first, *idle = process(session, np.zeros(12))
+    *rising, held = process(session, [*UP, *np.ones(12)], 6.0)
+    assert first.grip is GripState.UNKNOWN, "it is refused: there is none to compare with"
+    assert {one.grip for one in idle} == {GripState.NONE}
+    assert (held.grip, held.reasons) == (GripState.HELD, ())
+    too_recent = [one for one in rising if one.grip is GripState.HELD and one.reasons]
+    assert len(too_recent) == motion_calibration.estimator.motion.n_needed - 1

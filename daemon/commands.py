@@ -163,7 +163,7 @@ class Commands:
         another, drops = loop.operator.why_another_stop(request.get("stop")), loop.operator.unlock_question()
         if another or drops:
             sentence = "; ".join(filter(None, (another, drops)))
-            what = "drops" if drops else "acknowledges", f"stop {loop.safety.waiting}"
+            what = "drops" if drops else "acknowledges", f"stop {loop.safety.stop_number}"
             question = Question(
                 f"Unlock? {_capital(sentence)}.",
                 digest_of("unlock", *what, *rig.occasion(), *loop.operator.release_stakes()),

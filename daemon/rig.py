@@ -309,13 +309,14 @@ class Rig:
     def occasion(self) -> tuple[str, ...]:
         """Return what changes with each process, stop and run: a question from before it asks for another moment."""
         loop = self.control_loop
-        stops = f"{self.runner.stop_count} stops, {loop.safety.acknowledged} acknowledged"
+        stops = f"{self.runner.stop_count} stops, {loop.safety.acknowledgements} acknowledged"
         return self.token, stops, f"{loop.runs} runs"
 
     def state(self) -> Mapping[str, Any]:
         """Return what `status` shows of the control loop."""
-        state = loop_state(self.control_loop, 0.0, 0)
-        return {**{key: getattr(state, key) for key in LOOP_KEYS}, "stop_causes": self.control_loop.safety.stop_causes}
+        state, stop = loop_state(self.control_loop, 0.0, 0), self.control_loop.safety.waiting
+        causes = stop.causes if stop is not None else ""
+        return {**{key: getattr(state, key) for key in LOOP_KEYS}, "stop_causes": causes}
 
 
 def build_rig(

@@ -108,7 +108,8 @@ class Remembered:
     def of(cls, loop: ControlLoop) -> "Remembered":
         """Return the present state of a control loop."""
         running = loop.running.file.name if loop.running is not None else ""
-        stop = tuple((fault.code.name, fault.detail) for fault in loop.safety.stop_faults)
+        faults = loop.safety.waiting.faults if loop.safety.waiting is not None else ()
+        stop = tuple((fault.code.name, fault.detail) for fault in faults)
         return cls(running, stop, **asdict(loop.tool.grip))
 
     def restore(self, loop: ControlLoop, on_judged: OnJudged = lambda _: None) -> None:

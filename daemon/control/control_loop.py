@@ -89,12 +89,6 @@ class ControlLoop:
         self.tool = HeldTool(self.inputs, has_gripper="gripper" in required)
         # When the latest grip, release or tare ended, until each torque has been measured since, or should have been.
         self._unmeasured_since_ns: int | None = None
-        # Whether the latest stop has opened the gripper.
-        self._released = False
-        # The causes of the latest stop, once it is acknowledged, until the next start.
-        self._acknowledged = ""
-        # Of a stop after the experiment's end.
-        self._later_stop = ""
         # By source: whether its zero is known, which was taken since this process began or is kept from an earlier one.
         # It is not known once it was lost, or asked for and not taken; a source without an entry had neither.
         self._zero_known: dict[str, bool] = {}
@@ -223,9 +217,7 @@ class ControlLoop:
         # What the last experiment knew of the tool may be wrong by now.
         self.wrist.reset()
         self.tool.begin_experiment()
-        self._released = False
         self._unmeasured_since_ns = t_ns
-        self._acknowledged = self._later_stop = ""
         self.runs += 1
         # Until the first tick, the status must not show the end of the previous run.
         phase, activity = self.experiment.phase.value, self.experiment.command.activity
@@ -242,18 +234,14 @@ class ControlLoop:
 
     def stop(self, reason: str, fault: Fault) -> None:
         """End the experiment, if one runs, and stand still until the operator acknowledges the stop."""
-        self.safety.stop(fault)
-        if self.running is None:
-            self._later_stop = reason
-        elif self.experiment is not None:
-            self.experiment.stop(reason)
+        running = self.running
+        self.safety.stop(fault, reason if running is None else "")
+        if running is not None:
+            running.stop(reason)
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command."""
         self.tool.release_error = None
-        self._later_stop = ""
-        if self.safety.stopped:
-            self._acknowledged = f"the stop is acknowledged; its cause was: {self.safety.stop_causes}"
         self.safety.acknowledge()
 
     def tick(self, t_ns: int, late_s: float = 0.0, sent_rad_per_s: float | None = None) -> ControlOutput:
@@ -302,7 +290,7 @@ class ControlLoop:
     def _at_rest(self, found: Sequence[Fault]) -> list[Fault]:
         """Return the faults while no experiment runs, with what the operator should know of a held tool."""
         faults, arm = list(found), self.inputs.arm
-        if self.safety.stopped and (held := self.tool.may_still_hold) is not None:
+        if self.safety.waiting is not None and (held := self.tool.may_still_hold) is not None:
             faults.append(Fault(FaultCode.TOOL_GRIPPED, held))
         if unknown := self.tool.unknown_grip:
             faults.append(Fault(FaultCode.GRIP_UNKNOWN, unknown))
@@ -414,17 +402,21 @@ class ControlLoop:
             creep.reset()
 
     def _ended(self, decision: SafetyDecision) -> End:
-        experiment = self.experiment
-        phase = experiment.phase.value if experiment is not None else "idle"
-        reason = experiment.stop_reason if experiment is not None else ""
-        if self._later_stop:
-            reason = self._later_stop
-        elif experiment is not None and experiment.phase is ExperimentPhase.STOPPED and not self.safety.stopped:
-            reason = self._acknowledged or reason
-        self.status = LoopStatus(phase, reason, WristCommand(), decision)
-        release = decision.response is Response.STOP_AND_RELEASE and not self._released
-        self._released |= release
-        return End(release)
+        phase = self.experiment.phase.value if self.experiment is not None else "idle"
+        self.status = LoopStatus(phase, self._why_ended(), WristCommand(), decision)
+        return End(self.safety.release_once())
+
+    def _why_ended(self) -> str:
+        """Return why nothing moves, for the status; empty if nothing was stopped."""
+        experiment, stop = self.experiment, self.safety.waiting
+        if stop is not None and stop.reason:
+            return stop.reason
+        if experiment is None:
+            return ""
+        acknowledged = self.safety.acknowledged
+        if experiment.phase is ExperimentPhase.STOPPED and stop is None and acknowledged is not None:
+            return f"the stop is acknowledged; its cause was: {acknowledged.causes}"
+        return experiment.stop_reason
 
 
 def _turns(command: StepCommand) -> bool:

@@ -258,12 +258,12 @@ class ControlLoopRunner:
             return reason
         # A stop since the latest state is carried out and published as the stop that it is.
         self.decide_now()
-        waiting = self._control_loop.safety.waiting
+        number = self._control_loop.safety.stop_number
         try:
             await self.operator_action.unlock(confirmed=confirmed)
         except (ActionError, DriverError) as error:
             return str(error)
-        if another := self._control_loop.operator.why_another_stop(waiting):
+        if another := self._control_loop.operator.why_another_stop(number):
             return f"robot and gripper are unlocked, but there was another stop; {another}; unlock it again"
         self._control_loop.acknowledge()
         return None

@@ -44,8 +44,8 @@ class OperatorView:
         """Return why no experiment can begin, or None."""
         if (running := self.running()) is not None:
             return f"the experiment {running.file.name!r} is still running; stop it first"
-        if self.safety.stopped:
-            first, *others = self.safety.stop_faults
+        if (stop := self.safety.waiting) is not None:
+            first, *others = stop.faults
             also = f" Also: {'; '.join(fault.cause for fault in others)}." if others else ""
             return f"{first.sentence}{also}"
         return None
@@ -139,9 +139,10 @@ class OperatorView:
 
         So no operator acknowledges a stop that was not shown.
         """
-        if named in (None, self.safety.waiting) or not self.safety.stopped:
+        stop = self.safety.waiting
+        if stop is None or named in (None, stop.number):
             return ""
-        return f"the stop that waits is not the one that was shown: {self.safety.stop_causes}"
+        return f"the stop that waits is not the one that was shown: {stop.causes}"
 
     def release_stakes(self) -> tuple[str, ...]:
         """Return the facts that a confirmation of `release_question` covers; the width varies and is none of them."""

@@ -313,16 +313,37 @@ class SafetyDecision:
         return tuple(fault.sentence for fault in self.reported)
 
 
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A stop, from its first cause until the operator acknowledges it."""
+
+    response: Response
+    faults: tuple[Fault, ...]
+    # Grows with each cause that begins a stop or joins one.
+    number: int
+    # What stopped the rig while no experiment ran; empty where the stop has ended an experiment.
+    reason: str = ""
+    # Whether it has opened the gripper.
+    released: bool = False
+
+    @property
+    def causes(self) -> str:
+        """The causes, without their cures."""
+        return "; ".join(fault.cause for fault in self.faults)
+
+
 class SafetyMonitor:
     """Judges faults: a hold ends with its cause, a stop stays until the operator acknowledges it."""
 
     def __init__(self, patience: float = 1.0) -> None:
         """`patience` is the factor on the longest holds; above 1 on an emulated rig alone."""
         self._patience = patience
-        # How many stops the operator has acknowledged.
-        self.acknowledged = 0
+        # The stop that waits for the operator, and the one that was acknowledged last.
+        self.waiting: Stop | None = None
+        self.acknowledged: Stop | None = None
+        self.acknowledgements = 0
         # How many causes have begun a stop, or joined one that waits for the operator.
-        self.stops = 0
+        self._causes = 0
         # Hold timers of faults and of the wrist, and the faults that held it at the last judgement.
         self._held_ns: dict[str, int] = {}
         self._wrist_ns = 0
@@ -330,7 +351,6 @@ class SafetyMonitor:
         # Each fault's contribution to the wrist's timer, for the report.
         self._share_ns: dict[FaultCode, int] = {}
         self._judged_ns: int | None = None
-        self._stop: SafetyDecision | None = None
 
     def judge(self, faults: Iterable[Fault], t_ns: int) -> SafetyDecision:
         """Return the response to the faults at t_ns (monotonic clock) while an experiment runs."""
@@ -345,10 +365,10 @@ class SafetyMonitor:
         # Faults that stop come before faults that hold: the message begins with the cause of the stop.
         active = tuple(sorted(active, key=self._response, reverse=True))
         decision = SafetyDecision(response, self._explained(active, _explaining(active)))
-        if response >= Response.STOP_AND_KEEP_GRIP and (self._stop is None or response > self._stop.response):
-            self._stop = decision
-            self.stops += 1
-        return decision if self._stop is None else self._with_stop(self._stop, active)
+        if response >= Response.STOP_AND_KEEP_GRIP and (self.waiting is None or response > self.waiting.response):
+            self._causes += 1
+            self.waiting = Stop(response, decision.faults, self._causes)
+        return decision if self.waiting is None else self._with_stop(self.waiting, active)
 
     def report(self, faults: Iterable[Fault]) -> SafetyDecision:
         """Return the faults while nothing moves: a pending stop is kept, and only the robot's own stops begin one."""
@@ -357,45 +377,44 @@ class SafetyMonitor:
         for fault in active:
             if fault.rule.stops_at_rest:
                 # One that lasts is one cause.
-                self.stops += fault.code not in {known.code for known in self.stop_faults}
-                self._add(fault)
-        return SafetyDecision(Response.NOTE, active) if self._stop is None else self._with_stop(self._stop, active)
+                known = self.waiting.faults if self.waiting is not None else ()
+                self._causes += fault.code not in {one.code for one in known}
+                self._join(fault)
+        return SafetyDecision(Response.NOTE, active) if self.waiting is None else self._with_stop(self.waiting, active)
 
-    def stop(self, fault: Fault) -> None:
-        """Begin a stop that no input shows, such as an operator's; it keeps the grip, and a stronger one stays."""
-        self.stops += 1
-        self._add(fault)
+    def stop(self, fault: Fault, reason: str = "") -> None:
+        """Begin a stop that no input shows, such as an operator's; it keeps the grip, and a stronger one stays.
 
-    def _add(self, fault: Fault) -> None:
-        begun = self._stop or SafetyDecision(Response.STOP_AND_KEEP_GRIP)
-        earlier = (one for one in begun.faults if one.code is not fault.code)
-        self._stop = SafetyDecision(begun.response, (*earlier, fault))
+        `reason` is as in `Stop`.
+        """
+        self._causes += 1
+        self._join(fault, reason)
+
+    def _join(self, fault: Fault, reason: str = "") -> None:
+        """Let a fault join the stop that waits, or begin one."""
+        stop = self.waiting or Stop(Response.STOP_AND_KEEP_GRIP, (), self._causes)
+        others = (one for one in stop.faults if one.code is not fault.code)
+        self.waiting = replace(stop, faults=(*others, fault), number=self._causes, reason=reason or stop.reason)
+
+    def release_once(self) -> bool:
+        """Return whether the stop that waits has to open the gripper now; it counts as done."""
+        stop = self.waiting
+        if stop is None or stop.released or stop.response is not Response.STOP_AND_RELEASE:
+            return False
+        self.waiting = replace(stop, released=True)
+        return True
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command; a fault that persists stops again at the next judgement."""
-        self.acknowledged += self.stopped
-        self._stop = None
+        if self.waiting is not None:
+            self.acknowledged, self.waiting = self.waiting, None
+            self.acknowledgements += 1
         self._reset_timers()
 
     @property
-    def stopped(self) -> bool:
-        """Whether a stop waits for the operator."""
-        return self._stop is not None
-
-    @property
-    def waiting(self) -> int:
-        """The number of the stop that waits for the operator, which grows with each further cause; 0 without one."""
-        return self.stops if self.stopped else 0
-
-    @property
-    def stop_faults(self) -> tuple[Fault, ...]:
-        """The faults of the stop that waits for the operator; empty without one."""
-        return self._stop.faults if self._stop is not None else ()
-
-    @property
-    def stop_causes(self) -> str:
-        """The causes of the stop that waits for the operator, without their cures; empty without one."""
-        return "; ".join(fault.cause for fault in self.stop_faults)
+    def stop_number(self) -> int:
+        """The number of the stop that waits for the operator; 0 without one."""
+        return self.waiting.number if self.waiting is not None else 0
 
     @classmethod
     def _explained(cls, active: tuple[Fault, ...], cause: Fault | None) -> tuple[Fault, ...]:
@@ -406,7 +425,7 @@ class SafetyMonitor:
         return (cause, *(replace(one, is_consequence=True) if _may_follow(one) else one for one in others))
 
     @classmethod
-    def _with_stop(cls, stop: SafetyDecision, active: tuple[Fault, ...]) -> SafetyDecision:
+    def _with_stop(cls, stop: Stop, active: tuple[Fault, ...]) -> SafetyDecision:
         """Return the stop's faults, updated with the present ones."""
         codes = {fault.code for fault in active}
         # In the order of the stop, so that its cause stays first.

@@ -55,7 +55,7 @@ class StatePublisher:
         key = (
             status.phase,
             self.control_loop.runs,
-            self.control_loop.safety.waiting,
+            self.control_loop.safety.stop_number,
             tuple(fault.code for fault in status.decision.faults),
             status.velocity.reasons,
             experiment and experiment.step_number,
@@ -136,7 +136,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         speed_command_rad_per_s=status.velocity.speed_rad_per_s,
         speed_sent_rad_per_s=sent_rad_per_s,
         response=status.decision.response.name.lower().replace("_", " "),
-        stop=control_loop.safety.waiting,
+        stop=control_loop.safety.stop_number,
         cause=next(iter(status.decision.reasons), ""),
         faults=status.decision.codes,
         reasons=" ".join((*status.decision.reasons, *status.velocity.reasons)),

@@ -245,7 +245,7 @@ def rig(folder: Path, runner: Runner) -> Rig:
         SimpleNamespace(
             warm_up_s=0.0,
             runs=1,
-            safety=SimpleNamespace(acknowledged=0),
+            safety=SimpleNamespace(acknowledgements=0),
             tool=SimpleNamespace(may_hold=lambda: False),
             operator=SimpleNamespace(activation_note=lambda _: "", held_note=lambda _: "", file_refusal=lambda _: None),
         ),

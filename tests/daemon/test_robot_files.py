@@ -72,7 +72,7 @@ def test_two_robots_have_two_locks_and_two_memories(one, other):
 async def test_a_stop_that_was_kept_under_a_name_is_found_and_moves_to_the_address(earlier, now):
     write_memory(memory_path(earlier), Remembered(stop=(STOP,)))
     memory = RigMemory(RobotFiles.of(now), loop := new_loop())
-    assert [fault.code.name for fault in loop.safety.stop_faults] == [STOP[0]]
+    assert [fault.code.name for fault in loop.safety.waiting.faults] == [STOP[0]]
     await memory.save_present()
     assert read_memory(memory_path("192.168.1.10")).stop[0][0] == STOP[0]
     loop.acknowledge()
@@ -111,7 +111,7 @@ async def test_a_robot_with_a_new_address_keeps_stop_crash_and_grip(names, has_o
         write_memory(memory_path("192.168.1.10"), GRIP)
     names["ur.lab"] = ["192.168.1.20"]
     memory = RigMemory(RobotFiles.of("UR.lab"), loop := new_loop())
-    details = [fault.detail for fault in loop.safety.stop_faults]
+    details = [fault.detail for fault in loop.safety.waiting.faults]
     assert details[0] == STOP[1]
     assert any("'loosen' was under way" in detail for detail in details)
     assert any("had the address 192.168.1.10 then and has 192.168.1.20 at present" in detail for detail in details)
@@ -170,7 +170,7 @@ def test_a_stop_under_a_name_that_is_not_found_for_now_is_acknowledged_by_number
 async def test_a_name_that_was_never_found_waits_for_the_operator_until_it_was(names):
     names.clear()
     memory = RigMemory(RobotFiles.of("ur.lab"), loop := new_loop())
-    assert "the name 'ur.lab' has no address at present" in loop.safety.stop_faults[0].sentence
+    assert "the name 'ur.lab' has no address at present" in loop.safety.waiting.faults[0].sentence
     with lock_robot(memory.files), pytest.raises(UserError, match="driven by another program"):
         lock_robot(RobotFiles.of("UR.lab")).__enter__()
     loop.acknowledge()

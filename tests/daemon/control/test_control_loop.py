@@ -83,7 +83,7 @@ def test_a_tool_that_slips_while_a_torque_is_held_ends_in_a_stop_and_not_as_done
     slip(rig, rate_rad_per_s=0.1, most_rad=0.35)
     rig.run(60)
     assert_stopped_because_the_torque_does_not_follow(rig)
-    assert rig.control_loop.safety.stop_faults[0].code is FaultCode.NOT_FOLLOWING
+    assert rig.control_loop.safety.waiting.faults[0].code is FaultCode.NOT_FOLLOWING
     assert rig.true_nm[-1] < 0.05
 
 

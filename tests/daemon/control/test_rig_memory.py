@@ -377,7 +377,7 @@ def test_a_pipe_in_the_place_of_the_state_counts_as_a_stop_and_keeps_nobody_wait
 def test_a_fault_of_another_version_is_a_stop_all_the_same():
     loop = new_loop()
     Remembered(stop=(("NO_SUCH_FAULT", "it was hot"),)).restore(loop)
-    assert loop.safety.stop_faults == (Fault(FaultCode.DAEMON_ENDED, "it was hot"),)
+    assert loop.safety.waiting.faults == (Fault(FaultCode.DAEMON_ENDED, "it was hot"),)
 
 
 async def test_nothing_starts_where_a_stop_could_not_be_remembered(tmp_path, monkeypatch):

@@ -78,7 +78,7 @@ async def test_a_daemon_that_hung_for_longer_than_a_hand_needs_does_not_turn_the
         await cell.cycles(100)
         assert (cell.phase is ExperimentPhase.RUNNING) == goes_on
         assert (cell.state.motion == "wrist") == goes_on
-        assert cell.control_loop.safety.stopped != goes_on, "a stop waits for the operator's word"
+        assert (cell.control_loop.safety.waiting is None) == goes_on, "a stop waits for the operator's word"
 
 
 async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time():

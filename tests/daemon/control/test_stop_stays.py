@@ -82,7 +82,7 @@ async def test_nothing_starts_after_a_stop_before_it_is_acknowledged(stop):
         cell.robot.commands.clear()
         cell.gripper.asked.clear()
         refusal = await cell.runner.start(experiment(GRIP, MOVE))
-        first, *others = cell.control_loop.safety.stop_faults
+        first, *others = cell.control_loop.safety.waiting.faults
         assert refusal.startswith(first.sentence)
         assert all(fault.cause in refusal for fault in others)
         assert refusal.count("`shearloop command unlock`") == 1
@@ -115,7 +115,7 @@ async def test_the_daemons_end_in_mid_experiment_is_a_stop():
     async with driven(WAIT) as cell:
         cell.runner.close()
         assert cell.phase is ExperimentPhase.STOPPED
-        assert cell.control_loop.safety.stopped
+        assert cell.control_loop.safety.waiting is not None
 
 
 async def test_an_experiment_that_is_done_is_no_stop():

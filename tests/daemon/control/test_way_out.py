@@ -197,11 +197,11 @@ async def test_an_unlock_acknowledges_the_stop_that_was_shown_and_no_other():
         cell.runner.stop(also_idle=True)
         with pytest.raises(CommandRefusedError, match="the stop that waits is not the one") as two:
             await unlocked(cell, unlock, stop=shown["stop"], digest=one.value.facts["digest"])
-        assert (cell.control_loop.safety.waiting, len(cell.robot.commands)) == (3, sent)
+        assert (cell.control_loop.safety.stop_number, len(cell.robot.commands)) == (3, sent)
         # The question that comes with the refusal can be confirmed at once.
         digest = two.value.facts["digest"]
         assert await unlocked(cell, unlock, stop=shown["stop"], digest=digest, confirmed=True) == {}
-        assert not cell.control_loop.safety.stopped
+        assert cell.control_loop.safety.waiting is None
 
 
 @pytest.mark.parametrize("named", [{}, {"stop": 1}])
@@ -210,7 +210,7 @@ async def test_an_unlock_of_the_stop_that_waits_or_of_whatever_waits_asks_nothin
         cell.runner.stop(also_idle=True)
         await cell.cycles(3)
         assert await unlocked(cell, commands_of(cell)["unlock"], **named) == {}
-        assert not cell.control_loop.safety.stopped
+        assert cell.control_loop.safety.waiting is None
         # Another person has acknowledged it meanwhile.
         assert await unlocked(cell, commands_of(cell)["unlock"], stop=1) == {}
 
@@ -228,7 +228,7 @@ async def test_a_stop_during_an_unlocking_is_not_acknowledged_by_it():
         await cell.cycles(3)
         with pytest.raises(CommandRefusedError, match=r"but there was another stop; .* emergency stop is pressed"):
             await unlocking
-        assert cell.control_loop.safety.waiting == 2
+        assert cell.control_loop.safety.stop_number == 2
 
 
 async def test_no_release_while_the_wrist_moves_or_an_experiment_runs():
@@ -434,7 +434,7 @@ def test_no_torque_is_done_while_fingertip_and_load_cell_disagree(from_s):
     rig.lever_nm = -0.2
     rig.run(200)
     assert phase(rig) is ExperimentPhase.STOPPED
-    assert FaultCode.TORQUES_DISAGREE in [fault.code for fault in loop.safety.stop_faults]
+    assert FaultCode.TORQUES_DISAGREE in [fault.code for fault in loop.safety.waiting.faults]
 
 
 def test_the_angle_since_the_grip_belongs_to_the_grip():
@@ -581,7 +581,9 @@ async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
         for _ in range(2):
             reply = await stop_command({})
         assert reply["held"] == "its fingers hold something 30.0 mm wide, with an unknown force"
-        assert cell.control_loop.safety.stopped, "the next start waits for `unlock`, as after the page's stop"
+        assert cell.control_loop.safety.waiting is not None, (
+            "the next start waits for `unlock`, as after the page's stop"
+        )
         cell.holding = False
         await cell.cycles(2)
         assert "ended" not in await stop_command({"command": "stop", "spare_deamon": True}), (

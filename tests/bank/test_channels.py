@@ -29,7 +29,7 @@ def test_dead_channels_are_named_by_what_they_have_in_common(what):
     assert PAPER_TABLE.name_dead(dead) == names
 
 
-def test_an_open_electrode_is_told_from_the_one_that_shares_its_current():
+def test_an_open_electrode_and_the_one_that_shares_its_current_get_different_names():
     dead = (PAPER_TABLE.electrodes == 5).any(axis=1)
     first, second = PAPER_TABLE.name_dead(dead | (np.arange(896) == 500))
     assert first == "56 channels of electrode 5 (pin 6)"

@@ -189,7 +189,7 @@ def test_a_choice_that_nothing_is_good_enough_for_says_so():
     assert choice.next_step is None
 
 
-def test_what_is_good_enough_by_luck_is_not_chosen():
+def test_a_step_whose_finer_neighbour_is_not_good_enough_is_not_chosen():
     """A step falls between the nodes of one mesh as it should, and of the next finer one not."""
     steps = tuple(DesignStep(size_cm, off, "") for size_cm, off in ((0.5, 3.0), (0.2, 0.1), (0.1, 0.5), (0.05, 0.2)))
     assert DesignChoice("mesh size", "cm", steps).chosen.setting == 0.05

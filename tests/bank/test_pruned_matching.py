@@ -89,7 +89,7 @@ amplitudes = hnp.arrays(np.float64, PAPER_TABLE.n_channels, elements=st.floats(-
 @both
 @given(frame=amplitudes)
 @settings(max_examples=25, deadline=None)
-def test_random_frames(slow, fast, frame):
+def test_random_frames_match_as_without_pruning(slow, fast, frame):
     assert_same(fast.match(frame), slow.match(frame))
 
 
@@ -103,7 +103,7 @@ def test_random_frames(slow, fast, frame):
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=50, deadline=None)
-def test_frames_like_those_of_the_bank(slow, fast, cell, other, share, noise, lag, seed):
+def test_frames_like_those_of_the_bank_match_as_without_pruning(slow, fast, cell, other, share, noise, lag, seed):
     signals = BANK[0].astype(np.float64)
     frame = np.abs((1 - share) * signals[cell] + share * signals[other])
     frame += noise * np.abs(np.random.default_rng(seed).normal(size=PAPER_TABLE.n_channels))
@@ -187,7 +187,7 @@ SCENES = hard_scenes()
 
 @pytest.mark.parametrize("kind", KINDS, ids=["all lags", "zero lag"])
 @pytest.mark.parametrize("scene", SCENES)
-def test_hard_scenes(kind, scene):
+def test_hard_scenes_match_as_without_pruning(kind, scene):
     bank, frames = SCENES[scene]
     slow, fast = pair(*kind, bank)
     for frame in frames:
@@ -223,7 +223,7 @@ def recorded_frames(shared) -> list[np.ndarray]:
 
 
 @both
-def test_recorded_frames(recorded_frames, slow, fast):
+def test_recorded_frames_match_as_without_pruning(recorded_frames, slow, fast):
     """Far from anything in this bank, as they are from every bank: a hard case."""
     assert len(recorded_frames) > 60
     for frame in recorded_frames:

@@ -495,7 +495,7 @@ def test_messages_are_readable():
     assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
 
 
-def test_tasks_are_told_in_words_without_what_is_not_known():
+def test_a_task_row_shows_state_rate_and_errors_and_leaves_unknown_facts_empty():
     facts = {"alive": True, "done": False, "restarts": 0, "last_error": "", "rate_hz": None, "errors": {}}
     for changes, row in (
         ({}, ("alive", "", "")),
@@ -610,7 +610,7 @@ def test_what_takes_long_waits_and_a_missing_daemon_is_reported_at_once(monkeypa
 
 
 @pytest.mark.parametrize("name", ["tare", "start", "pause", "resume", "release", "unlock"])
-def test_what_acts_is_meant_for_the_daemon_that_runs_and_an_unlock_for_the_stop_that_waits(name, monkeypatch, capsys):
+def test_a_command_names_the_running_daemon_and_unlock_names_the_waiting_stop(name, monkeypatch, capsys):
     asked: list[dict[str, Any]] = []
     loop = {"stop": 3, "stop_causes": "the operator stopped it: nothing was under way"}
 

@@ -45,13 +45,13 @@ def keyboard(monkeypatch) -> Iterator[Keyboard]:
     os.close(keyboard.slave)
 
 
-def test_a_motion_is_not_allowed_by_a_word_of_before(keyboard):
+def test_a_word_typed_before_the_question_does_not_allow_a_motion(keyboard):
     keyboard.type("move\nmove\n")
     assert Terminal(keyboard, "").answer("MOTION: the fingers close").strip() == "no"
     assert keyboard.shown.getvalue() == "MOTION: the fingers close\n"
 
 
-async def test_fingers_do_not_move_for_an_enter_of_before(keyboard, capsys):
+async def test_an_enter_typed_before_the_question_does_not_answer_it(keyboard, capsys):
     with Operator() as operator:
         keyboard.type("\n\n")
         await turns()

@@ -28,7 +28,9 @@ def ending_with(rig_config: Path, *steps: Mapping[str, Any]) -> Path:
     return path
 
 
-async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_end(rig_config, tiny_bank, log):
+async def test_a_daemon_that_is_ended_during_an_experiment_stops_the_arm_and_reports_the_end(
+    rig_config, tiny_bank, log
+):
     out = StringIO()
     path = ending_with(rig_config, {"do": "release"}, {"do": "turn_to", "angle_rad": 3.0, "speed_rad_per_s": 0.2})
     async with running_rig(path, tiny_bank) as (daemon, watcher, _cause, _command):

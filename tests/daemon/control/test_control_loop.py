@@ -129,7 +129,7 @@ def test_a_tighter_grip_of_the_same_tool_keeps_the_angle_of_the_grip():
     assert rig.control_loop.tool.grip.force_n == 100.0
 
 
-def test_each_message_tells_the_step_and_its_own_activity():
+def test_each_message_has_the_step_that_its_activity_belongs_to():
     """The end of a measurement begins the next step within the same decision."""
     hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 1}
     rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, hold, {"do": "release"}, torque_source="load_cell")
@@ -356,7 +356,7 @@ def test_a_grip_that_is_lost_says_what_the_fingers_do(sense, does):
     ],
 )
 @pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
-def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(sense, what, turning):
+def test_a_turn_is_refused_while_the_gripper_does_not_know_whether_it_holds_a_tool(sense, what, turning):
     rig = Rig(new_loop())
     for _ in range(70):
         rig.step()
@@ -389,7 +389,7 @@ def test_a_grip_that_may_meet_nothing_allows_turns_after_it():
 
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
 @pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
-def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_what_turns(sense, turning):
+def test_a_gripper_that_becomes_uncertain_after_the_start_fails_the_turn(sense, turning):
     rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 0.1}, turning, GRIP)
     rig.hand = replace(rig.hand, **sense)
     rig.run(1)

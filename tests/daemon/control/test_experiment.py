@@ -172,7 +172,7 @@ def test_a_steps_limits_only_tighten_the_experiments():
         ({"do": "grip", "widht_mm": 20}, "not permitted"),
     ],
 )
-def test_a_mistake_in_a_step_is_told_with_the_cure(step, part):
+def test_a_mistake_in_a_step_is_refused_with_the_cure(step, part):
     with pytest.raises(ValidationError, match=part):
         experiment(step)
 
@@ -354,7 +354,7 @@ def test_a_torque_that_undoes_a_tightening_by_its_sign_alone_is_refused(tighten,
 
 
 @pytest.mark.parametrize(("between", "refused"), [({**HOLD, "torque_nm": 0.0}, True), (GRIP, True), (RELEASE, False)])
-def test_what_comes_between_a_tightening_and_its_undoing_forgives_nothing_but_a_release(between, refused):
+def test_only_a_release_between_a_tightening_and_its_undoing_prevents_the_refusal(between, refused):
     steps = [GRIP, {**TIGHTEN, **CLOCKWISE}, between, {"do": "identify"}, HOLD]
     file = ExperimentFile.model_validate({"name": "one", "steps": steps})
     undoing = [text for _, text in check_steps(file) if "undoes step 2, tighten clockwise" in text]

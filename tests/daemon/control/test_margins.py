@@ -135,7 +135,7 @@ def test_at_the_gain_and_delay_margins_the_loop_is_just_stable(age, ratio, lag, 
 
 
 @pytest.mark.parametrize("model", [EIT, replace(EIT, compensated=False, age_s=1.2), replace(EIT, stiffness_ratio=2.2)])
-def test_roots_agree_with_the_loop_iterated_by_hand(model):
+def test_the_gain_limit_agrees_with_a_simulation_of_the_loop(model):
     """Brute force: the difference equations run for 3000 measurements, a twentieth below and above the boundary."""
     limit = gain_limit(model)
     for factor, dies_out in ((0.95, True), (1.05, False)):

@@ -55,7 +55,7 @@ def after_restart(before: Rig) -> Rig:
     return after
 
 
-def test_after_a_crash_nothing_moves_and_the_state_tells_of_the_tool():
+def test_after_a_crash_nothing_moves_and_the_state_names_the_gripped_tool():
     rig = started(Rig(new_loop()), GRIP, WAIT)
     rig.run(2)
     after = after_restart(rig)
@@ -269,7 +269,7 @@ def test_a_soft_tool_that_gives_way_slowly_is_the_same(restarted):
 
 
 @pytest.mark.parametrize("steps", [[GRIP], [{"do": "release"}, GRIP]])
-def test_a_gripper_that_lost_its_power_opens_on_no_tool_unsaid(steps, restarted):
+def test_the_operator_is_warned_before_a_gripper_that_lost_its_power_is_activated(steps, restarted):
     """Its next motion activates it, which opens and closes the fingers."""
     rig = restarted.rig
     rig.force_n = 0.0

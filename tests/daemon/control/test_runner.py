@@ -23,7 +23,7 @@ from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experimen
 from tests.drivers.ur.handler_bench import SETTINGS
 
 
-async def test_an_action_that_dies_fails_its_step_and_is_told():
+async def test_an_action_that_crashes_fails_its_step_with_the_error():
     async with driven() as cell:
         cell.gripper.error = RuntimeError("no such register")
         await cell.start(GRIP)
@@ -32,7 +32,7 @@ async def test_an_action_that_dies_fails_its_step_and_is_told():
 
 
 @pytest.mark.parametrize("kind", [ActionError, DriverError, OSError])
-async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_operator_says_unlock(kind):
+async def test_a_gripper_that_does_not_open_after_a_stop_is_reported_until_unlock(kind):
     async with driven({"do": "wait", "wait_s": 60}) as cell:
         cell.gripper.error = kind("the gripper does not answer")
         cell.exceed_torque()
@@ -95,7 +95,7 @@ async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused():
         await cell.until_done()
 
 
-async def test_who_waits_for_an_experiments_end_is_told_of_that_one():
+async def test_experiment_ended_returns_the_experiment_it_waited_for():
     async with driven({"do": "wait", "wait_s": 60}) as cell:
         first = cell.control_loop.experiment
         waiting = asyncio.create_task(cell.runner.experiment_ended())
@@ -330,7 +330,7 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         assert FaultCode.COMMAND_REFUSED not in codes
 
 
-async def test_what_moves_is_told_until_it_stands():
+async def test_motion_names_what_moves_until_arm_and_gripper_are_at_rest():
     """Meanwhile no file is read for a request: the loop that watches the motion must not be late."""
     async with driven({**TWIST, "angles_rad": [3.0]}) as cell:
         await cell.cycles(60)
@@ -421,7 +421,7 @@ async def test_each_of_two_stops_is_published_though_the_second_follows_at_once(
         assert cell.state.rests
 
 
-async def test_stop_that_a_blocked_robot_refuses_tells_since_when_it_is_blocked_and_stands():
+async def test_a_stop_that_a_blocked_robot_refuses_has_the_times_of_block_and_standstill():
     async with driven(TWIST, cycles=50) as cell:
         cell.robot.bench.arm.accepts = False
         await cell.until_ended(20)

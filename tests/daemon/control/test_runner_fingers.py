@@ -144,7 +144,7 @@ async def test_a_stop_ends_unlocking_and_stops_the_fingers():
         assert cell.runner.stop() is None
 
 
-async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch):
+async def test_the_state_warns_of_fingers_that_could_not_be_stopped(monkeypatch):
     async with gripping() as cell:
 
         async def does_not() -> None:

@@ -101,7 +101,7 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
     assert all(f"{event.text} for " in last.detail for event in events[:4])
 
 
-def test_one_cause_alone_is_told_alone():
+def test_a_stop_by_a_single_cause_reports_only_that_cause():
     stopped = taking_turns((FaultCode.ESTIMATE_STALE, 1.0))
     assert [found.code for found in stopped[1].report([]).faults] == [FaultCode.ESTIMATE_STALE]
 
@@ -206,7 +206,7 @@ def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(seq
         assert (gate.waiting is not None) == (strongest in STOPS)
 
 
-def test_two_things_of_one_kind_are_both_told():
+def test_two_faults_of_one_code_are_both_reported():
     both = [Fault(FaultCode.DEVICE_LOST, "the gripper"), Fault(FaultCode.DEVICE_LOST, "the load cell")]
     gate = SafetyMonitor()
     for seen in (gate.judge(both, 0), gate.judge([], SECOND), gate.report([])):
@@ -235,7 +235,7 @@ def test_a_pause_of_the_daemon_stops_and_what_it_leads_to_is_not_repeated():
     assert gate.report([invalid]).reasons == (invalid.sentence,)
 
 
-def test_what_stops_is_told_before_what_holds():
+def test_a_fault_that_stops_is_reported_before_one_that_holds():
     held, stops = trouble(FaultCode.ESTIMATE_STALE), trouble(FaultCode.ROBOT_BLOCKED)
     assert SafetyMonitor().judge([held, stops], 0).reasons == (stops.sentence, held.sentence)
 
@@ -256,7 +256,7 @@ def test_the_cure_of_a_stop_names_the_command_that_allows_the_next_start(code):
 
 
 @pytest.mark.parametrize("event", [FaultCode.RECORDING_FAILED, FaultCode.COMMAND_REFUSED])
-def test_what_does_not_come_of_a_pause_is_told_beside_it(event):
+def test_a_fault_that_a_pause_does_not_cause_is_reported_beside_the_pause(event):
     paused, other, limit = trouble(FaultCode.DAEMON_PAUSED), trouble(event), trouble(FaultCode.TORQUE_LIMIT)
     gate = SafetyMonitor()
     assert gate.judge([other, paused], 0).reasons == (paused.sentence, other.sentence)
@@ -269,7 +269,7 @@ MOMENTS = st.lists(st.tuples(TIMES, st.sets(st.sampled_from(list(FaultCode)), ma
 
 
 @given(MOMENTS)
-def test_what_explains_changes_what_is_told_and_never_what_is_done(moments):
+def test_an_explained_fault_changes_the_report_and_never_weakens_the_response(moments):
     """Beside a gate that takes a pause of the daemon for a loop that is late, which explains nothing."""
     explaining, plain, t_ns = SafetyMonitor(), SafetyMonitor(), 0
     for passed_ns, events in moments:

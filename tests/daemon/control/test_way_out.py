@@ -514,7 +514,7 @@ def test_no_straight_move_begins_with_a_tool_that_is_or_may_be_gripped(sense):
         ([{"do": "hold_torque", "torque_nm": 0.1, "direction": "clockwise"}], "until the torque is -0.1 N·m"),
     ],
 )
-def test_the_first_motion_is_told_before_a_start(steps, said):
+def test_first_motion_describes_the_first_step_that_moves_something(steps, said):
     assert said in first_motion(ExperimentFile.model_validate({"name": "test", "steps": steps}))
 
 

@@ -303,29 +303,29 @@ class ControlLoop:
 
     def _run_step(self, experiment: Experiment, decision: SafetyDecision, wrist_rad: float, t_ns: int) -> ControlOutput:
         """Let the experiment choose its command, and the wrist's controller a speed."""
-        held = decision.response is Response.HOLD
+        on_hold = decision.response is Response.HOLD
         origin_rad = self.tool.count_angle(wrist_rad)
-        self._choose_command(experiment, wrist_rad, origin_rad, t_ns, held=held)
+        self._choose_command(experiment, wrist_rad, origin_rad, t_ns, on_hold=on_hold)
         awaited = self._awaited_torques(experiment, t_ns)
-        still = held or awaited is not None or experiment.phase is ExperimentPhase.PAUSED
+        still = on_hold or awaited is not None or experiment.phase is ExperimentPhase.PAUSED
         action = None if still else self._begin_command(experiment, wrist_rad, origin_rad, t_ns)
         velocity = WristCommand()
         if experiment.running:
             velocity = self._wrist_command(experiment, wrist_rad, origin_rad, t_ns, still=still)
         if not experiment.running:
             return self._ended(self.safety.report(decision.faults))
-        phase = "held" if held else experiment.phase.value
+        phase = "held" if on_hold else experiment.phase.value
         self.status = LoopStatus(phase, awaited or experiment.command.activity, velocity, decision)
         return StandStill() if still else Drive(velocity.speed_rad_per_s, action)
 
     def _choose_command(
-        self, experiment: Experiment, wrist_rad: float, origin_rad: float, t_ns: int, *, held: bool
+        self, experiment: Experiment, wrist_rad: float, origin_rad: float, t_ns: int, *, on_hold: bool
     ) -> None:
         """Let the experiment choose its command; it ends if it would turn a tool that may be in the gripper."""
         latest = self.inputs.torques.get(experiment.file.torque_source)
-        torque_nm = latest.torque_nm if latest is not None and not held else None
-        stands = held or self._awaited_torques(experiment, t_ns) is not None
-        experiment.update(t_ns, wrist_rad - origin_rad, torque_nm, gripped_at_rad=origin_rad, held=stands)
+        torque_nm = latest.torque_nm if latest is not None and not on_hold else None
+        clock_stands = on_hold or self._awaited_torques(experiment, t_ns) is not None
+        experiment.update(t_ns, wrist_rad - origin_rad, torque_nm, gripped_at_rad=origin_rad, clock_stands=clock_stands)
         # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now. A `grip` that
         # may meet nothing allows turns, although a tool as wide as its target is not felt.
         gripper = self.inputs.gripper
@@ -362,7 +362,7 @@ class ControlLoop:
         """Return how the wrist turns for the command; the end of an identification begins the next step."""
         command = experiment.command
         if still:
-            return self.wrist.hold()
+            return self.wrist.stand_still()
         if isinstance(command.action, IdentifyStep) and (excitation := self.wrist.excitation) is not None:
             velocity = self.wrist.identify(excitation, t_ns, wrist_rad)
             if excitation.done:

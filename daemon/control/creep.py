@@ -1,4 +1,4 @@
-"""The creep of a gel under a held twist: shear into torque."""
+"""The creep of a gel under a constant twist: shear into torque."""
 
 import math
 from dataclasses import dataclass
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 @dataclass(slots=True)
 class Creep:
-    """Converts shear into torque, reading by reading; `share` is the final loss of a held torque.
+    """Converts shear into torque, reading by reading; `share` is the final loss of torque.
 
-    Under a held twist the gel's shear stays and its torque falls; a fingertip measures the shear. With γ the shear, as
-    the torque on a fresh gel, the torque is γ − share·c. Here c follows γ with a time constant: one Maxwell element in
-    parallel with a spring (the standard linear solid; Ferry, Viscoelastic Properties of Polymers, 1980, chapter 1).
+    Under a constant twist the gel's shear stays and its torque falls; a fingertip measures the shear. With γ the shear,
+    as the torque on a fresh gel, the torque is γ − share·c. Here c follows γ with a time constant: one Maxwell element
+    in parallel with a spring (the standard linear solid; Ferry, Viscoelastic Properties of Polymers, 1980, chapter 1).
     """
 
     share: float

@@ -1,7 +1,7 @@
 """Runs an experiment step by step: its commands, its steps as generators, its phases. No I/O; time is an argument.
 
 Each step is a generator that receives a `StepContext`, yields a `StepCommand`, and returns at its end. The experiment's
-clock stands while it is paused or held.
+clock stands while it is paused, or while the control loop says so, as during a hold.
 """
 
 from collections.abc import Generator
@@ -73,8 +73,8 @@ class StepContext:
 class StepCommand:
     """Output of a step.
 
-    An action starts with the first command that has it, and ends the step. `hold_number` counts the held angles or
-    torques of a step, from 1; 0 while none is held.
+    An action starts with the first command that has it, and ends the step. `hold_number` counts the angles or
+    torques at which a step waits, from 1; 0 while it waits at none.
     """
 
     wrist: WristSetpoint = Hold()
@@ -105,7 +105,7 @@ class Experiment:
         self._expected_s = [one.takes_s for one in demands(file.steps, speeds)]
         self.phase = ExperimentPhase.RUNNING
         self.stop_reason = ""
-        # The step's command, also while the wrist is paused or held.
+        # The step's command, also while the wrist stands still.
         self.command = StepCommand()
         # The tighter of the experiment's limits and the step's.
         self.limits = file.limits
@@ -148,15 +148,21 @@ class Experiment:
         return max(0.0, 1.0 - self._left_s / max(sum(self._expected_s), 1e-9))
 
     def update(
-        self, t_ns: int, wrist_rad: float, torque_nm: float | None, *, gripped_at_rad: float = 0.0, held: bool = False
+        self,
+        t_ns: int,
+        wrist_rad: float,
+        torque_nm: float | None,
+        *,
+        gripped_at_rad: float = 0.0,
+        clock_stands: bool = False,
     ) -> None:
-        """Choose the command for now; while paused or held the experiment's clock stands still.
+        """Choose the command for now, unless the experiment is paused or its clock has to stand.
 
         `wrist_rad` counts from the angle at the grip, `gripped_at_rad`.
         """
         passed_s = max(0, t_ns - self._t_ns) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
-        if held or self.phase is not ExperimentPhase.RUNNING:
+        if clock_stands or self.phase is not ExperimentPhase.RUNNING:
             return
         self._elapsed_s += passed_s
         view = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s)

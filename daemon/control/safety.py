@@ -260,7 +260,7 @@ class FaultCode(Enum):
 
 TABLE: Mapping[FaultCode, Rule] = {code: code.value for code in FaultCode}
 # The longest hold by several alternating faults.
-HELD_AT_MOST_S = max(rule.hold_at_most_s for rule in TABLE.values() if rule.hold_at_most_s is not None)
+LONGEST_HOLD_S = max(rule.hold_at_most_s for rule in TABLE.values() if rule.hold_at_most_s is not None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,8 +344,8 @@ class SafetyMonitor:
         self.acknowledgements = 0
         # How many causes have begun a stop, or joined one that waits for the operator.
         self._causes = 0
-        # Hold timers of faults and of the wrist, and the faults that held it at the last judgement.
-        self._held_ns: dict[str, int] = {}
+        # Hold timers of faults and of the wrist, and the faults of the last judgement that hold.
+        self._hold_ns: dict[str, int] = {}
         self._wrist_ns = 0
         self._holding: frozenset[FaultCode] = frozenset()
         # Each fault's contribution to the wrist's timer, for the report.
@@ -359,7 +359,7 @@ class SafetyMonitor:
             self._count(active, t_ns)
         self._judged_ns = t_ns
         response = max(map(self._response, active), default=Response.NOTE)
-        if response is Response.HOLD and self._wrist_ns > self._patience * HELD_AT_MOST_S * 1e9:
+        if response is Response.HOLD and self._wrist_ns > self._patience * LONGEST_HOLD_S * 1e9:
             active = (*active, Fault(FaultCode.HELD_TOO_LONG, self._hold_report()))
             response = TABLE[FaultCode.HELD_TOO_LONG].response
         # Faults that stop come before faults that hold: the message begins with the cause of the stop.
@@ -438,40 +438,40 @@ class SafetyMonitor:
         return SafetyDecision(stop.response, cls._explained((*kept, *new), _explaining(stop.faults)))
 
     def _count(self, active: tuple[Fault, ...], t_ns: int) -> None:
-        """Advance the hold timers to t_ns: up for faults that held until now, down for the others."""
+        """Advance the hold timers to t_ns: up for faults that lasted until now, down for the others."""
         passed_ns = 0 if self._judged_ns is None else t_ns - self._judged_ns
         holding = frozenset(fault.code for fault in active if fault.rule.hold_at_most_s is not None)
-        held = self._holding.union(code for code in holding if TABLE[code].is_past)
-        held_timers = {code.timer for code in held}
+        lasted = self._holding.union(code for code in holding if TABLE[code].is_past)
+        lasted_timers = {code.timer for code in lasted}
         holding_timers = {code.timer for code in holding}
         counted = {
-            timer: _counted(self._held_ns.get(timer, 0), passed_ns, held=timer in held_timers)
-            for timer in (*self._held_ns, *holding_timers)
+            timer: _counted(self._hold_ns.get(timer, 0), passed_ns, up=timer in lasted_timers)
+            for timer in (*self._hold_ns, *holding_timers)
         }
-        self._held_ns = {timer: held_ns for timer, held_ns in counted.items() if held_ns or timer in holding_timers}
-        self._wrist_ns = _counted(self._wrist_ns, passed_ns, held=bool(held))
+        self._hold_ns = {timer: hold_ns for timer, hold_ns in counted.items() if hold_ns or timer in holding_timers}
+        self._wrist_ns = _counted(self._wrist_ns, passed_ns, up=bool(lasted))
         if not self._wrist_ns:
             self._share_ns.clear()
-        for code in held:
+        for code in lasted:
             self._share_ns[code] = self._share_ns.get(code, 0) + passed_ns
         self._holding = holding
 
     def _reset_timers(self) -> None:
-        self._held_ns.clear()
+        self._hold_ns.clear()
         self._share_ns.clear()
         self._wrist_ns, self._holding, self._judged_ns = 0, frozenset(), None
 
     def _response(self, fault: Fault) -> Response:
         rule = fault.rule
         longest_s = rule.hold_at_most_s
-        if longest_s is not None and self._held_ns[fault.code.timer] > self._patience * longest_s * 1e9:
+        if longest_s is not None and self._hold_ns[fault.code.timer] > self._patience * longest_s * 1e9:
             return Response.STOP_AND_KEEP_GRIP
         return rule.response
 
     def _hold_report(self) -> str:
         """Return the hold time of each fault, the longest first."""
-        longest_first = sorted(self._share_ns.items(), key=lambda held: -held[1])
-        return ", ".join(f"{code.text} for {held_ns / 1e9:.1f} s" for code, held_ns in longest_first)
+        longest_first = sorted(self._share_ns.items(), key=lambda entry: -entry[1])
+        return ", ".join(f"{code.text} for {hold_ns / 1e9:.1f} s" for code, hold_ns in longest_first)
 
 
 def _explaining(faults: tuple[Fault, ...]) -> Fault | None:
@@ -483,6 +483,6 @@ def _may_follow(fault: Fault) -> bool:
     return fault.code is FaultCode.COMMAND_UNANSWERED or fault.rule.response is Response.HOLD
 
 
-def _counted(held_ns: int, passed_ns: int, *, held: bool) -> int:
-    """Return a hold timer after `passed_ns` with or without the fault."""
-    return held_ns + passed_ns if held else max(0, held_ns - round(DECAY * passed_ns))
+def _counted(hold_ns: int, passed_ns: int, *, up: bool) -> int:
+    """Return a hold timer after `passed_ns`, which it counts up or down."""
+    return hold_ns + passed_ns if up else max(0, hold_ns - round(DECAY * passed_ns))

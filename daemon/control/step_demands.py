@@ -53,7 +53,7 @@ def _travel_rad(angles_rad: Sequence[float]) -> float:
 
 
 class Before(NamedTuple):
-    """What a step begins at: the held torque, the wrist joint's angle, and the tool's pose; None for unknown ones."""
+    """What a step begins at: the torque, the wrist joint's angle, and the tool's pose; None for unknown ones."""
 
     torque_nm: float = 0.0
     wrist_rad: float | None = None

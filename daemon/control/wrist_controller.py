@@ -58,7 +58,7 @@ class WristController:
         self._torque_limit_nm = 0.0
         self._config = config
         self._limit = WristLimit.of(config)
-        self._held = False
+        self._stands_still = False
         # Torques wait for the next angle.
         self._pending: deque[TorqueSample] = deque(maxlen=MOST_PENDING)
         self.excitation: StiffnessExcitation | None = None
@@ -87,9 +87,9 @@ class WristController:
         if not isinstance(setpoint, TrackTorque):
             # An open loop records no angles; the next closed loop starts from the torque measured then.
             self.tracked = self.controller = None
-        elif self._held and self.controller is not None:
+        elif self._stands_still and self.controller is not None:
             self.controller.resume()
-        self._held = False
+        self._stands_still = False
         match setpoint:
             case Hold():
                 return WristCommand()
@@ -150,9 +150,9 @@ class WristController:
         self.tool, self.excitation, self._judged = excitation.result, None, None
         return WristCommand()
 
-    def hold(self) -> WristCommand:
+    def stand_still(self) -> WristCommand:
         """Stand still; the next `turn` continues without a jump."""
-        self._held = True
+        self._stands_still = True
         return WristCommand()
 
     def reset(self) -> None:
@@ -169,7 +169,7 @@ class WristController:
         since_ns = t_ns - self._config.actuation_s * 1e9
         while self._under_way and self._under_way[0][0] <= since_ns:
             self._under_way.popleft()
-        return sum(speed * held_s for _, speed, held_s in self._under_way)
+        return sum(speed * lasted_s for _, speed, lasted_s in self._under_way)
 
     def _clipped(self, speed_rad_per_s: float) -> WristCommand:
         if not math.isfinite(speed_rad_per_s):

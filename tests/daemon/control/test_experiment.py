@@ -36,17 +36,17 @@ class Bench:
         self.wish = StepCommand()
         self.seen: list[StepCommand] = []
 
-    def tick(self, *, held: bool = False) -> StepCommand:
+    def tick(self, *, clock_stands: bool = False) -> StepCommand:
         self.t_ns += self.tick_ns
         if self.wish.action:
             self.machine.end_action()
         torque_nm = STIFFNESS_NM_PER_RAD * self.wrist_rad
-        self.machine.update(self.t_ns, self.wrist_rad, torque_nm, held=held)
+        self.machine.update(self.t_ns, self.wrist_rad, torque_nm, clock_stands=clock_stands)
         wish = self.machine.command
         if wish.action is not None and self.machine.begin_action():
             self.begun.append(type(wish.action).__name__)
         step_s = self.tick_ns / 1e9
-        match Hold() if held or self.machine.phase is ExperimentPhase.PAUSED else wish.wrist:
+        match Hold() if clock_stands or self.machine.phase is ExperimentPhase.PAUSED else wish.wrist:
             case MoveToAngle(angle, speed):
                 reach = speed * step_s
                 self.wrist_rad += max(-reach, min(reach, angle - self.wrist_rad))
@@ -136,7 +136,7 @@ def test_while_paused_or_held_no_time_passes():
         bench.tick()
     bench.machine.resume()
     for _ in range(1000):
-        bench.tick(held=True)
+        bench.tick(clock_stands=True)
     assert bench.machine.remaining_s == left_s
     assert bench.machine.command == command
     bench.run()
@@ -225,7 +225,7 @@ def test_any_experiment_ends_whatever_interrupts_it_and_never_moves_after_its_en
             bench.machine.pause()
         elif what == "resume":
             bench.machine.resume()
-        bench.tick(held=what == "hold")
+        bench.tick(clock_stands=what == "hold")
         assert 0.0 <= bench.machine.progress <= 1.0
     bench.machine.resume()
     bench.run()

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.safety import HELD_AT_MOST_S, TABLE, Fault, FaultCode, Response, SafetyMonitor
+from shearloop.daemon.control.safety import LONGEST_HOLD_S, TABLE, Fault, FaultCode, Response, SafetyMonitor
 
 STOPS = (Response.STOP_AND_KEEP_GRIP, Response.STOP_AND_RELEASE)
 SECOND = 10**9
@@ -96,7 +96,7 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
     events = [event for event, _ in HOLDS][:count]
     stopped = taking_turns(*((event, each_s) for event in events))
     stopped_s, gate = stopped
-    assert stopped_s == pytest.approx(HELD_AT_MOST_S, abs=2 * TICK_S)
+    assert stopped_s == pytest.approx(LONGEST_HOLD_S, abs=2 * TICK_S)
     (last,) = (one for one in gate.report([]).faults if one.code is FaultCode.HELD_TOO_LONG)
     assert all(f"{event.text} for " in last.detail for event in events[:4])
 
@@ -159,7 +159,7 @@ def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop
     for events, lasts_ns in sequence:
         if gate.judge([trouble(event) for event in events], t_ns).response in STOPS:
             return
-        assert not events or held_ns <= HELD_AT_MOST_S * SECOND
+        assert not events or held_ns <= LONGEST_HOLD_S * SECOND
         t_ns += lasts_ns
         held_ns = held_ns + lasts_ns if events else max(0.0, held_ns - 0.5 * lasts_ns)
 

@@ -189,6 +189,9 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
                 "`shearloop command release` can open them. Ctrl-C in its terminal ends the daemon, or "
                 "`systemctl stop shearloop`."
             ]
+        if reply.get("ended_by_itself"):
+            ended = f"{reply['ended_by_itself']!r} had just ended by itself"
+            return [f"stop: nothing was moving, because {ended}; after 5 s, a further stop ends the daemon"]
         return [f"stop: stopped {reply['stopped']}" if reply.get("stopped") else "stop: nothing was moving"]
     values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
     return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -244,6 +244,8 @@ class Commands:
         if held is not None:
             # An operator who stops twice must still be able to open the gripper.
             return {"stopped": "", "held": held}
+        if self.rig is not None and (ended := self.rig.runner.ended_unseen()) is not None:
+            return {"stopped": "", "ended_by_itself": ended}
         # Nothing moves, so the daemon itself stops, once the reply is sent.
         asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
         return {"ended": True}

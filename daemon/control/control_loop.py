@@ -349,6 +349,9 @@ class ControlLoop:
             case TareStep() if (reason := self.operator.why_no_tare_step()) is not None:
                 self._fail(experiment, reason)
                 return None
+            case IdentifyStep() if self.tool.is_empty:
+                self._fail(experiment, "the gripper holds nothing to identify; put a `grip` before it")
+                return None
             case GripStep() as grip:
                 self.tool.begin_grip(grip, origin_rad)
             case IdentifyStep() as identify:

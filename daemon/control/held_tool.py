@@ -203,6 +203,11 @@ class HeldTool:
             return self._on_judged is not None or self.grip.force_n is not None
         return gripper.may_hold
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether our gripper is known to hold nothing; a tool that is held by other means is not known."""
+        return self.has_gripper and self.inputs.gripper is not None and not self.may_hold()
+
     def may_be_loaded(self) -> bool:
         """Return whether a tool may load the sensors: a held one, or a clamped one whose angle counts."""
         return self.may_hold() if self.has_gripper else self.grip.origin_rad is not None

@@ -41,6 +41,8 @@ BRAKE_S = 0.5
 ENABLED_WITHIN_S = 0.5
 ENDING = "the daemon ends; start it again"
 STOPPED_AT_START = "it was stopped during its start"
+# Somebody who sends a stop may not have seen yet that the experiment has ended by itself.
+UNSEEN_S = 5.0
 
 
 class ControlLoopRunner:
@@ -75,6 +77,8 @@ class ControlLoopRunner:
         self._may_be_moving = False
         # The latest experiment whose stop has a timeline.
         self._timed: Experiment | None = None
+        # When something that may have been moving ended.
+        self._ended_ns: int | None = None
         self._decided_ns = 0
         # Counts the stops, also while an experiment starts.
         self._stop_count = 0
@@ -123,6 +127,15 @@ class ControlLoopRunner:
             what = f"{stopped!r} was under way" if stopped is not None else "nothing was under way"
             self._request_stop("the operator stopped it", Fault(FaultCode.OPERATOR_STOP, what))
         return stopped
+
+    def ended_unseen(self) -> str | None:
+        """Return the experiment that has ended by itself so lately that a stop is meant for it, or None."""
+        experiment, ended_ns = self._control_loop.experiment, self._ended_ns
+        if experiment is None or ended_ns is None or self._clock.now_ns() - ended_ns > UNSEEN_S * 1e9:
+            return None
+        stop = self._control_loop.safety.waiting
+        asked = stop is not None and any(fault.code is FaultCode.OPERATOR_STOP for fault in stop.faults)
+        return None if asked else experiment.file.name
 
     def close(self) -> None:
         """Stop the running experiment at the daemon's end, and start nothing more."""
@@ -368,7 +381,7 @@ class ControlLoopRunner:
             run, name = self._control_loop.runs, experiment.file.name
             self._timeline.begin(run, name, status.activity, status.decision, now_ns)
         if is_new or self._may_be_moving:
-            self._may_be_moving = False
+            self._may_be_moving, self._ended_ns = False, now_ns
             self.actions.cancel()
             self._sender.stop()
 

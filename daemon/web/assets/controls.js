@@ -125,7 +125,11 @@ export class Controls {
   confirm() {
     const { asked: name, digest } = this;
     this.ask_about("");
-    if (name && !this.reasons[name]) this.command(name, digest, this.picked);
+    if (!name) return;
+    // Meanwhile something was stopped, started or lost.
+    const reason = this.reasons[name];
+    if (reason) this.tell(`${name} was not sent: ${reason}`, "bad");
+    else this.command(name, digest, this.picked);
   }
 
   // The confirmation starts the experiment of the question, even if another one is picked meanwhile. The digest says

@@ -266,7 +266,13 @@ export function headPanel(link) {
   if (document.body.dataset.alarm !== alarm) document.body.dataset.alarm = alarm;
 }
 
-const isStopped = (link) => link.get("loop.state")?.content.phase === "stopped";
+// Also a stop while no experiment ran waits for `unlock`.
+const waitsForUnlock = (loop) => loop.phase === "stopped" || (!ACTIVE.has(loop.phase) && loop.response.startsWith("stop"));
+
+function isStopped(link) {
+  const loop = link.get("loop.state")?.content;
+  return loop !== undefined && waitsForUnlock(loop);
+}
 
 function stateWord(link) {
   const state = link.get("loop.state");
@@ -274,7 +280,7 @@ function stateWord(link) {
   const lost = { ended: "ENDED", dead: "NO DAEMON", lost: "NO VIEWER", connecting: "connecting" }[link.state()];
   if (lost) return lost;
   if (!loop) return "no robot";
-  const word = { stopped: "STOPPED", held: "HOLD" }[loop.phase] ?? loop.phase;
+  const word = waitsForUnlock(loop) ? "STOPPED" : loop.phase === "held" ? "HOLD" : loop.phase;
   const holds = loop.phase === "running" && loop.set_point_nm != null;
   return holds ? `holding ${link.number(state, loop.ramp_nm == null ? "set_point_nm" : "ramp_nm", 2, SIGNED)}` : word;
 }
@@ -353,7 +359,8 @@ export function loopPanel(link) {
   // The last state of an ended daemon is struck out.
   const current = message && (!link.isOld(message) || link.end()) ? message.content : undefined;
   const step = current?.steps ? `, step ${current.step} of ${current.steps}` : "";
-  put(byId("phase-name"), current ? `${current.phase}${current.experiment ? `: ${current.experiment}` : ""}${step}` : "–");
+  const phase = current && waitsForUnlock(current) ? "stopped" : current?.phase;
+  put(byId("phase-name"), current ? `${phase}${current.experiment ? `: ${current.experiment}` : ""}${step}` : "–");
   const reasons = current?.reasons ?? "";
   // The reason for the stop is listed below, with its cure.
   const stopped = current?.phase === "stopped";

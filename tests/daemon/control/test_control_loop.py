@@ -378,6 +378,15 @@ def test_a_turn_is_refused_while_the_gripper_does_not_know_whether_it_holds_a_to
     assert refused({"do": "release"}, turning) is None
 
 
+def test_an_identification_of_nothing_is_refused():
+    rig = Rig(new_loop())
+    rig.force_n, rig.width_mm, before_rad = 0.0, 140.0, rig.wrist_rad
+    started(rig, {"do": "identify"}, torque_source="load_cell")
+    rig.run(1)
+    assert "the gripper holds nothing to identify" in rig.control_loop.experiment.stop_reason
+    assert rig.wrist_rad == before_rad
+
+
 def test_a_grip_that_may_meet_nothing_allows_turns_after_it():
     rig = Rig(new_loop())
     rig.hand, rig.force_n = replace(rig.hand, unfelt=True), 0.0

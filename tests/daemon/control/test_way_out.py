@@ -16,6 +16,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
 from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.loop_runner import UNSEEN_S
 from shearloop.daemon.control.plan import plan_of, speeds_of
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.step_motions import first_motion
@@ -29,7 +30,7 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import MODELS
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
-from tests.drivers.ur.handler_bench import SETTINGS
+from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 
 WAIT = {"do": "wait", "wait_s": 60}
 
@@ -589,4 +590,23 @@ async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
         assert "ended" not in await stop_command({"command": "stop", "spare_deamon": True}), (
             "a misspelt word ends nothing"
         )
+        assert await stop_command({}) == {"ended": True, "process": os.getpid()}
+
+
+async def test_a_stop_just_after_an_experiment_has_ended_by_itself_does_not_end_the_daemon():
+    """Who sent it had not seen the end, and would lose the daemon by a single stop."""
+    async with driven({"do": "wait", "wait_s": 0.1}) as cell:
+        await cell.until_done()
+        stop_command = commands_of(cell)["stop"]
+        assert await stop_command({}) == {"stopped": "", "ended_by_itself": "test", "process": os.getpid()}
+        await cell.cycles(round(UNSEEN_S * 1e9 / CYCLE_NS) + 1)
+        assert await stop_command({}) == {"ended": True, "process": os.getpid()}
+
+
+async def test_a_second_stop_of_an_operator_ends_the_daemon_at_once():
+    async with driven({"do": "wait", "wait_s": 60}) as cell:
+        cell.holding = False
+        stop_command = commands_of(cell)["stop"]
+        assert (await stop_command({}))["stopped"] == "test"
+        await cell.cycles(5)
         assert await stop_command({}) == {"ended": True, "process": os.getpid()}

@@ -377,6 +377,10 @@ def test_head_and_title_name_rig_computer_emulation_and_state(browsed):
     page.wait_for_function("() => document.title === 'STOPPED · EMULATED · bench on rig-pc'")
     assert browsed.text("#where") == "EMULATED bench on rig-pc"
     assert page.evaluate("document.body.dataset.alarm") == "stopped"
+    # Also where no experiment was stopped.
+    browsed.daemon.say(loop={"phase": "idle", "response": "stop and keep grip"})
+    page.wait_for_function("() => document.title === 'STOPPED · bench on rig-pc'")
+    browsed.until("#phase-name", "stopped")
     browsed.daemon.say(loop={"phase": "held", "cause": CAUSE, "reasons": REASONS})
     page.wait_for_function("() => document.title.startsWith('HOLD · ') && document.body.dataset.alarm === ''")
 

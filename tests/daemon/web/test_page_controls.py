@@ -184,6 +184,18 @@ def test_the_picked_experiment_shows_its_plan_and_is_the_one_that_starts(browsed
     assert not page.is_visible("#plan")
 
 
+def test_a_confirmation_that_a_stop_has_overtaken_says_why_it_was_not_sent(browsed):
+    page = browsed.open(token=True)
+    browsed.daemon.say(loop={"phase": "idle"})
+    page.click("[data-command=start]:enabled")
+    browsed.until("#question-text", "Really start?")
+    browsed.daemon.say(loop={"phase": "idle", "response": "stop and keep grip"})
+    page.wait_for_selector("[data-command=start]:disabled")
+    page.click("#confirm")
+    browsed.until("#answer", "start was not sent: unlock first")
+    assert browsed.daemon.asked == []
+
+
 @pytest.mark.parametrize("name", ["start", "release"])
 def test_what_has_changed_since_the_question_is_asked_again(name, browsed):
     page = browsed.open(token=True)

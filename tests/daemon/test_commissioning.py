@@ -256,7 +256,7 @@ def test_an_experiment_that_asks_for_more_is_refused_with_its_key_and_a_cure(tmp
     assert "REFUSED" in printed.out
 
 
-async def test_a_running_daemon_refuses_it_too(tmp_path):
+async def test_a_running_daemon_refuses_an_experiment_beyond_the_cap(tmp_path):
     path = tmp_path / "one.yaml"
     content = {"name": "one", "limits": {"torque_nm": 0.3}, "steps": [BEYOND[0][0]]}
     path.write_text(yaml.safe_dump(content))
@@ -295,7 +295,7 @@ def test_a_missing_report_is_a_mistake_of_the_configuration(tmp_path):
         commissioning_of(config, read_settings(config.robot), NOW)
 
 
-def test_the_key_and_another_experiment_do_not_make_it_another_rig(tmp_path):
+def test_the_report_key_and_the_experiment_do_not_change_the_rigs_identity(tmp_path):
     plain = identity_of(load_daemon_config(write_rig(tmp_path)), VERSION, SERIAL)
     path = write_rig(tmp_path, commissioned="report.yaml", experiment="other.yaml", name="other")
     assert identity_of(load_daemon_config(path), VERSION, SERIAL) == plain

@@ -344,7 +344,7 @@ def test_each_list_of_the_robots_file_may_lack_an_entry(tmp_path):
         ("{width_mm: 5}", "1: steps[0].do: is missing"),
     ],
 )
-def test_a_step_of_no_kind_is_told_in_a_sentence(step, said, tmp_path):
+def test_a_step_of_an_unknown_kind_is_refused_in_one_sentence(step, said, tmp_path):
     assert said in refused(tmp_path, f"{{name: one, steps: [{step}]}}", ExperimentFile)
 
 

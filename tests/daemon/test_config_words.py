@@ -29,7 +29,7 @@ def test_a_text_without_quotes_is_quoted_as_it_was_written(written, tmp_path):
 
 @pytest.mark.parametrize("written", ["yes", "true", "off"])
 @pytest.mark.parametrize("section", ["loop: {kp: %s}", "load_cell: {device: {path: port}, rate_hz: %s}"])
-def test_a_truth_is_no_number(section, written, tmp_path):
+def test_a_boolean_is_refused_where_a_number_is_expected(section, written, tmp_path):
     said = refusal(tmp_path, f"{section % written}\n")
     assert "is true or false, which YAML also reads from yes and no; write a number" in said
 

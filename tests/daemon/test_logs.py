@@ -47,7 +47,7 @@ class Terminal(io.StringIO):
         return super().write(text)
 
 
-def test_a_stopped_terminal_blocks_nobody_and_says_that_texts_are_missing():
+def test_a_blocked_terminal_does_not_block_the_writer_and_dropped_lines_are_noted():
     terminal = Terminal()
     outlet = NonBlockingWriter(terminal, most_waiting=5)
     outlet.write("0\n")
@@ -64,7 +64,7 @@ def test_a_stopped_terminal_blocks_nobody_and_says_that_texts_are_missing():
     assert note == "… texts are missing above: the terminal did not read them"
 
 
-def test_what_nobody_reads_any_longer_kills_nobody():
+def test_an_output_whose_reader_has_gone_does_not_end_the_process():
     ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr.count("the output has no reader any more") == 1

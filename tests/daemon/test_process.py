@@ -79,7 +79,7 @@ def forgotten() -> weakref.ref[Cycle]:
 
 
 @pytest.mark.usefixtures("unfrozen")
-def test_nothing_is_collected_until_all_that_lasts_is_there_and_then_only_what_comes():
+def test_the_collector_starts_when_the_program_is_ready_and_skips_objects_from_before():
     # A collection of Python 3.12 freezes what lives as long as the program.
     gc.collect()
     frozen = gc.get_freeze_count()

@@ -34,7 +34,7 @@ def emulated(config, tunnel, tmp_path) -> Path:
     return config(robot="ur.yaml", emulated=True)
 
 
-async def test_the_daemon_neither_drives_it_nor_sends_it_a_program(emulated, tunnel):
+async def test_an_emulated_daemon_neither_drives_a_real_controller_nor_sends_it_a_program(emulated, tunnel):
     async with running_daemon(emulated) as daemon:
         health = collector(daemon, "health")
         while not (robot := (await health.get())["tasks"]["robot"]).get("error"):
@@ -49,12 +49,12 @@ async def test_the_daemon_neither_drives_it_nor_sends_it_a_program(emulated, tun
     assert [event for event in tunnel.events if event["event"].startswith(("program", "motion"))] == []
 
 
-def test_the_commissioning_does_not_begin(emulated, monkeypatch, mistake):
+def test_an_emulated_commissioning_does_not_begin_on_a_real_controller(emulated, monkeypatch, mistake):
     monkeypatch.setattr(sys, "stdin", StringIO(""))
     assert REFUSED in mistake("commission", emulated, "--out", emulated.with_name("report.yaml"))
 
 
-def test_the_doctor_says_so(emulated, tunnel):
+def test_the_doctor_reports_a_real_controller_in_an_emulated_rig(emulated, tunnel):
     async def found(path: Path) -> list[str]:
         findings = await check_devices(load_daemon_config(path), 0.1)
         return [

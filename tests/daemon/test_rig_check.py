@@ -115,7 +115,7 @@ def test_a_step_that_asks_for_more_than_its_limit_is_refused_with_both_numbers(t
 
 
 @pytest.mark.parametrize("between", [[], [{"do": "tare"}], [{"do": "release"}], [{"do": "grip"}]])
-def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path, between):
+def test_hold_torque_is_refused_without_an_identification_of_the_present_tool(tmp_path, between):
     identify, hold = {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.1}
     gripper = {"socket": {"host": "127.0.0.1"}}
     first = [identify] if between else []
@@ -175,7 +175,7 @@ def test_a_torque_that_the_driving_calibration_reads_as_none_is_refused(tmp_path
     assert f"step 2: {step['do']} turns clockwise" in loop.start(file, 0), "a running daemon refuses it too"
 
 
-def test_every_mistake_of_an_experiment_is_told_on_a_line_of_its_own(tmp_path):
+def test_every_mistake_of_an_experiment_has_a_line_of_its_own(tmp_path):
     hold = {"do": "hold_torque", "torque_nm": 0.1}
     mistakes = refusal(tmp_path, {"torque_source": "rigth", "steps": [{"do": "grip"}, hold, {"do": "release"}]})
     *others, last = mistakes.splitlines()
@@ -197,7 +197,7 @@ def test_every_mistake_of_an_experiment_is_told_on_a_line_of_its_own(tmp_path):
     assert len(refusal(tmp_path, {"limits": LIMITS, "steps": [twist, twist]}).splitlines()) == 2
 
 
-def test_a_file_that_is_none_is_told_with_its_name(tmp_path):
+def test_a_missing_experiment_file_is_refused_by_name(tmp_path):
     daemon = config(tmp_path, {})
     (tmp_path / "experiment.yaml").unlink()
     with pytest.raises(UserError, match=r"experiment\.yaml: the experiment cannot be read: No such file"):

@@ -81,7 +81,7 @@ def truth_that_falls_at(t_s: float, for_s: float) -> TorqueSeries:
     return TorqueSeries(times * S, torque)
 
 
-def test_a_disturbance_is_told_without_the_next_one():
+def test_the_summary_measures_a_disturbance_without_the_next_one():
     t_s = np.arange(0.0, 44.0, 0.1)
     fallen = 0.015 * ((t_s >= 20) & (t_s < 21)) + 0.08 * ((t_s >= 30) & (t_s < 33))
     truth = TorqueSeries(t_s * S, np.where(t_s < 13.0, 0.0, 0.1) - fallen)
@@ -90,7 +90,7 @@ def test_a_disturbance_is_told_without_the_next_one():
     assert "(second): 0.080 N·m off, back within ± 10% after" in text
 
 
-def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturbance():
+def test_the_summary_of_a_hold_has_true_torque_and_recovery_from_a_disturbance():
     text = summary_of_hold(truth_that_falls_at(26.0, 5.5), [(26 * S, "kick -0.03")])
     assert "'hold' was done, after 44 s" in text
     assert "  step 1 of 3  identify       10.0 s   stiffness" in text
@@ -164,11 +164,11 @@ def test_an_experiment_that_was_stopped_says_why():
 
 
 @pytest.mark.parametrize("phase", ["done", "stopped", "idle"])
-def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase):
+def test_a_run_that_was_not_heard_from_its_beginning_has_no_summary(phase):
     assert summary_of(loop_state(0, phase=phase)) == ""
 
 
-def test_the_pause_of_an_operator_is_told_beside_the_time_that_it_is_part_of():
+def test_the_summary_shows_the_operators_pause_beside_the_steps_duration():
     paused = {"phase": "paused", "hold": 1}
     text = summary_of_hold(None, [], loop_state(20, **paused), loop_state(23, **paused), loop_state(26.3, hold=1))
     assert "hold_torque    34.0 s   6.3 s of them paused" in text
@@ -182,7 +182,7 @@ def test_a_set_point_of_nothing_has_no_band():
     assert "within ±" not in text
 
 
-def test_where_a_screw_ended_and_what_it_took_is_told():
+def test_the_summary_of_a_tightening_has_the_angle_and_the_final_and_largest_torque():
     truth = TorqueSeries(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
     turning = {"step_name": "tighten", "torque_source": "load_cell", "set_point_nm": None}
     messages = [loop_state(10, **turning)]
@@ -251,7 +251,7 @@ def test_a_stop_that_was_asked_for_is_no_error(code):
         ("stopped", f"{FaultCode.TORQUE_LIMIT.text}, {FaultCode.OPERATOR_STOP.text}", False),
     ],
 )
-def test_the_summary_tells_a_persons_stop_from_a_faults(phase, code, as_asked):
+def test_a_run_ended_as_asked_only_if_it_was_done_or_an_operator_stopped_it(phase, code, as_asked):
     summary = RunSummary()
     assert summary.ended_as_asked
     for content in (loop_state(0), loop_state(5, phase=phase, faults=code)):

@@ -110,7 +110,7 @@ def defaults() -> Iterator[tuple[str, Place, object]]:
                 yield name, *found
 
 
-def test_no_default_stands_twice():
+def test_equal_defaults_of_one_name_come_from_one_constant():
     """One name may have several values, as in the steps of an experiment; equal values come from one constant."""
     places: dict[tuple[str, object], set[Place]] = defaultdict(set)
     for name, place, value in defaults():

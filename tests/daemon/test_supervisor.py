@@ -12,7 +12,7 @@ def test_pauses_double_from_half_a_second_to_half_a_minute():
     assert [restart_pause_s(deaths) for deaths in (1, 2, 3, 7, 8, 500)] == [0.5, 1.0, 2.0, 30.0, 30.0, 30.0]
 
 
-async def test_a_task_that_dies_is_started_again_and_its_death_is_told(monkeypatch):
+async def test_a_task_that_dies_is_restarted_and_its_error_is_recorded_and_logged(monkeypatch):
     monkeypatch.setattr(supervisor, "FIRST_PAUSE_S", 0.0)
     watched = Supervisor()
     starts = 0

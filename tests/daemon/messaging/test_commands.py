@@ -164,7 +164,7 @@ def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
     assert set(DAEMON_COMMANDS) == set(handled) == {*server.NEEDS_TOKEN, STATUS, STOP, EXPERIMENTS}
 
 
-async def test_commands_are_told_with_their_answer_and_questions_are_not():
+async def test_commands_are_reported_with_their_answer_and_questions_are_not():
     reported: list[tuple[str, str | None]] = []
     sensors = SimpleNamespace(tareable={"right": SimpleNamespace(tare=lambda **_: None)})
     handlers = Commands(

@@ -174,7 +174,7 @@ async def test_each_frame_is_estimated_and_then_published_in_order():
     assert publisher.messages == expected
 
 
-async def test_the_loop_is_told_why_a_valid_estimate_has_no_torque():
+async def test_the_loop_gets_the_reason_why_a_valid_estimate_has_no_torque():
     class DiameterAlone(FakeSession):
         why_no_torque = "there is no torque without the tool's diameter"
 
@@ -443,7 +443,7 @@ async def test_no_idle_frame_is_of_a_gripped_tool(complete, said, log):
     assert log.said == ["right has no idle frame: the gripper holds something"]
 
 
-async def test_whoever_waits_for_a_tare_is_told_at_once_that_the_gripper_holds_something():
+async def test_a_waiting_tare_fails_at_once_when_the_gripper_holds_something():
     clock, session = FixedClock(), Taring()
     held = resting_gripper()
     held.is_holding = False

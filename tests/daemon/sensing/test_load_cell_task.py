@@ -84,7 +84,7 @@ async def asked(task: LoadCellTask) -> asyncio.Task[str | None]:
     return zero
 
 
-async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile():
+async def test_both_callers_get_the_zero_when_a_second_one_asks_before_it_is_taken():
     async with reading() as (task, board):
         first = await asked(task)
         await board.send(5.0, ZERO_SAMPLES // 2)
@@ -122,7 +122,7 @@ async def test_a_slow_board_has_the_time_that_its_readings_take():
         assert task.diagnostics()["error"] == ""
 
 
-async def test_readings_that_know_of_the_load_before_are_not_of_the_zero():
+async def test_readings_that_began_before_the_tare_request_are_not_part_of_the_zero():
     """An HX711 settles within four conversions: a reading is of the time since three before its own began."""
     now_ns, period_ns = Clock().now_ns(), round(1e9 / 10.9)
     async with reading(clock=SimpleNamespace(now_ns=lambda: now_ns)) as (task, board):
@@ -185,7 +185,7 @@ async def test_health_quotes_the_last_refused_line():
         assert task.diagnostics()["error"] == board.refusal
 
 
-async def test_whoever_listens_is_told_of_a_zero_once_it_is_taken():
+async def test_the_loop_learns_when_a_zero_is_asked_for_and_when_it_is_taken():
     told: list[bool] = []
     loop = SimpleNamespace(on_torque=lambda _: None, on_zero=lambda _, known=True: told.append(known))
     async with reading(loop=loop) as (task, board):

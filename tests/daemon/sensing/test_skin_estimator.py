@@ -233,7 +233,7 @@ def test_a_zero_under_a_small_load_is_stated_in_the_interval(calibration, shear_
     assert holds(bench.push(0.8), 0.8)
 
 
-def test_a_zero_under_load_that_nothing_gave_away_is_told_when_the_load_goes(calibration):
+def test_an_unnoticed_zero_under_load_is_reported_when_the_load_goes(calibration):
     """The calibration's rest is that of this very load, so that the zero itself cannot be refused."""
     stretched = REST_OHM[0] * (1 + 0.088 * 0.8), REST_OHM[1]
     bench = Bench(calibration.model_copy(update={"rest_ohm": stretched}))

@@ -35,7 +35,7 @@ def test_temperature_changes_both_gauges_and_is_no_load():
 
 
 @pytest.mark.parametrize("shear_n", [-2.0, -0.5, 0.4, 1.0])
-def test_a_zero_under_load_is_refused_and_the_load_is_told(shear_n):
+def test_a_zero_under_load_is_refused_and_the_refusal_quotes_the_load(shear_n):
     stretch = SLOPE * abs(shear_n)
     r1, r2 = (24.6 * (1 + stretch), 25.3) if shear_n > 0 else (24.6, 25.3 * (1 + stretch))
     why = taken(r1, r2)
@@ -49,7 +49,7 @@ def test_a_zero_under_a_load_too_small_to_be_refused_says_how_wrong_it_may_be():
     assert zero.uncertainty == pytest.approx(SLOPE * 0.1, rel=0.1)
 
 
-def test_swapped_gauges_are_told_from_a_load():
+def test_a_zero_names_swapped_gauges_and_does_not_mistake_a_load_for_them():
     assert "swapped" in taken(25.3, 24.6)
     assert "swapped" not in taken(24.6 * 1.12, 25.3)
 
@@ -61,7 +61,7 @@ def test_a_gauge_that_drifts_while_the_zero_is_taken_is_named(gauge):
     assert f"gauge {gauge} changed by +0.3" in why
 
 
-def test_a_bad_contact_is_told_by_its_noise():
+def test_a_zero_names_the_gauge_with_a_bad_contact_by_its_noise():
     jitter = 1 + 0.01 * np.random.default_rng(1).normal(0, 1, 20)
     assert "gauge 2 scatters" in taken(24.6, 25.3 * jitter)
 

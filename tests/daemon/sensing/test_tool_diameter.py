@@ -13,7 +13,7 @@ def estimate(diameter_mm: float, half_width_mm: float) -> Estimate:
     )
 
 
-def test_fingertips_apart_are_weighed_and_both_together_hold_them_already():
+def test_the_diameter_of_two_fingertips_is_their_weighted_mean_or_the_combined_one():
     diameters = FingertipDiameters("combined")
     assert diameters.latest(0) is None
     diameters.update("right", estimate(20.0, 2.0), 0)

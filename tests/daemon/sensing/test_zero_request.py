@@ -42,7 +42,7 @@ def test_a_request_ends_once(state):
     ("state", "told"),
     [(ZeroState.TAKEN, None), (ZeroState.FAILED, "it is loaded"), (ZeroState.EXPIRED, "nothing came")],
 )
-async def test_whoever_waits_is_told_how_the_latest_request_ends(state, told):
+async def test_waiting_for_a_replaced_request_returns_the_end_of_the_latest_one(state, told):
     first = ZeroRequest(0, 10)
     async with running(first.wait(60.0, lambda: "too late")) as (waiting,):
         await asyncio.sleep(0)

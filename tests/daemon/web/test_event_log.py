@@ -20,7 +20,7 @@ def loop(phase: str, step: int = 1, **changed: Any) -> tuple[str, dict[str, Any]
     return "loop.state", {**state, "reasons": "", "response": "note", **changed}
 
 
-def test_steps_holds_and_stops_are_told_once_each():
+def test_the_event_log_lists_each_step_hold_and_stop_once():
     assert lines(
         loop("idle"),
         loop("running"),
@@ -53,7 +53,7 @@ def test_steps_holds_and_stops_are_told_once_each():
     ]
 
 
-def test_commands_are_told_with_who_sent_them_and_why_they_were_refused():
+def test_the_event_log_lists_commands_with_their_sender_and_reason_of_refusal():
     sent = {"command": "start", "subject": "hold.yaml", "by": "ann@rig, the live page", "accepted": True, "reason": ""}
     refused = {**sent, "command": "tare", "subject": "", "accepted": False, "reason": "something is held"}
     assert lines(("daemon.command", sent), ("daemon.command", refused), ("daemon.command", refused)) == [
@@ -62,7 +62,7 @@ def test_commands_are_told_with_who_sent_them_and_why_they_were_refused():
     ]
 
 
-def test_faults_of_tasks_and_devices_and_the_end_are_told():
+def test_the_event_log_lists_faults_of_tasks_and_devices_and_the_daemons_end():
     alive, dead = {"alive": True, "error": ""}, {"alive": False, "last_error": "RuntimeError: a bug"}
     times = {"experiment": "hold", "decided_after_s": 0.004, "sent_after_s": 0.006, "stands_after_s": None}
     assert lines(
@@ -105,7 +105,7 @@ def test_what_began_before_the_viewer_is_not_dated_at_its_start():
     assert lines(loop("stopped", cause="the torque is old.", response="stop and keep grip"))[0][1].endswith(since)
 
 
-def test_a_stop_that_was_not_sent_tells_why():
+def test_the_event_log_says_why_a_stop_was_not_sent():
     times = {"experiment": "hold", "decided_after_s": 0.0, "sent_after_s": None, "stands_after_s": 0.096}
     times |= {"refusal": "Nothing can be sent.", "blocked_after_s": 0.004}
     assert lines(("loop.stop", times)) == [

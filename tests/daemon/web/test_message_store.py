@@ -157,7 +157,7 @@ def test_k_and_sigma_are_marked_only_where_they_are_heights(model, labels, meani
 
 
 @pytest.mark.parametrize(("model", "unit"), [("linear", "cm"), ("modulated_gaussian", "rad/cm"), ("unknown", "")])
-def test_a_heatmap_tells_the_unit_of_k(model, unit):
+def test_a_heatmap_has_the_unit_of_k_of_its_model(model, unit):
     latest = MessageStore(3.6)
     latest.add("eit.heatmap", message(scores=np.ones((3, 3)), model=model), 1.0)
     assert batch(latest)["messages"][0]["k_unit"] == unit

@@ -87,7 +87,7 @@ async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing():
         assert rest.data == b"kept"
 
 
-async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told():
+async def test_a_read_or_write_after_the_port_has_gone_raises_device_lost():
     with PtyPort() as peer, SerialPort(peer.path) as port:
         reading = asyncio.create_task(port.read(DEADLINE_S))
         await asyncio.sleep(0)

@@ -131,7 +131,7 @@ async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next
     assert kit.diagnostics()["errors"] == {}
 
 
-async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path):
+async def test_a_missing_board_is_awaited_and_reported_as_new_only_once(tmp_path):
     links = LinkEvents()
     kit = EitKit(SerialLink(path=tmp_path / "eit", monitor=LinkMonitor(links)), PAPER_TABLE.zero_slots)
     taking = asyncio.create_task(take(kit.readings(), 1))

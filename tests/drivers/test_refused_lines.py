@@ -35,7 +35,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("line", "expected", "who", "cure"), CASES)
-def test_who_sends_a_line_and_what_to_do(line, expected, who, cure):
+def test_a_refused_line_names_its_probable_sender_and_the_cure(line, expected, who, cure):
     found_who, found_cure = sender_of(line, expected)
     assert who in found_who
     assert cure in found_cure

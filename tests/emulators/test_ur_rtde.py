@@ -44,7 +44,7 @@ def replies(data: bytes) -> list[tuple[int, bytes]]:
     return found
 
 
-def test_conversation_of_a_client():
+def test_a_client_sets_up_its_recipes_and_receives_the_requested_values():
     rtde = session()
     assert replies(rtde.receive(CONVERSATION)) == [
         (ord("V"), b"\x01"),

@@ -90,7 +90,7 @@ def test_a_reading_that_was_not_made_is_refused(text):
         read_elements(Reply(text, 0, 0))
 
 
-def test_an_overload_of_the_scanner_is_told_by_channel():
+def test_an_overload_of_the_scanner_names_its_channel():
     voltages = read_scan(Reply("+9.90000000E+37,-1.25000000E-01", 100, 300))
     assert (voltages.over_1, voltages.over_2, voltages.t_mid_ns) == (True, False, 200)
     assert parse_numbers("-1,2.5E3", 2, "It") == [-1.0, 2500.0]

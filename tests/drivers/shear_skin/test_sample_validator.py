@@ -121,7 +121,7 @@ def test_voltages_from_before_the_current_flowed_are_not_called_a_short():
     assert one.sample(voltages(0.0, 0.0, 6), on).faults == (SkinFault.SHORT_1, SkinFault.SHORT_2)
 
 
-def test_a_converter_that_stands_still_is_told_by_gauge():
+def test_a_converter_that_stands_still_is_reported_for_its_gauge():
     one = judge()
     sources = [replace(GOOD, t_ns=n * 10**8) for n in range(60)]
     samples = [one.sample(voltages(0.123, 0.126 + 1e-6 * (n % 2), n), source) for n, source in enumerate(sources)]

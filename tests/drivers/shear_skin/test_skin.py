@@ -112,7 +112,7 @@ async def test_resistances_come_through_over_every_way_in(tmp_path, serial_sourc
 
 @pytest.mark.parametrize("serial_source", [True, False])
 @pytest.mark.parametrize("outage", ["silence", "unplug"])
-async def test_a_source_that_cannot_be_switched_off_is_told(tmp_path, serial_source, outage):
+async def test_a_source_that_cannot_be_switched_off_at_the_end_is_reported(tmp_path, serial_source, outage):
     async with a_bench(tmp_path, serial_source=serial_source, adc=True, deadline_s=0.1) as bench:
         bench.command(f"source {outage}")
         await bench.next_says(SkinFault.SOURCE_LOST)
@@ -160,7 +160,7 @@ async def test_a_source_that_is_silent_or_gone_is_named_and_set_up_again_without
         assert openings >= 3
 
 
-async def test_a_source_that_is_switched_off_by_hand_stays_off_and_says_so(tmp_path):
+async def test_a_source_that_the_operator_switches_off_stays_off_and_is_reported(tmp_path):
     async with a_bench(tmp_path, serial_source=False, adc=False) as bench:
         bench.circuit.output_on = False
         await bench.next_says(SkinFault.SOURCE_OFF)

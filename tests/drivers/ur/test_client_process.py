@@ -175,7 +175,7 @@ async def worker_told(told: list[Held]) -> None:
             await asyncio.sleep(0)
 
 
-async def test_a_worker_is_told_what_is_held_at_its_start_and_at_each_change(play, told):
+async def test_a_worker_gets_what_is_held_at_its_start_and_at_each_change(play, told):
     play("exec cat")
     holds = [True]
     robot = UrRobot(settings_for("127.0.0.254"))

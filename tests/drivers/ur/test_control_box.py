@@ -96,7 +96,7 @@ def test_controller_of_the_other_generation_is_named(generation, version, cure):
     check_generation(UrSettings("10.0.0.1", limits, generation=generation), own)
 
 
-def test_several_closed_ports_are_told_together():
+def test_several_closed_ports_are_named_in_one_sentence():
     said = closed_ports_sentence("arm", [30004, 29999], ())
     assert "30004 (RTDE) and 29999 (Dashboard Server)" in said
     assert f"enable RTDE and Dashboard Server under {MENU}" in said
@@ -104,7 +104,7 @@ def test_several_closed_ports_are_told_together():
 
 
 @pytest.mark.parametrize("request_", ["power on", "brake release", "unlock protective stop", "stop", "close popup"])
-async def test_local_control_is_told_at_once_in_the_controllers_own_words(request_):
+async def test_a_request_in_local_control_is_refused_with_the_controllers_own_words(request_):
     async with serving() as controller:
         controller.command("local-control")
         with pytest.raises(DriverError) as refused:
@@ -115,7 +115,7 @@ async def test_local_control_is_told_at_once_in_the_controllers_own_words(reques
     assert f"`{request_}`" in str(refused.value)
 
 
-async def test_what_is_carried_out_says_nothing_and_a_refused_necessity_says_why():
+async def test_a_dashboard_request_returns_nothing_if_done_and_raises_the_refusal():
     robot = Robot()
     async with serving(robot):
         for requests in (("close popup", "close safety popup"), ("stop",), ("power on",), ("brake release",)):

@@ -61,7 +61,7 @@ def test_intervals_hold_cylinders_that_the_line_was_not_fitted_to():
     assert np.mean(inside) >= 0.85
 
 
-def test_the_interval_tells_how_far_grips_differ_that_the_line_goes_through():
+def test_the_interval_covers_grips_that_differ_although_the_line_fits_them():
     """A line through four places that differ in more than the diameter is exact for these, and for no other."""
     places = gaussian_filter1d(np.random.default_rng(8).normal(size=(4, 2 * PAPER_TABLE.n_channels)), 4.0, axis=1)
     placed = []

@@ -45,7 +45,7 @@ def _n_valid_of_whole(calibration: Calibration, bank: Bank) -> int:
 
 @pytest.mark.parametrize("start", [0, DEATH])
 @pytest.mark.parametrize("dead", list(DEAD))
-def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank, dead, start):
+def test_estimates_stay_valid_and_cover_the_truth_when_channels_die_after_calibration(calibration, bank, dead, start):
     series = twisting(seed=3, cycles=3)
     whole = _n_valid_of_whole(calibration, bank)
     found = judged(without(DEAD[dead], start, series, Session(calibration, bank)), series)
@@ -67,7 +67,7 @@ def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibrati
 
 
 @pytest.mark.parametrize("start", [0, DEATH])
-def test_torques_that_the_dead_channels_alone_told_of_are_refused(monkeypatch, start):
+def test_a_torque_that_only_dead_channels_respond_to_is_refused(monkeypatch, start):
     tip = conftest.tip
 
     def felt_by_one_electrode(number: int) -> conftest.Tip:
@@ -180,7 +180,7 @@ def test_channels_that_come_back_while_idle_are_used_from_then_on(motion_calibra
 
 
 @pytest.mark.parametrize("start", [0, DEATH])
-def test_a_channel_that_reads_0_is_masked_without_being_told(calibration, bank, start):
+def test_a_channel_that_reads_0_is_masked_without_a_flag(calibration, bank, start):
     """Recordings and callers of the library hand over channels alone."""
     series = twisting(seed=3, cycles=2)
     expected = without(ELECTRODE, start, series, Session(calibration, bank))

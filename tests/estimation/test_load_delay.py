@@ -107,7 +107,7 @@ def unmoved(recorded):
     return replace(recorded, channels=recorded.channels[50] + noise)
 
 
-def test_times_are_unchecked_where_no_recording_tells_or_only_roughly(recorded, monkeypatch):
+def test_times_are_uncertain_where_no_recording_shows_the_delay_well(recorded, monkeypatch):
     assert find_load_delay(unmoved(recorded)) is None
     assert measure_timing([recorded]).uncertainty_s == 0.0
     assert measure_timing([unmoved(recorded)]).uncertainty_s == 0.75

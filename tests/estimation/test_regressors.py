@@ -118,7 +118,7 @@ def test_a_curve_needs_enough_frames():
 
 
 @pytest.mark.parametrize("n", [8, 13, 19, 20, 49, 500])
-def test_what_is_judged_comes_later_or_is_left_out(n):
+def test_judged_rows_come_after_the_fitted_ones_or_are_left_out_of_them(n):
     for past, future in [*later_splits(n), *later_origins(n)]:
         assert past.max() < future.min()
     assert all(future.max() == n - 1 for _, future in later_origins(n))
@@ -129,7 +129,7 @@ def test_what_is_judged_comes_later_or_is_left_out(n):
     assert all(not set(rest) & set(block) for rest, block in left_out_blocks(n))
 
 
-def test_of_equal_strengths_the_strongest():
+def test_the_strongest_of_equally_good_strengths_is_chosen():
     def fit(_features, _values, strength):
         return SimpleNamespace(predict=lambda rows: rows[:, 0] + (5.0 if strength == 10.0 else 1.0))
 

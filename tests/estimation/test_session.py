@@ -112,7 +112,7 @@ def test_frames_with_a_quarter_of_noise_are_not_valid_and_the_others_are(motion_
     assert rmse < 0.005
 
 
-def test_another_fingertip_is_told_by_its_pattern(motion_calibration):
+def test_another_fingertip_is_recognised_by_its_pattern_and_refused(motion_calibration):
     for tips in ((2, 1), (1, 3), (4, 5)):
         estimates = follow(motion_calibration, twisting(seed=9, tips=tips))
         assert not any(one.valid for one in estimates)
@@ -132,14 +132,14 @@ def test_dead_channels_are_done_without_and_widen_the_interval(motion_calibratio
     assert all(b > a for a, b in widths)
 
 
-def test_too_many_dead_channels_end_it(motion_calibration):
+def test_too_many_dead_channels_give_no_valid_estimate(motion_calibration):
     usable = np.random.default_rng(0).random((2, 896)) > 0.4
     estimates = follow(motion_calibration, twisting(seed=11), usable)
     assert not any(one.valid for one in estimates)
     assert "dead or saturated" in estimates[100].reasons[0]
 
 
-def test_one_fingertip_does_too_and_two_do_better():
+def test_two_fingertips_have_a_smaller_error_than_one():
     other = twisting(seed=14, noise_v=0.003)
     errors = {}
     for sides in (("right",), ("right", "left")):
@@ -382,7 +382,7 @@ def test_an_ordinary_frame_is_at_no_rail():
     assert mask_unmeasured(frame, np.ones(frame.shape, dtype=np.bool_)).all()
 
 
-def test_of_as_many_as_are_at_a_rail_one_less_is_chance():
+def test_nine_channels_at_one_value_are_masked_and_eight_are_not():
     frame = np.linspace(0.1, 0.2, 896)[None]
     for count in range(1, 20):
         frame[0, :count] = 0.7

@@ -23,7 +23,7 @@ def test_fused_measurements_lie_between_and_cover_the_ones_that_contradict_each_
 
 
 @given(st.lists(measurements, max_size=6), st.randoms())
-def test_things_are_as_many_as_their_measurements_tell_apart(several, random):
+def test_measurements_within_their_uncertainty_count_as_one_value(several, random):
     things = distinct(several)
     assert set(things) <= set(several)
     assert (things == []) == (several == [])
@@ -48,7 +48,7 @@ def test_the_interval_of_fused_measurements_holds_the_truth_as_often_as_it_says(
     assert 0.94 < np.mean([one is not None and abs(one.value) <= one.half_width for one in found]) < 0.99
 
 
-def test_nothing_measured_is_nothing():
+def test_combining_no_finite_measurement_gives_none():
     assert combine(None, None) is None
     assert combine(Measured(1.0, float("inf")), Measured(2.0, float("inf"))) is None, "each may be anything"
     with pytest.raises(ValueError, match="without uncertainty"):

@@ -114,7 +114,7 @@ def test_the_range_holds_the_force_whatever_came_before(path):
 
 
 @given(forces)
-def test_a_change_of_response_tells_the_direction_and_with_it_the_force(path):
+def test_a_change_of_response_gives_the_direction_and_with_it_the_force(path):
     before = 0.0
     for state, (shear_n, normal_n) in zip(walk(path), path, strict=True):
         now = net(state)

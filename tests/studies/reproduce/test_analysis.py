@@ -192,7 +192,7 @@ def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift, lackin
         np.array([0.1]),
     ],
 )
-def test_what_is_no_repeated_series_is_told(values):
+def test_place_in_series_returns_none_for_values_that_are_no_repeated_series(values):
     assert place_in_series(values) is None
 
 

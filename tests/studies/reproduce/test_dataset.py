@@ -30,7 +30,7 @@ def test_the_channels_that_follow_the_torque_come_first_and_are_enough():
     assert regress_on_channels(slices, parts)[0].r2[0] == pytest.approx(by_hand, abs=1e-12)
 
 
-def test_a_share_is_reached_first_and_for_good():
+def test_counts_reaching_returns_the_first_and_the_lasting_channel_count():
     counts = np.array([1, 2, 3, 4, 5])
     found = ChannelRegression("", counts, counts / 10.0, np.array([0.1, 0.9, 0.2, 0.95, 1.0]))
     assert found.counts_reaching(0.8) == (2, 4)

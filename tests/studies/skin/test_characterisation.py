@@ -9,7 +9,7 @@ from shearloop.estimation.skin.membrane import THICK_SECTION, Membrane
 from shearloop.studies.skin.characterisation import fit_line, loading, loop, responses
 
 
-def test_a_line_by_hand():
+def test_the_fitted_line_and_its_prediction_interval_have_the_textbook_values():
     line = fit_line(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 1.0, 3.0, 3.0]))
     assert (line.slope_per_n, line.kink_n) == pytest.approx((0.8, -1.0))
     # t(0.975, 2) = 4.3027

@@ -64,7 +64,7 @@ def reader_of(features, values, **options) -> SliceRegressor:
     return fit_slice_regressor(features, values, Ridge.fit, strengths=(1e-9,), fit_line=Ridge.fit, **options)
 
 
-def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it():
+def test_a_saturated_reading_has_an_interval_far_beyond_the_range():
     rng = np.random.default_rng(1)
     values = rng.uniform(0.0, 1.0, 200)
     reader = reader_of(saturating(values) + rng.normal(0, 1e-3, (200, 2)), values - 0.5)
@@ -76,7 +76,7 @@ def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it(
     assert max(below, above) < 0.3
 
 
-def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_anywhere_above_that():
+def test_a_response_that_folds_back_beyond_the_range_widens_the_interval_upwards():
     """Left out, a tenth of the range beyond is read a tenth inside: so half a range beyond, half of it inside."""
     values = np.random.default_rng(5).uniform(0.0, 1.0, 200)
 
@@ -106,7 +106,7 @@ def test_what_is_read_at_the_end_towards_zero_may_be_no_load_at_all(sign):
 
 
 @pytest.mark.parametrize("steps", [1, 2, 4])
-def test_equal_values_do_not_tell_where_the_outermost_of_them_are(steps):
+def test_the_range_ends_below_the_largest_values_where_they_are_equal(steps):
     """As torques that were commanded, not measured: more than a fifth are the largest, and some of these were kept.
 
     Of one step nothing is left to tell the others by, and as far as the largest are read now nothing is known.
@@ -139,7 +139,7 @@ def test_where_values_beyond_are_read_as_such_intervals_reach_twice_as_far_beyon
     assert below < 0.01
 
 
-def test_how_much_is_the_own_response_is_told_whatever_the_torque_does():
+def test_the_response_share_does_not_depend_on_the_torque():
     frames = sliced().channels[:, 0]
     guard = NoveltyDetector.fit(frames, PAPER_TABLE)
     own = guard.response_share(frames[35], ALL)
@@ -234,7 +234,7 @@ def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_n
     assert any("opposite injections" in why or "Q residual" in why for why in guard.reasons(foreign, ALL))
 
 
-def test_what_one_of_the_two_does_not_say_is_left_out():
+def test_the_reciprocity_check_leaves_out_pairs_with_an_unusable_channel():
     frames = noisy_slices(50, 5)
     twins = ReciprocityCheck.fit(frames[:40], PAPER_TABLE)
     usable = ALL.copy()

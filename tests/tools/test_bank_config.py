@@ -140,7 +140,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_build_writes_the_bank_and_tells_its_identity(folder, tmp_path, capsys, result_of):
+def test_build_writes_the_bank_and_reports_its_identity(folder, tmp_path, capsys, result_of):
     capsys.readouterr()
     build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", f"{tmp_path}/b.bank", "--jobs", "1"]
     result = result_of(*build)

@@ -61,7 +61,7 @@ def test_a_wrong_scale_of_the_estimator_is_not_taken_for_creep():
 
 
 @pytest.mark.parametrize(("fingertip_nm", "load_cell_nm"), [(0.02, 0.0), (0.0, 0.005)])
-def test_several_grips_tell_as_much_as_one_long_one_and_a_wrong_zero_tells_hardly_anything(fingertip_nm, load_cell_nm):
+def test_several_grips_give_the_same_creep_and_a_wrong_zero_hardly_changes_it(fingertip_nm, load_cell_nm):
     """The load cell's zero was taken when the recording began; a fingertip's may be far off."""
     times, shears, torques = twisted(300.0)
     found = fit_creep([Stretch(t_s, shears + fingertip_nm, torques + load_cell_nm) for t_s in (times, times + 1e4)])

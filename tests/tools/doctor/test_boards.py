@@ -120,7 +120,7 @@ async def test_an_electrode_whose_channels_stand_still_or_read_0_is_dead_and_nam
     assert "connector" in found.next_step
 
 
-async def test_single_channels_without_a_signal_are_told_from_electrodes(rig):
+async def test_single_dead_channels_are_not_taken_for_a_dead_electrode(rig):
     scattered = np.arange(896) % 97 == 0
     found = (await rig(frames(silent=scattered)))["channels of right"]
     assert (found.state, "10 dead" in found.found, "electrode" in found.found) == ("trouble", True, False)
@@ -216,7 +216,7 @@ async def test_bytes_without_a_line_end_are_quoted(rig):
     assert "0.1234, 0.1234" in found.found
 
 
-async def test_a_silent_board_and_a_slow_one_are_told_so(rig):
+async def test_a_silent_board_and_a_too_short_check_have_their_own_cures(rig):
     found = await rig(texts(b""))
     assert "nothing was received in 0.6 s" in found["rate of right"].found
     assert "power" in found["rate of right"].next_step
@@ -234,7 +234,7 @@ async def test_a_silent_board_and_a_slow_one_are_told_so(rig):
         (counts(torque_nm=3.0), True, "beyond the cell's capacity", "tare"),
     ],
 )
-async def test_what_is_wrong_with_the_load_cells_signal_is_told(rig, tmp_path, load, calibrated, part, cure):
+async def test_a_fault_of_the_load_cells_signal_is_named_with_its_cure(rig, tmp_path, load, calibrated, part, cure):
     save_calibration(tmp_path / "load.yaml", CALIBRATION)
     changes = {"calibration": str(tmp_path / "load.yaml")} if calibrated else {}
     found = (await rig(load=load, **changes))["signal of load_cell"]

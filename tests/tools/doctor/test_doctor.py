@@ -104,14 +104,14 @@ def test_doctor_stops_at_an_invalid_configuration(tmp_path, ran, result_of, mist
     assert main(["doctor", "--seconds", "nan"]) == 2
 
 
-def test_the_clock():
+def test_the_clock_is_judged_by_its_year_and_its_synchronisation():
     assert doctor.check_clock(1e9, 0).state == "trouble"
     assert doctor.check_clock(1.8e9, 5).state == "note"
     assert doctor.check_clock(1.8e9, 0).state == "good"
     assert doctor.clock_state() in range(-1, 6)
 
 
-def test_the_disk(tmp_path, monkeypatch):
+def test_the_disk_is_judged_by_its_free_space(tmp_path, monkeypatch):
     for free, state in ((1e8, "trouble"), (1e9, "note"), (1e11, "good")):
         monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
         assert doctor.check_disk(tmp_path / "not/yet/there").state == state
@@ -246,7 +246,7 @@ def usb_bus(folder: Path, *, port: bool, vendor: str = "1a86") -> Path:
     return folder
 
 
-def test_a_board_without_a_port_is_told_from_one_with_a_port(tmp_path):
+def test_only_a_board_without_a_port_is_listed_as_hidden(tmp_path):
     assert list_hidden_boards(usb_bus(tmp_path / "with", port=True)) == []
     (found,) = list_hidden_boards(usb_bus(tmp_path / "without", port=False))
     assert (found.usb, found.likely) == ("1a86:7523", "load cell (CH340)")

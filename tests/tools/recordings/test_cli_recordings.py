@@ -171,7 +171,7 @@ def test_files_of_an_earlier_export_are_named(form, mat_folder, tmp_path, ran):
     assert exported == ["", "", f"Not of this export, and there before: {left}.\n"]
 
 
-def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alone():
+def test_reasons_that_differ_only_in_numbers_are_counted_under_one_real_example():
     said = [
         "outside the calibration: the Q residual is 2.1 (at most 1.5)",
         "right fingertip: 7 % of the channels jumped since the last frame; it was touched",

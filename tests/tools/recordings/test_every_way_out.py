@@ -313,13 +313,13 @@ def check(one: Recorded, out: Path, ran: Any, mistake: Any) -> None:
         check_replay(one)
 
 
-def test_of_every_topic_with_empty_keys_and_odd_texts(tmp_path, ran, mistake):
+def test_every_export_gives_back_every_topic_with_empty_keys_and_odd_texts(tmp_path, ran, mistake):
     one = made(tmp_path)
     assert {live_topic(topic) for topic in one.rows()} >= set(TOPICS)
     check(one, tmp_path / "out", ran, mistake)
 
 
-def test_of_the_skin(tmp_path, ran, mistake):
+def test_every_export_gives_back_a_recording_of_the_skin(tmp_path, ran, mistake):
     published = asyncio.run(test_skin_replay.recorded(tmp_path, socket=False, average_s=0.02))
     check(Recorded(latest_recording(tmp_path / "recordings"), published), tmp_path / "out", ran, mistake)
 
@@ -341,7 +341,7 @@ async def absent(path: Path) -> Published:
 
 
 @pytest.mark.usefixtures("ur_rtde")
-def test_with_absent_devices(config, tmp_path, ran, mistake):
+def test_every_export_gives_back_a_recording_with_absent_devices(config, tmp_path, ran, mistake):
     robot_at(own_address(5), tmp_path)
     path = config(
         load_cell={"device": {"path": "no-load-cell"}},
@@ -365,7 +365,7 @@ async def twisted(config: Path, bank: Path, path: Path) -> tuple[Published, Watc
 
 
 @pytest.mark.real_time
-def test_of_the_whole_rig(rig_config, tiny_bank, tmp_path, ran, mistake):
+def test_every_export_gives_back_a_recording_of_the_whole_rig(rig_config, tiny_bank, tmp_path, ran, mistake):
     content = yaml.safe_load(rig_config.read_text())
     rig_config.write_text(yaml.safe_dump({**content, "recording": {"folder": str(tmp_path / "recordings")}}))
     twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.3, "hold_s": 1.5}

@@ -101,7 +101,7 @@ def of_all_twists(twists) -> Calibration:
     return fit("motion_regression", [twists], "all")
 
 
-def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders, of_one_cylinder):
+def test_a_grip_is_recognised_on_a_recording_of_another_tool(cylinders, of_one_cylinder):
     """Fitted to one cylinder each, whose grips are from a tenth to eight times as strong as on the others."""
     idle_s, held_s = 7.0, (24.5, 87.0)
     for calibration in of_one_cylinder.values():
@@ -139,7 +139,7 @@ def test_cylinders_that_turn_differently_give_a_diameter_and_a_gain_for_each(cyl
 @pytest.mark.parametrize(
     ("sides", "r", "rmse_nm"), [(("right",), 0.85, 0.008), (("left",), 0.85, 0.008), (("right", "left"), 0.93, 0.0055)]
 )
-def test_later_twists(twists, sides, r, rmse_nm):
+def test_later_twists_are_read_with_the_expected_error_and_coverage(twists, sides, r, rmse_nm):
     series = twists.select_sides(sides)
     past = [part_of(series, 0, HALF)]
     timing = measure_timing(past, [part_of(twists, 0, HALF)])
@@ -203,7 +203,7 @@ def test_three_twists_of_a_gain_that_drifts_make_later_ones_no_worse(twists_file
     assert after["coverage_95"] > 0.9
 
 
-def test_later_torque_slices(slices, earlier):
+def test_later_torque_slices_are_read_with_the_expected_error_and_coverage(slices, earlier):
     """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
     for n, (rmse_nm, winkler_nm) in LATER_SLICES.items():
         figures = figures_of([estimate_slices(earlier("motion_regression", n), slices.between(n, 49))])
@@ -260,7 +260,8 @@ def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_n
     figures = figures_of([estimate_slices(calibration, select_rows(slices, ~inside))])
     assert figures["valid_fraction"] > 0.9, "or nothing would be tested"
     assert figures["coverage_95"] >= 0.9
-    # As where somebody has vouched that no other will come, which changes nothing else (test_later_torque_slices).
+    # As where somebody has vouched that no other will come, which changes nothing else
+    # (test_later_torque_slices_are_read_with_the_expected_error_and_coverage).
     reader = _without_ends(calibration.torque.regressor)
     vouched = replace(calibration, torque=replace(calibration.torque, regressor=reader))
     vouched_for = figures_of([estimate_slices(vouched, select_rows(slices, ~inside))])
@@ -283,7 +284,7 @@ def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_interval
     assert np.mean(missed) <= 0.1
 
 
-def test_later_slices_of_the_cylinders(shared):
+def test_later_slices_of_the_cylinders_are_read_within_5_mm(shared):
     (series,) = read_slices(shared / "recordings/diameter_slices")
     calibration = fit_slices("motion_regression", [part_of(series, 0, 0.62)], "earlier")
     figures = figures_of([estimate_slices(calibration, part_of(series, 0.62, 1))])

@@ -86,7 +86,7 @@ def test_the_gripper_says_which_tool_it_held(tmp_path):
     assert read_series(path, tool_mm=20.0)[0].tool_mm == Measured(20.0, 0.0)
 
 
-def test_a_gripper_that_told_nothing_leaves_the_tool_unknown(tmp_path):
+def test_a_gripper_that_reports_no_width_leaves_the_tool_unknown(tmp_path):
     for number, held in enumerate(((), ((5, None),), ((39, TEN), (40, TWENTY)))):
         (series,) = read_series(recorded(tmp_path / str(number), *held))
         assert series.tool_mm == (TEN if number == 2 else None)
@@ -99,7 +99,7 @@ def test_a_gripper_that_told_nothing_leaves_the_tool_unknown(tmp_path):
         (None, ((5, TEN), (20, TWENTY)), "the gripper held tools of 20.1 and 10.2 mm"),
     ],
 )
-def test_who_disagrees_about_the_tool_is_told_unless_somebody_knows(tmp_path, named_mm, held, why):
+def test_contradictory_tools_are_refused_unless_the_caller_names_the_tool(tmp_path, named_mm, held, why):
     recording = read_recording(recorded(tmp_path, *held, named_mm=named_mm))
     with pytest.raises(UserError, match=why):
         series_of(recording)

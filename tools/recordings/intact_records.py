@@ -4,6 +4,7 @@ Chunks and attachments have a checksum. If a record's own length is damaged, rea
 the index names, or at the next bytes that have the form of a chunk.
 """
 
+import mmap
 import os
 import struct
 import zlib
@@ -46,6 +47,7 @@ from shearloop.errors import UserError
 from shearloop.files import open_file
 
 Progress = Callable[[int], None]
+_JOINED = "several recordings follow one another in this file, whose messages would be mixed; repair each alone"
 NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
 # A recorder makes chunks of 16 MB and attaches files of up to 32 MB.
 LARGEST_RECORD_BYTES = 64 << 20
@@ -139,11 +141,13 @@ class IntactRecords:
         return {topic: count for topic, count in sorted(found.items()) if count}
 
     def __iter__(self) -> Iterator[Message | Metadata | Attachment]:
-        """Read the file; raises UserError if it is missing or not MCAP."""
+        """Read the file; raises UserError if it is missing, not MCAP, or of several recordings."""
         try:
             with open_file(self._path) as file:
                 self.size = os.fstat(file.fileno()).st_size
                 check_magic(self._path, file)
+                if _begins_again(file):
+                    raise UserError(f"{self._path}: {_JOINED}")
                 yield from self._records(file)
         except OSError as error:
             raise UserError(f"{self._path}: the recording cannot be read: {error.strerror or error}") from error
@@ -266,6 +270,12 @@ def check_magic(path: Path, file: BinaryIO) -> None:
     """Raise UserError for a file that is not MCAP; leaves it after the magic bytes."""
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise UserError(f"{path}: this is not an MCAP file, or is empty; there is nothing to read")
+
+
+def _begins_again(file: BinaryIO) -> bool:
+    """Return whether another recording begins within the file: numbers of channels and places are a recording's own."""
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        return content.find(MCAP0_MAGIC + bytes([Opcode.HEADER]), 1) >= 0
 
 
 def check_size(chunk: Chunk) -> None:

@@ -22,6 +22,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder
 from shearloop.daemon.recorder.schema import basic_identity
+from shearloop.daemon.recorder.writer import new_recording
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.tools.recordings.export import export
@@ -274,3 +275,16 @@ def test_an_unknown_packing_is_named(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"\x03\0\0\0lz4", b"\x03\0\0\0xyz"))
     with pytest.raises(UserError, match="packed by 'xyz', which is neither zstd nor lz4"):
         read_recording(path)
+
+
+@pytest.mark.parametrize("cut", [0, 1, 400])
+def test_recordings_that_were_joined_by_cat_are_refused(content, cut, tmp_path):
+    """The numbers of channels are a file's own: messages of the second one would land under topics of the first."""
+    with new_recording(tmp_path / "other.mcap", "a bench", {}) as writer:
+        writer.add_torque(10**18, 0.01)
+    other = (tmp_path / "other.mcap").read_bytes()
+    for number, second in enumerate((content, other)):
+        path = tmp_path / f"joined-{number}.mcap.partial"
+        path.write_bytes(content[: len(content) - cut] + second)
+        with pytest.raises(UserError, match="several recordings follow one another"):
+            repair(path)

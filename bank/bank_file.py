@@ -244,7 +244,7 @@ def how_to_build(path: Path) -> str:
     """Return a sentence with the command that builds a bank, from the definition with its name where there is one."""
     folders = path.parent / "banks", path.parent, path.parent.parent / "config" / "banks"
     definitions = [folder / f"{path.stem}.yaml" for folder in folders]
-    named = next((one for one in definitions if one.is_file()), None)
+    named = next((definition for definition in definitions if definition.is_file()), None)
     example = ", from a FILE such as banks/paper.yaml" if named is None else ""
     definition = "FILE" if named is None else shlex.quote(str(named))
     return f"build it with `shearloop bank build --config {definition} --out {shlex.quote(str(path))}`{example}"

@@ -116,10 +116,10 @@ class ChannelTable:
         if dead.all():
             return ["every electrode"]
         named, explained = [], np.zeros(self.n_channels, dtype=np.bool_)
-        for name, own in self._groups:
-            if dead[own].all() and not explained[own].all():
-                named.append(f"{np.count_nonzero(own)} channels {name}")
-                explained |= own
+        for name, channels in self._groups:
+            if dead[channels].all() and not explained[channels].all():
+                named.append(f"{np.count_nonzero(channels)} channels {name}")
+                explained |= channels
         return named
 
     def still_groups(self, still: BoolArray) -> BoolArray:

@@ -99,7 +99,7 @@ def searched_settings(model: str, height: float, places: FloatArray = _PLACES) -
 
 def simulated_signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> FloatArray:
     """Return the (m, n) difference signals of the settings with a positive conductivity everywhere."""
-    cells = [cell for cell in (conductivity(forward.mesh, model, *one) for one in settings) if cell.min() > 0]
+    cells = [cell for cell in (conductivity(forward.mesh, model, *setting) for setting in settings) if cell.min() > 0]
     voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *cells]))
     signals: FloatArray = voltages[1:] - voltages[0]
     return signals
@@ -126,7 +126,7 @@ def envelope_score(difference: FloatArray, signals: FloatArray, settings: Envelo
     """
     smooth = _moving_average(np.abs(difference), settings.averaged)
     measured = np.fft.rfft(_ranks(envelope(smooth, settings)))
-    simulated = np.fft.rfft([_ranks(envelope(one, settings)) for one in np.abs(signals)])
+    simulated = np.fft.rfft([_ranks(envelope(signal, settings)) for signal in np.abs(signals)])
     return float(np.fft.irfft(measured * np.conj(simulated), len(difference)).max(axis=1).mean())
 
 
@@ -307,7 +307,7 @@ def simulated_frames(design: Design, fingertip: Fingertip, n: int = 49, seed: in
 
 def _positive(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> list[Setting]:
     """Return the settings with a positive conductivity."""
-    return [one for one in settings if conductivity(forward.mesh, model, *one).min() > 0]
+    return [setting for setting in settings if conductivity(forward.mesh, model, *setting).min() > 0]
 
 
 def _fit(frames: FloatArray, signals: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -448,8 +448,8 @@ def _board_choices(measured: MeasuredFrames, table: ChannelTable) -> tuple[Desig
     of_channels = tuple(step(count, order[:count]) for count in counts)
     taken: list[int] = []
     of_injections = []
-    while rest := [one for one in range(table.n_electrodes) if one not in taken]:
-        taken.append(min(rest, key=lambda one: variance(channels_of([*taken, one]))))
+    while rest := [injection for injection in range(table.n_electrodes) if injection not in taken]:
+        taken.append(min(rest, key=lambda injection: variance(channels_of([*taken, injection]))))
         numbers = ", ".join(map(str, sorted(taken)))
         of_injections.append(step(len(taken), channels_of(taken), f"; injections {numbers}"))
     return (

@@ -42,7 +42,7 @@ class Elimination:
         self._kept = kept
         lower = terms.where(terms.rows >= terms.columns)
         structures = _structures(lower, n, n - kept)
-        sizes = [len(each) for each in structures]
+        sizes = [len(structure) for structure in structures]
         rows, columns = np.concatenate(structures), np.repeat(np.arange(n), sizes)
         # Entry p of the factor begins as Σ_t shares[p, t] · (factors, 1)_t.
         place = np.searchsorted(columns * n + rows, lower.columns * n + lower.rows)
@@ -53,7 +53,7 @@ class Elimination:
         by_row = by_row[(columns[by_row] < n - kept) & (columns[by_row] < rows[by_row])]
         row_starts = np.searchsorted(rows[by_row], np.arange(n + 1))
         plan = rows, starts, by_row, row_starts, starts[columns[by_row] + 1]
-        self._plan = _Plan(*(each.astype(np.uint32) for each in plan))
+        self._plan = _Plan(*(array.astype(np.uint32) for array in plan))
 
     def schur_complements(self, factors: FloatArray) -> FloatArray:
         """Return the (n, kept, kept) Schur complements for the (n, F) factors of the entries; factor F is 1.

@@ -184,7 +184,7 @@ class RoundFingertip:
 
         centres = np.deg2rad(self.angles_deg).tolist()
         around = np.linspace(0.0, 2 * np.pi, 120, endpoint=False).tolist()
-        return Outline([at(angle) for angle in around], [(at(one - half), at(one + half)) for one in centres])
+        return Outline([at(angle) for angle in around], [(at(centre - half), at(centre + half)) for centre in centres])
 
     def mesh(self) -> Mesh:
         """Return the fingertip's mesh."""
@@ -214,7 +214,9 @@ class RoundFingertip:
             np.flatnonzero(np.mod(middles - start, 2 * np.pi) < end - start)
             for start, end in zip(starts, ends, strict=True)
         ]
-        edges, of_edge = joined_edges([np.column_stack([each, following[each]]) for each in covered])
+        edges, of_edge = joined_edges(
+            [np.column_stack([covered_nodes, following[covered_nodes]]) for covered_nodes in covered]
+        )
         return Mesh(
             nodes=nodes,
             triangles=np.vstack([ring * n_around + place % n_around, within]),

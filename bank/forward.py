@@ -63,7 +63,7 @@ class ForwardModel:
         patterns = table.n_electrodes // (2 if table.injection == "opposite" else 1)
         self._pattern = sink % patterns
         self._sign = np.where(sink < patterns, 1.0, -1.0)
-        first = np.array([np.flatnonzero(sink == one)[0] for one in range(patterns)])
+        first = np.array([np.flatnonzero(sink == pattern)[0] for pattern in range(patterns)])
         self.currents = np.zeros((table.n_electrodes, patterns))
         self.currents[sink[first], np.arange(patterns)] = -STIMULATION_CURRENT
         self.currents[source[first], np.arange(patterns)] = STIMULATION_CURRENT
@@ -116,8 +116,8 @@ class BatchForwardModel:
         The bits of one do not depend on the others. Raises ConductivityError, before anything is solved, where a
         conductivity is not positive.
         """
-        for each in conductivities:
-            require_positive(each, len(self.mesh.triangles))
+        for conductivity in conductivities:
+            require_positive(conductivity, len(self.mesh.triangles))
         schur = self.elimination.schur_complements(conductivities)
         found = np.empty((len(conductivities), self.direct.table.n_channels))
         sound = rounding_leaks(schur) <= MAX_LEAK
@@ -205,7 +205,7 @@ def elimination_order(mesh: Mesh, terms: Terms) -> IntArray:
     narrow = reverse_cuthill_mckee(grounded.tocsr(), symmetric_mode=True)
     starts = np.arange(n - 1), narrow, narrow[::-1]
     orderings = [splu(grounded[start][:, start], **_LITTLE_FILL) for start in starts]
-    best = int(np.argmin([each.L.nnz for each in orderings]))
+    best = int(np.argmin([ordering.L.nnz for ordering in orderings]))
     place = np.full(n + mesh.n_electrodes, -1, dtype=np.int64)
     place[free[starts[best]]] = orderings[best].perm_c
     place[n:] = n - 1 + np.arange(mesh.n_electrodes)

@@ -152,9 +152,9 @@ def _eidors_fields(path: Path) -> dict[str, Any]:
     try:
         [model] = models if isinstance(models, Struct) else []
         electrodes: Any = model["electrode"]
-        impedance = np.array([np.asarray(one["z_contact"], np.float64).item() for one in electrodes])
+        impedance = np.array([np.asarray(electrode["z_contact"], np.float64).item() for electrode in electrodes])
         nodes, triangles = np.asarray(model["nodes"], np.float64), _numbers(model["elems"])
-        members = [_numbers(one["nodes"]).ravel() for one in electrodes]
+        members = [_numbers(electrode["nodes"]).ravel() for electrode in electrodes]
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise GeometryError(
             f"{path}: expected an EIDORS forward model in the variable `mdl`, with nodes, elems and "
@@ -164,7 +164,9 @@ def _eidors_fields(path: Path) -> dict[str, Any]:
         raise GeometryError(f"{path}: the EIDORS model is not of triangles: elems has shape {triangles.shape}")
     # The boundary edges between an electrode's nodes are its own, as EIDORS reads them.
     boundary = boundary_edges(triangles)
-    edges, of_edge = joined_edges([boundary[np.isin(boundary, own).all(axis=1)] for own in members])
+    edges, of_edge = joined_edges(
+        [boundary[np.isin(boundary, electrode_nodes).all(axis=1)] for electrode_nodes in members]
+    )
     return dict(zip(_FIELDS, (nodes, triangles, edges, of_edge, impedance), strict=True))
 
 
@@ -178,7 +180,7 @@ def _numbers(values: Any) -> IntArray:
 
 def joined_edges(edges: list[IntArray]) -> tuple[IntArray, IntArray]:
     """Return the (E, 2) edges of all electrodes, and the electrode (E,) of each edge."""
-    return np.vstack(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
+    return np.vstack(edges), np.repeat(np.arange(len(edges)), [len(electrode_edges) for electrode_edges in edges])
 
 
 def _array(values: ArrayLike, name: str, dtype: type, shape: tuple[int, ...]) -> NDArray[Any]:

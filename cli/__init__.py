@@ -147,7 +147,7 @@ class Parser(argparse.ArgumentParser):
             self._refuse(f"there is no {value!r}; it is `shearloop command {value}`")
         of = f" of {action.option_strings[-1]}" if action.option_strings else ""
         # A mistyped word must not become a motion.
-        near = get_close_matches(str(value), [one for one in known if one not in MOVING], 1)
+        near = get_close_matches(str(value), [choice for choice in known if choice not in MOVING], 1)
         self._refuse(f"there is no {value!r}{of}; {f'did you mean {near[0]}?' if near else _there_are(known)}")
 
     def _refuse(self, sentence: str) -> NoReturn:

@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     factors, errors = correction.factors.tolist(), correction.errors.tolist()
     names = adapted.sides if len(factors) == len(adapted.sides) else (" and ".join(adapted.sides),)
     gains = {name: {"gain": gain, "error": error} for name, gain, error in zip(names, factors, errors, strict=True)}
-    sentences = [f"{name}: torque times {one['gain']:.2f} ± {one['error']:.2f}." for name, one in gains.items()]
+    sentences = [f"{name}: torque times {entry['gain']:.2f} ± {entry['error']:.2f}." for name, entry in gains.items()]
     sentences.append(f"Offset: {correction.offset_nm:+.4f} N·m.")
     if correction.is_unchanged:
         sentences.append("The deviation may be chance; the gain is unchanged.")

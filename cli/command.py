@@ -173,7 +173,10 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
         from shearloop.cli.terminal import table
 
         own = reply["configured"]
-        known = [(one["path"], one["name"], "configured" if one["path"] == own else "") for one in reply["experiments"]]
+        known = [
+            (experiment["path"], experiment["name"], "configured" if experiment["path"] == own else "")
+            for experiment in reply["experiments"]
+        ]
         return table(("file", "name", ""), known)
     if name == "tare":
         end = "`shearloop command status` shows its end, and `start` is refused until then"

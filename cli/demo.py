@@ -117,7 +117,7 @@ def check_ports(config: "DaemonConfig", robot: str | None) -> None:
     """Raise UserError if another daemon, or another emulated rig, has the addresses of this configuration."""
     refuse_second_daemon(config.commands, "" if is_free(HOST, PAGE_PORT) else f"http://{HOST}:{PAGE_PORT}/")
     ours = [urlsplit(address) for address in (config.publish, config.commands) if address.startswith("tcp://")]
-    places = [(str(one.hostname), one.port) for one in ours if one.port]
+    places = [(str(url.hostname), url.port) for url in ours if url.port]
     places += [(robot, RTDE_PORT)] if robot is not None and config.emulators else []
     for host, port in places:
         if not is_free(host, port):

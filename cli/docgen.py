@@ -110,14 +110,14 @@ def _setting(key: str, found: Mapping[str, Any], required: bool) -> tuple[str, .
 def _value(found: Mapping[str, Any]) -> str:
     """Return a value's kind and range in words."""
     if "anyOf" in found:
-        return " or ".join(_value(one) for one in found["anyOf"] if one.get("type") != "null")
+        return " or ".join(_value(option) for option in found["anyOf"] if option.get("type") != "null")
     if "const" in found or "enum" in found:
-        return ", ".join(f"`{one}`" for one in found.get("enum", [found.get("const")]))
+        return ", ".join(f"`{value}`" for value in found.get("enum", [found.get("const")]))
     if any(references(found)) or found["type"] == "object":
         return "list of sections" if "items" in found else "section"
     if found["type"] == "array":
         count = f" of {found['minItems']}" if found.get("minItems") == found.get("maxItems", 0) else ""
-        kinds = dict.fromkeys(_value(one) for one in found.get("prefixItems") or [found["items"]])
+        kinds = dict.fromkeys(_value(item) for item in found.get("prefixItems") or [found["items"]])
         return f"list{count}: {', then '.join(kinds)}"
     names = {"string": "path" if found.get("format") == "path" else "text", "boolean": "true or false"}
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}

@@ -116,8 +116,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.calibration} assumes that {found.assumptions}.", file=sys.stderr)
     for doubt in found.doubts:
         print(f"Warning: {doubt}.", file=sys.stderr)
-    for one in found.left_out:
-        print(f"Left out: {one}.", file=sys.stderr)
+    for omission in found.left_out:
+        print(f"Left out: {omission}.", file=sys.stderr)
     for name in found.emulated:
         print(f"EMULATED: every device of {name} was emulated.", file=sys.stderr)
     if args.plot or args.out:
@@ -191,8 +191,8 @@ def _leave_out(args: argparse.Namespace) -> int:
             write_estimates(found.all_tracks, names, args.estimates)
     for doubt in doubts:
         print(f"Warning: {doubt}.", file=sys.stderr)
-    for one in left_out:
-        print(f"Left out: {one}.", file=sys.stderr)
+    for omission in left_out:
+        print(f"Left out: {omission}.", file=sys.stderr)
     figures = found.figures(args.loaded_nm)
     by_load = figures_by_load(found.all_tracks, args.loaded_nm)
     sentences = _lines({**by_load, "all": figures_of(found.all_tracks)})
@@ -262,7 +262,9 @@ def _draw(found: "Evaluation", out: Path) -> None:
     from shearloop.tools.evaluation_figure import draw_tracks
 
     tracks = found.tracks
-    names = [f"{path.name}, {' and '.join(one.series.sides)}" for path, one in zip(found.paths, tracks, strict=True)]
+    names = [
+        f"{path.name}, {' and '.join(track.series.sides)}" for path, track in zip(found.paths, tracks, strict=True)
+    ]
     try:
         with writing(out, "the figure"):
             draw_tracks(tracks, names, found.title, out, found.draw)

@@ -264,7 +264,7 @@ def judges_slices(path: Path, recordings: "Sequence[Path]") -> bool:
 
     _check_no_recording(path)
     is_slices = kind_of(path) == KIND
-    if any(one.is_dir() != is_slices for one in recordings):
+    if any(recording.is_dir() != is_slices for recording in recordings):
         made, other = ("slices", "raw frames") if is_slices else ("raw frames", "slices")
         raise UserError(
             f"{path} was made from {made}, and cannot judge {other}; calibrate on recordings of the same kind"
@@ -281,4 +281,6 @@ def read_judged(path: Path, recordings: "Sequence[Path]") -> "tuple[Calibration,
 
     check_paths_differ(recordings)
     calibration = load_calibration(path)
-    return calibration, [(one, series) for one in recordings for series in read_series(one, calibration.sides)]
+    return calibration, [
+        (recording, series) for recording in recordings for series in read_series(recording, calibration.sides)
+    ]

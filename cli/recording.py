@@ -77,20 +77,20 @@ def _list(args: argparse.Namespace) -> int:
 
     found = list_recordings(args.folder)
     if args.json:
-        for one in found:
-            print(json.dumps(asdict(one), ensure_ascii=False))
+        for recording in found:
+            print(json.dumps(asdict(recording), ensure_ascii=False))
         return 0
     if not found:
         print(f"{args.folder}: no recording is in this folder or below it")
         return 0
     rows = []
-    for one in found:
+    for recording in found:
         # A recording without an index has neither of these; an empty cell would look like a shifted row.
-        began = "–" if one.first_unix_ns is None else _local_time(one.first_unix_ns)
-        lasts = "–" if one.duration_s is None else f"{one.duration_s:.0f} s"
-        remark = one.unreadable or ("" if one.closed else "not closed, or being written")
-        ran = ", ".join(one.experiments) or "–"
-        rows.append((began, lasts, f"{one.size_bytes / 1e6:.1f} MB", one.path, ran, remark))
+        began = "–" if recording.first_unix_ns is None else _local_time(recording.first_unix_ns)
+        lasts = "–" if recording.duration_s is None else f"{recording.duration_s:.0f} s"
+        remark = recording.unreadable or ("" if recording.closed else "not closed, or being written")
+        ran = ", ".join(recording.experiments) or "–"
+        rows.append((began, lasts, f"{recording.size_bytes / 1e6:.1f} MB", recording.path, ran, remark))
     print(*table(("from", "lasts", "size", "file", "experiment", "remark"), rows), sep="\n")
     return 0
 

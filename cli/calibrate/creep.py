@@ -26,9 +26,9 @@ def run(args: argparse.Namespace) -> int:
 
     judges_slices(args.calibration, args.recordings)
     calibration, named = read_judged(args.calibration, args.recordings)
-    check_no_copies([(str(path), one) for path, one in named])
+    check_no_copies([(str(path), series) for path, series in named])
     bank = Bank.open(args.bank) if args.bank else None
-    grips = [grip for _, one in named for grip in grips_of(estimate_series(calibration, one, bank))]
+    grips = [grip for _, series in named for grip in grips_of(estimate_series(calibration, series, bank))]
     found = fit_creep(grips)
     share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)
     result = {

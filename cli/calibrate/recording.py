@@ -81,7 +81,7 @@ def _calibrate_recordings(args: argparse.Namespace, physics: "Physics") -> tuple
     trial = _Trial(
         kind,
         lambda: plan_left_out(kind, recipe, result.parts, names),
-        lambda: [estimate_series(result.calibration, one, physics.bank) for one in result.parts],
+        lambda: [estimate_series(result.calibration, part, physics.bank) for part in result.parts],
         MEAN_TWIST,
         advice_unjudged(kind, result.parts),
     )
@@ -109,7 +109,7 @@ def _calibrate_slices(args: argparse.Namespace, physics: "Physics") -> tuple[dic
     trial = _Trial(
         LEVELS,
         lambda: plan_levels(LEVELS, recipe, result.parts),
-        lambda: [estimate_slices(result.calibration, one, physics.bank) for one in result.parts],
+        lambda: [estimate_slices(result.calibration, part, physics.bank) for part in result.parts],
         MEAN_OF_PLACE,
         advice_unjudged(LEVELS, ()),
     )
@@ -208,12 +208,14 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
             f"It measures {own} torques alone, because the recordings have no others: a tool with a {other} torque may "
             "read as 0. Record twists both ways if a tool is turned both ways."
         )
-    known = [f"{abs(one.delay_s):.2f} s {'before' if one.delay_s < 0 else 'after'}" for one in timing.delays if one]
+    known = [
+        f"{abs(delay.delay_s):.2f} s {'before' if delay.delay_s < 0 else 'after'}" for delay in timing.delays if delay
+    ]
     if known:
         probably = "probably " if timing.uncertainty_s else ""
         sentences.append(f"The load is {probably}stamped {', '.join(known)} the frames move.")
     sentences += [f"Warning: {doubt}." for doubt in result.doubts]
-    sentences += [f"Left out: {one}." for one in result.left_out]
+    sentences += [f"Left out: {omission}." for omission in result.left_out]
     if result.widening is not None:
         sentences.append(
             "Could not verify the load cell's timestamps: the load changed too few times. They may be "
@@ -230,7 +232,7 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
             "shows it; correct it with `shearloop adapt`."
         )
     elif result.tools:
-        named = " and ".join(f"{one.value:.3g}" for one in result.tools)
+        named = " and ".join(f"{tool.value:.3g}" for tool in result.tools)
         sentences.append(f"The tools of {named} mm have the torque in common.")
         if calibration.diameter is None:
             sentences.append("Diameters are not estimated: that takes recordings of three.")

@@ -60,8 +60,8 @@ async def play(
             reading.enter_context(stdin_lines(obey))
         with contextlib.suppress(asyncio.CancelledError):
             await task
-    for each in printing:
-        each.cancel()
+    for printer in printing:
+        printer.cancel()
 
 
 async def _print_port(name: str, appearances: "asyncio.Queue[str]") -> None:

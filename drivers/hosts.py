@@ -85,11 +85,11 @@ def addresses_of(hosts: Iterable[str]) -> Mapping[str, frozenset[str]]:
     names = {name for name in spelt.values() if not is_address(name)}
     # A look-up cannot be broken off, and must not keep the process from ending either.
     asking = [threading.Thread(target=look_up, args=(name,), name="look-up", daemon=True) for name in names]
-    for one in asking:
-        one.start()
+    for thread in asking:
+        thread.start()
     until_s = time.monotonic() + RESOLVED_WITHIN_S
-    for one in asking:
-        one.join(max(0.0, until_s - time.monotonic()))
+    for thread in asking:
+        thread.join(max(0.0, until_s - time.monotonic()))
     known = dict(found)
     return {
         host: frozenset({name}) if is_address(name) else known.get(name, frozenset()) for host, name in spelt.items()

@@ -63,7 +63,9 @@ def measure_level(samples: Sequence[LoadSample], mass_g: float) -> Level:
             "The load cell's converter is at the end of its range: take load off the cell, and check that none of "
             "its four wires is loose."
         )
-    good = _without_outliers([one.raw for one in samples if not (one.saturated or one.spike or one.partial)])
+    good = _without_outliers(
+        [sample.raw for sample in samples if not (sample.saturated or sample.spike or sample.partial)]
+    )
     if len(good) < least:
         raise DeviceCalibrationError(
             f"Only {len(good)} of the {SAMPLES_PER_STEP} readings needed were good: check the cable, and that "

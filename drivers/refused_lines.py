@@ -68,7 +68,7 @@ def shown(line: bytes) -> str:
 
 def sender_of(line: bytes, expected: BoardKind) -> tuple[str, str]:
     """Return who sends such lines, and what to do where the expected board should send."""
-    sender = next((one for one in _SENDERS if one.form.fullmatch(line)), None)
+    sender = next((sender for sender in _SENDERS if sender.form.fullmatch(line)), None)
     if sender is None:
         return "a board of another kind", _EXCHANGE
     if sender.board is None:

@@ -41,7 +41,7 @@ class WidthCalibration(CalibrationModel):
         if self.open_counts >= self.closed_counts or self.open_mm <= self.closed_mm:
             raise ValueError("the open position must have fewer counts and more millimetres than the closed one")
         widths = [self.width_mm(counts) for counts in range(COUNTS_MAX + 1)]
-        if any(one <= other for one, other in pairwise(widths)):
+        if any(width <= other for width, other in pairwise(widths)):
             raise ValueError(
                 f"with a bow of {self.bow_mm:g} mm the width would not fall with the counts: measure it again with "
                 "`shearloop calibrate gripper`"

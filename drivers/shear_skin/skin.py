@@ -210,13 +210,13 @@ class SampleAverager:
             return None
         whole = replace(sample, seq=self._seq, missed=self._missed)
         if not sample.faults:
-            t_mid_ns = sum(one.t_mid_ns for one in self._block) // len(self._block)
+            t_mid_ns = sum(member.t_mid_ns for member in self._block) // len(self._block)
             whole = replace(whole, r1_ohm=self._mean("r1_ohm"), r2_ohm=self._mean("r2_ohm"), t_mid_ns=t_mid_ns)
         self._block, self._missed, self._seq = [], 0, self._seq + 1
         return whole
 
     def _mean(self, name: str) -> float:
-        return fmean(getattr(one, name) for one in self._block)
+        return fmean(getattr(sample, name) for sample in self._block)
 
 
 def _is_reachable(before: tuple[float, float], after: tuple[float, float], missed: int) -> bool:
@@ -247,7 +247,7 @@ class ShearSkin:
         """
         async with contextlib.aclosing(self._daq.batches()) as batches:
             async for readings in batches:
-                averaged = (self._averager.add(self._validator.sample(one, self._latest)) for one in readings)
+                averaged = (self._averager.add(self._validator.sample(reading, self._latest)) for reading in readings)
                 yield [sample for sample in averaged if sample is not None]
 
     @property

@@ -259,7 +259,7 @@ class UrArm:
         """Return the mean of the latest samples at rest as the controller measures them, of one where none is."""
         last = round(seconds * self._settings.rate_hz)
         recent = [*self._recent_wrenches][-last:] or [self._receiver.latest().wrench]
-        fx, fy, fz, mx, my, mz = (fmean(one) for one in zip(*recent, strict=True))
+        fx, fy, fz, mx, my, mz = (fmean(component) for component in zip(*recent, strict=True))
         return fx, fy, fz, mx, my, mz
 
     def _write_deadline(self, left_s: float) -> None:

@@ -65,7 +65,7 @@ def command_dashboard(host: str, timeout_s: float, requests: tuple[str, ...]) ->
     }
     if not refused:
         return ""
-    request = next((one for one in refused if one in _INDISPENSABLE), next(iter(refused)))
+    request = next((request for request in refused if request in _INDISPENSABLE), next(iter(refused)))
     said = f"The controller answered “{refused[request]}” to `{request}`"
     (remote,) = ask_dashboard(host, timeout_s, ("is in remote control",))
     if remote.lower() == "false":

@@ -144,8 +144,8 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
         for number, qd in enumerate(sample.qd_rad_per_s, 1)
     ]
     tool = ("tool speed", sample.tcp_speed_m_per_s, limits.linear_speed_m_per_s, "m/s")
-    for one in (*speeds, tool, *_loads(sample, limits)):
-        if beyond := _beyond(*one):
+    for measurement in (*speeds, tool, *_loads(sample, limits)):
+        if beyond := _beyond(*measurement):
             return beyond
     return slowed_sentence(sample) or tool_difference(sample, settings.tool)
 
@@ -203,7 +203,7 @@ def _is_reported(value: float | tuple[float, ...]) -> bool:
 
 def _rounded(value: float | tuple[float, ...] | None) -> str:
     values = value if isinstance(value, tuple) else (value,)
-    return ", ".join("unknown" if one is None else f"{one:.4g}" for one in values)
+    return ", ".join("unknown" if number is None else f"{number:.4g}" for number in values)
 
 
 def _beyond(name: str, value: float, bound: Bound, unit: str) -> str:

@@ -139,12 +139,12 @@ def _to_plain(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
     """Return YAML's view of a value; its arrays go into `arrays` by their path."""
     if is_dataclass(value):
         plain = {"estimator": value.name} if isinstance(value, Estimator) else {}
-        for one in fields(value):
-            part = getattr(value, one.name)
-            if one.metadata == INLINE:
+        for field in fields(value):
+            part = getattr(value, field.name)
+            if field.metadata == INLINE:
                 plain |= _to_plain(part, path, arrays)
             else:
-                plain[one.name] = _to_plain(part, f"{path}/{one.name}", arrays)
+                plain[field.name] = _to_plain(part, f"{path}/{field.name}", arrays)
         return plain
     if isinstance(value, np.ndarray):
         name = path.strip("/").replace("/", ".")
@@ -193,13 +193,13 @@ class _Plain:
     def _dataclass(self, kind: Any, plain: Any, path: str) -> Any:
         kind = self.estimator_class(plain["estimator"]) if kind is Estimator else kind
         hints, values = get_type_hints(kind), {}
-        for one in fields(kind):
-            if one.metadata == INLINE:
-                values[one.name] = self.value(hints[one.name], plain, path)
-            elif isinstance(one.default, float) and math.isnan(one.default):
-                values[one.name] = float(plain.get(one.name, one.default))  # may be unknown
-            elif one.name in plain or one.default is MISSING:
-                values[one.name] = self.value(hints[one.name], plain[one.name], f"{path}/{one.name}")
+        for field in fields(kind):
+            if field.metadata == INLINE:
+                values[field.name] = self.value(hints[field.name], plain, path)
+            elif isinstance(field.default, float) and math.isnan(field.default):
+                values[field.name] = float(plain.get(field.name, field.default))  # may be unknown
+            elif field.name in plain or field.default is MISSING:
+                values[field.name] = self.value(hints[field.name], plain[field.name], f"{path}/{field.name}")
         return kind(**values)
 
 
@@ -216,5 +216,5 @@ def _checked(array: NDArray[Any], kind: Any, name: str) -> NDArray[Any]:
 
 def _names(kind: Any) -> set[str]:
     """Return the names of a dataclass's values in the file."""
-    found = [_names(one.type) if one.metadata == INLINE else {one.name} for one in fields(kind)]
+    found = [_names(field.type) if field.metadata == INLINE else {field.name} for field in fields(kind)]
     return set().union(*found)

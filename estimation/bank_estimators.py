@@ -56,7 +56,7 @@ class BankEstimator(_OnBank):
 
     def features(self, reading: Reading) -> FloatArray:
         """Return the features of each side's match."""
-        return np.concatenate([one.features for one in reading.matches])
+        return np.concatenate([match.features for match in reading.matches])
 
     def feature_width(self, _quantity: Quantity) -> int:
         """Return the number of features of all sides: k, σ, σ² and the logarithm of the amplitude of each."""

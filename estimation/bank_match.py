@@ -103,10 +103,14 @@ def find_numberings(idle: FloatArray, homogeneous: FloatArray, table: ChannelTab
         turned = ElectrodeNumbering(rotation, reflected)
         score = float(np.corrcoef(model[turned.model_channels(table)], measured)[0, 1])
         found.append(replace(turned, score=score))
-    best = max(found, key=lambda one: (round(one.score, 9), -one.rotation))
+    best = max(found, key=lambda numbering: (round(numbering.score, 9), -numbering.rotation))
     half_turn = best.reflected, (best.rotation + table.n_electrodes // 2) % table.n_electrodes
-    alike = [one for one in found if one.score > best.score - _SYMMETRIC or (one.reflected, one.rotation) == half_turn]
-    return sorted(alike, key=lambda one: one is not best)
+    alike = [
+        numbering
+        for numbering in found
+        if numbering.score > best.score - _SYMMETRIC or (numbering.reflected, numbering.rotation) == half_turn
+    ]
+    return sorted(alike, key=lambda numbering: numbering is not best)
 
 
 def resolve_symmetry(numberings: list[ElectrodeNumbering], touch: FloatArray, bank: Bank) -> ElectrodeNumbering:
@@ -114,7 +118,7 @@ def resolve_symmetry(numberings: list[ElectrodeNumbering], touch: FloatArray, ba
 
     touch (c,) is the change of the idle frame by a grip, in volts.
     """
-    scores = [RefinedMatcher(bank, one).match(touch).score for one in numberings]
+    scores = [RefinedMatcher(bank, numbering).match(touch).score for numbering in numberings]
     best = int(np.argmax(scores))
     return numberings[best] if scores[best] > scores[0] + _ALIKE else numberings[0]
 

@@ -36,8 +36,8 @@ _UNKNOWN_STRENGTH = (
     "again to have it checked)"
 )
 _ONE_SIGN = {
-    sign: f"no torque is {other}, because its recordings have {own} torques alone"
-    for sign, own, other in ((1, "positive", "negative"), (-1, "negative", "positive"))
+    sign: f"no torque is {other}, because its recordings have {recorded} torques alone"
+    for sign, recorded, other in ((1, "positive", "negative"), (-1, "negative", "positive"))
 }
 # Tools differ if their diameters differ by a larger share.
 LARGEST_TOOL_SHARE = 0.15
@@ -149,8 +149,8 @@ class Calibration:
     @property
     def assumption_text(self) -> str:
         """The user's guarantees, and what this file cannot check, as part of a sentence; empty without any."""
-        texts = [_ASSUMPTION_TEXTS[one] for one in self.assumptions]
-        if any(one.strength is None for one in self.validators):
+        texts = [_ASSUMPTION_TEXTS[assumption] for assumption in self.assumptions]
+        if any(validator.strength is None for validator in self.validators):
             texts.append(_UNKNOWN_STRENGTH)
         if self.only_sign:
             texts.append(_ONE_SIGN[self.only_sign])
@@ -172,8 +172,12 @@ class Calibration:
     def check_shapes(self) -> None:
         """Raise ValueError where arrays do not fit together, as in a file that another program wrote."""
         c, m = self.estimator.table.n_channels, max(len(self.sides), 1)
-        rows = [a for one in self.validators for a in (one.idle, one.gripped, one.noise, one.grip_weights)]
-        rows += [one.strength.weights for one in self.validators if one.strength is not None]
+        rows = [
+            a
+            for validator in self.validators
+            for a in (validator.idle, validator.gripped, validator.noise, validator.grip_weights)
+        ]
+        rows += [validator.strength.weights for validator in self.validators if validator.strength is not None]
         whole = self.estimator.scale.shape == (m, c) and all(row.shape == (c,) for row in rows)
         if not whole or len(self.validators) not in (0, len(self.sides)):
             raise ValueError(f"it is of {len(self.sides)} sides of {c} channels, and its arrays have other shapes")

@@ -34,7 +34,7 @@ class ChannelImputer:
     @classmethod
     def fit(cls, positions: FloatArray, validators: tuple[FingertipValidator, ...]) -> Self:
         """Fit to the (n, m·c) differences of gripped frames in units of the validators' noises."""
-        noise = np.array([one.noise for one in validators])
+        noise = np.array([validator.noise for validator in validators])
         alive = np.isfinite(noise)
         mean = positions.mean(axis=0)
         moved = positions - mean

@@ -29,17 +29,17 @@ def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> Inte
 
     Its interval is the error on cylinders left out.
     """
-    diameters = np.array([one.diameter_mm[0] for one in grips])
+    diameters = np.array([grip.diameter_mm[0] for grip in grips])
     reduction = _reduction(grips, table)
-    reduced = [one.position @ reduction for one in grips]
+    reduced = [grip.position @ reduction for grip in grips]
     line = _fit_reduced(grips, reduced, reduction)
     squares = []
-    for one, diameter in zip(grips, diameters, strict=True):
+    for grip, diameter in zip(grips, diameters, strict=True):
         # Leave out all grips of this cylinder: another one would only confirm this diameter.
         kept = np.flatnonzero(diameters != diameter).tolist()
         if len(set(diameters[kept].tolist())) >= LEAST_LEFT:
             rest = _fit_reduced([grips[i] for i in kept], [reduced[i] for i in kept], reduction)
-            squares.append(float(((rest.predict(one.mean_position) - diameter) ** 2).mean()))
+            squares.append(float(((rest.predict(grip.mean_position) - diameter) ** 2).mean()))
     # Each recording counts once, which is too few for a quantile.
     half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
     low, high = float(diameters.min()), float(diameters.max())
@@ -57,7 +57,7 @@ def fit_line(grips: Sequence[CalibrationRows], table: ChannelTable) -> Ridge:
     neighbours, as the paper did with its cylinders, lowers the noise.
     """
     reduction = _reduction(grips, table)
-    return _fit_reduced(grips, [one.position @ reduction for one in grips], reduction)
+    return _fit_reduced(grips, [grip.position @ reduction for grip in grips], reduction)
 
 
 def _reduction(grips: Sequence[CalibrationRows], table: ChannelTable) -> FloatArray:
@@ -69,9 +69,9 @@ def _reduction(grips: Sequence[CalibrationRows], table: ChannelTable) -> FloatAr
 
 def _fit_reduced(grips: Sequence[CalibrationRows], frames: Sequence[FloatArray], reduction: FloatArray) -> Ridge:
     """Return the line of `fit_line`; `frames` are the grips' positions times the reduction."""
-    diameters = np.array([one.diameter_mm[0] for one in grips])
-    positions = np.array([one.mean(axis=0) for one in frames])
-    moved = np.concatenate([one - position for one, position in zip(frames, positions, strict=True)])
+    diameters = np.array([grip.diameter_mm[0] for grip in grips])
+    positions = np.array([grip_frames.mean(axis=0) for grip_frames in frames])
+    moved = np.concatenate([grip_frames - position for grip_frames, position in zip(frames, positions, strict=True)])
     moved = moved[:: 1 + len(moved) // _MOST_FRAMES]
     _, sizes, directions = np.linalg.svd(moved, full_matrices=False)
     n = max(min(_N_NUISANCE, int(np.count_nonzero(sizes)) - 1), 0)
@@ -81,7 +81,7 @@ def _fit_reduced(grips: Sequence[CalibrationRows], frames: Sequence[FloatArray],
         return np.asarray(rows - (rows @ directions[:n].T * shrink) @ directions[:n])
 
     frame_noise = float((whitened(moved) ** 2).sum()) / max(len(moved) - len(grips), 1)
-    noise = frame_noise * (1.0 / BASELINE_FRAMES + float(np.mean([1.0 / len(one) for one in frames])))
+    noise = frame_noise * (1.0 / BASELINE_FRAMES + float(np.mean([1.0 / len(grip_frames) for grip_frames in frames])))
     centred = whitened(positions - positions.mean(axis=0))
     squares, modes = np.linalg.eigh(centred @ centred.T)
     clear: BoolArray = squares > max(_CLEAR * noise, _ROUNDING * float(squares[-1]))
@@ -91,5 +91,5 @@ def _fit_reduced(grips: Sequence[CalibrationRows], frames: Sequence[FloatArray],
     least = _ROUNDING * noise + float(np.finfo(np.float64).eps * (positions**2).sum())
     true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
     along = centred.T @ (modes @ (modes.T @ (diameters - diameters.mean()) / true))
-    mean = np.mean([one.position.mean(axis=0) for one in grips], axis=0)
+    mean = np.mean([grip.position.mean(axis=0) for grip in grips], axis=0)
     return Ridge(mean, reduction @ whitened(along), float(diameters.mean()), 0.0)

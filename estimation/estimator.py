@@ -123,7 +123,7 @@ class CalibrationRows:
 
     def where(self, rows: IntArray | BoolArray) -> Self:
         """Return some of the frames."""
-        return type(self)(*(getattr(self, one.name)[rows] for one in fields(self)))
+        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

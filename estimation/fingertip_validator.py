@@ -97,34 +97,39 @@ class FingertipValidator:
         Each is compared with its own idle frames, because the gel drifts between recordings. Raises CalibrationError
         where the frames are too few, and where the grip does not show.
         """
-        n_idle, n_gripped = min(len(one.idle) for one in recordings), min(len(one.gripped) for one in recordings)
+        n_idle = min(len(recording.idle) for recording in recordings)
+        n_gripped = min(len(recording.gripped) for recording in recordings)
         if few := too_few_frames(n_idle, n_gripped):
             raise CalibrationError(f"side {side}: {few}")
-        bases = [np.median(one.idle, axis=0) for one in recordings]
+        bases = [np.median(recording.idle, axis=0) for recording in recordings]
         base = np.mean(bases, axis=0)
         noise = _noise_of(recordings)
         scale = _noise_of_changes(noise, base)
-        changes = [one.changes(own) for one, own in zip(recordings, bases, strict=True)]
+        changes = [recording.changes(idle_frame) for recording, idle_frame in zip(recordings, bases, strict=True)]
         if not _is_separable(changes, scale):
             raise CalibrationError(
                 f"side {side}: gripped frames look like idle ones; did the fingertip touch the tool?"
             )
         weights = _grip_weights(changes, scale)
         step_limit = fall_limit = np.inf
-        if not any(len(one.released) for one in recordings):
-            scores = [one.gripped @ weights for one in changes]
-            step_limit = _STEP_MARGIN * max(float(frame_steps(one.gripped, noise).max()) for one in recordings)
-            fall_limit = _STEP_MARGIN * max(float((one[:-STEP_FRAMES] - one[STEP_FRAMES:]).max()) for one in scores)
+        if not any(len(recording.released) for recording in recordings):
+            scores = [change.gripped @ weights for change in changes]
+            step_limit = _STEP_MARGIN * max(
+                float(frame_steps(recording.gripped, noise).max()) for recording in recordings
+            )
+            fall_limit = _STEP_MARGIN * max(
+                float((grip_scores[:-STEP_FRAMES] - grip_scores[STEP_FRAMES:]).max()) for grip_scores in scores
+            )
         return cls(
             side,
             base,
-            np.concatenate([one.gripped for one in recordings]).mean(axis=0),
+            np.concatenate([recording.gripped for recording in recordings]).mean(axis=0),
             noise,
             weights,
             _grip_threshold(changes, weights),
             step_limit,
             fall_limit,
-            CalibratedStrength.fit(_strength_weights(changes, scale), [one.gripped for one in changes]),
+            CalibratedStrength.fit(_strength_weights(changes, scale), [change.gripped for change in changes]),
         )
 
     def looks_idle(self, frame: FloatArray) -> bool:
@@ -189,9 +194,9 @@ class FingertipSet:
     def __init__(self, sides: tuple[FingertipValidator, ...]) -> None:
         """Take the validators in the order of a frame's sides."""
         self.sides = sides
-        self.idle: FloatArray = np.array([one.idle for one in sides])
-        self.gripped: FloatArray = np.array([one.gripped for one in sides])
-        noise = np.array([one.noise for one in sides])
+        self.idle: FloatArray = np.array([validator.idle for validator in sides])
+        self.gripped: FloatArray = np.array([validator.gripped for validator in sides])
+        noise = np.array([validator.noise for validator in sides])
         # Channels that were not dead at calibration.
         self.alive: BoolArray = np.isfinite(noise)
         self._jump_limits_v = np.maximum(_JUMP_NOISES * np.sqrt(2.0) * noise, _JUMP_V)
@@ -201,11 +206,11 @@ class FingertipSet:
         """Return for each side the reason why too few channels are usable, empty where there are enough."""
         unusable = 1.0 - np.count_nonzero(usable, axis=1) / usable.shape[1]
         return [
-            f"{one.side} fingertip: {100 * share:.0f} % of the channels are dead or saturated; check the ribbon cable "
-            "and the gel's contact with the electrodes"
+            f"{validator.side} fingertip: {100 * share:.0f} % of the channels are dead or saturated; check the ribbon "
+            "cable and the gel's contact with the electrodes"
             if share > LARGEST_UNUSABLE_SHARE
             else ""
-            for one, share in zip(self.sides, unusable.tolist(), strict=True)
+            for validator, share in zip(self.sides, unusable.tolist(), strict=True)
         ]
 
     def check(self, frame: FloatArray, usable: BoolArray) -> tuple[list[str], BoolArray]:
@@ -328,8 +333,10 @@ def _medians(rows: FloatArray, counts: IntArray) -> FloatArray:
 
 def _noise_of(recordings: Sequence[GripParts]) -> FloatArray:
     """Return the (c,) noise of gripped frames in volts, infinite for channels that were dead before or in a grip."""
-    noise = np.sqrt(np.mean([channel_noise(one.gripped) ** 2 for one in recordings], axis=0))
-    silent = np.max([(part == 0.0).mean(axis=0) for one in recordings for part in (one.idle, one.gripped)], axis=0)
+    noise = np.sqrt(np.mean([channel_noise(recording.gripped) ** 2 for recording in recordings], axis=0))
+    silent = np.max(
+        [(part == 0.0).mean(axis=0) for recording in recordings for part in (recording.idle, recording.gripped)], axis=0
+    )
     return np.where(silent > _SILENT_SHARE, np.inf, noise)
 
 
@@ -350,8 +357,8 @@ def _is_separable(changes: Sequence[GripParts], scale: FloatArray) -> bool:
     Some combination of c channels separates any frames from any others that it was fitted to.
     """
     weights = _grip_weights(changes, scale, slice(0, None, 2))
-    for one in changes:
-        idle, gripped, released = (part[1::2] @ weights for part in one)
+    for change in changes:
+        idle, gripped, released = (part[1::2] @ weights for part in change)
         if np.quantile(gripped, 0.01) <= np.quantile(np.concatenate([idle, released]), 0.99):
             return False
     return True
@@ -359,16 +366,16 @@ def _is_separable(changes: Sequence[GripParts], scale: FloatArray) -> bool:
 
 def _grip_weights(changes: Sequence[GripParts], scale: FloatArray, rows: slice = slice(None)) -> FloatArray:
     """Return the (c,) weights of a grip's score, fitted to these rows of each part."""
-    parts = [np.concatenate([one[i][rows] for one in changes]) / scale for i in range(3)]
+    parts = [np.concatenate([change[i][rows] for change in changes]) / scale for i in range(3)]
     return _discriminant([part for part in parts if len(part)]) / scale
 
 
 def _grip_threshold(changes: Sequence[GripParts], weights: FloatArray) -> float:
     """Return the score above which a fingertip is gripped."""
-    idle_scores = np.concatenate([one.idle @ weights for one in changes])
+    idle_scores = np.concatenate([change.idle @ weights for change in changes])
     rise = max(_IDLE_DEVIATIONS * float(idle_scores.std()), _LEAST_RISE)
     highest_idle = float(np.quantile(idle_scores, 0.99))
-    weakest_grip = min(float(np.quantile(one.gripped @ weights, 0.01)) for one in changes)
+    weakest_grip = min(float(np.quantile(change.gripped @ weights, 0.01)) for change in changes)
     # Idle scores of different tools scatter further than the weakest grip of them.
     return highest_idle + min(rise, _LARGEST_RISE * max(weakest_grip - highest_idle, 0.0))
 
@@ -378,9 +385,9 @@ def _strength_weights(changes: Sequence[GripParts], scale: FloatArray) -> FloatA
 
     It ignores motion within each grip. A discriminant of all of them together would ignore how strong they are too.
     """
-    scaled = [[part / scale for part in one] for one in changes]
-    within = np.vstack([part - part.mean(axis=0) for one in scaled for part in one if len(part)])
-    parts = [np.concatenate([one[i] for one in scaled]) for i in range(3)]
+    scaled = [[part / scale for part in change] for change in changes]
+    within = np.vstack([part - part.mean(axis=0) for change in scaled for part in change if len(part)])
+    parts = [np.concatenate([change[i] for change in scaled]) for i in range(3)]
     return _discriminant([part for part in parts if len(part)], within) / scale
 
 

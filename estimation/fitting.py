@@ -64,7 +64,7 @@ def fit(
     physics, kind = physics or Physics(), estimator_class(name)
     sides = _check_recordings(recordings)
     check_physics(kind, physics)
-    chosen = [one.select_sides(sides) for one in recordings]
+    chosen = [recording.select_sides(sides) for recording in recordings]
     timing = timing or measure_timing(recordings)
     material = replace(_material(chosen, physics), nested=nested)
     tools = _tools_of(recordings)
@@ -76,8 +76,8 @@ def fit(
         tool_mm=tools[0].value if len(tools) == 1 else np.nan,
         validators=material.validators,
         profile=TorqueProfile.fit(chosen),
-        learned=LearnedFrames.of(one.channels for one in chosen),
-        emulated=any(one.emulated for one in recordings),
+        learned=LearnedFrames.of(recording.channels for recording in chosen),
+        emulated=any(recording.emulated for recording in recordings),
     )
     fitted = _fit_outputs(blank, chosen, physics, timing.uncertainty_s)
     return fitted if timing.references else replace(fitted, assumptions=("load timing",))
@@ -94,9 +94,9 @@ def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:
     if not recordings:
         raise CalibrationError("there is no recording to calibrate on")
     check_finite(recordings)
-    if len({one.table for one in recordings}) > 1:
+    if len({recording.table for recording in recordings}) > 1:
         raise CalibrationError("the recordings are of different kinds of fingertips; make a calibration of each")
-    sides = tuple(side for side in recordings[0].sides if all(side in one.sides for one in recordings))
+    sides = tuple(side for side in recordings[0].sides if all(side in recording.sides for recording in recordings))
     if not sides:
         raise CalibrationError("the recordings have no side in common; name the side of each when importing")
     return sides
@@ -104,15 +104,15 @@ def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:
 
 def _tools_of(recordings: Sequence[FrameSeries]) -> list[Measured]:
     """Return the known diameters in mm of the recordings' different tools."""
-    return distinct([tool for one in recordings if (tool := one.tool_mm) is not None])
+    return distinct([tool for recording in recordings if (tool := recording.tool_mm) is not None])
 
 
 def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
     """Return what an estimator is prepared from."""
     grips = [
-        (one.channels, grip)
-        for number, one in enumerate(recordings, 1)
-        for grip in _clear_grips(one, number, len(recordings))
+        (recording.channels, grip)
+        for number, recording in enumerate(recordings, 1)
+        for grip in _clear_grips(recording, number, len(recordings))
     ]
     validators = tuple(
         FingertipValidator.fit(
@@ -125,13 +125,15 @@ def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
         for layer, side in enumerate(recordings[0].sides)
     )
     gripped = [frames[grip.gripped] for frames, grip in grips]
-    return Material(np.array([one.noise for one in validators]), physics, recordings[0].table, validators, gripped)
+    return Material(
+        np.array([validator.noise for validator in validators]), physics, recordings[0].table, validators, gripped
+    )
 
 
 def _clear_grips(recording: FrameSeries, number: int, of: int) -> list[Grip]:
     """Return the grips with enough frames; raises CalibrationError with the recording's name if it has none."""
     grips = find_grips(recording)
-    few = [too_few_frames(one.idle.stop - one.idle.start, one.gripped.stop - one.gripped.start) for one in grips]
+    few = [too_few_frames(grip.idle.stop - grip.idle.start, grip.gripped.stop - grip.gripped.start) for grip in grips]
     if all(few):
         raise CalibrationError(f"recording {number} of {of}: {few[0]}")
     return [grip for grip, why in zip(grips, few, strict=True) if not why]
@@ -147,7 +149,7 @@ def _fit_outputs(
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
     bounds = None
     if timing_uncertainty_s:
-        each = [torque_bounds(one, timing_uncertainty_s) for one in recordings]
+        each = [torque_bounds(recording, timing_uncertainty_s) for recording in recordings]
         places = zip(rows.recording.tolist(), rows.frame.tolist(), strict=True)
         least_nm, largest_nm = np.array([[end[frame] for end in each[recording]] for recording, frame in places]).T
         bounds = least_nm, largest_nm
@@ -163,13 +165,15 @@ def _fit_outputs(
     diameter = estimator.fit_diameter(known) if enough else None
     law = None
     if len(tools := _tools_of(recordings)) > 1:
-        diameters_mm = np.array([np.nan if one.tool_mm is None else one.tool_mm.value for one in recordings])
+        diameters_mm = np.array(
+            [np.nan if recording.tool_mm is None else recording.tool_mm.value for recording in recordings]
+        )
         fitted = _fit_tools(prepared, rows, diameters_mm) if enough else None
         if fitted is not None:
             estimator, regressor, law = fitted
         elif unexplained > _TOOLS_MAY_LEAVE:
             raise CalibrationError(
-                f"the tools of {' and '.join(f'{one.value:.3g}' for one in tools)} mm turn so differently that they "
+                f"the tools of {' and '.join(f'{tool.value:.3g}' for tool in tools)} mm turn so differently that they "
                 "have no torque in common; calibrate on each alone, or on three diameters"
             )
     torque = OutputModel(regressor, estimator.k_range(rows.features))
@@ -189,12 +193,12 @@ def _fit_tools(
     features, torque_nm = rows.features, rows.torque_nm.copy()
     tools, recording = np.unique(rows.recording, return_inverse=True)
     diameters_mm = diameters_mm[tools]
-    for own in (recording == one for one in range(len(tools))):
-        if torque_nm[own].min() < -LOADED_SHARE * torque_nm[own].max():
+    for of_recording in (recording == number for number in range(len(tools))):
+        if torque_nm[of_recording].min() < -LOADED_SHARE * torque_nm[of_recording].max():
             return None
-        torque_nm[own] -= np.quantile(torque_nm[own], _RELEASED)
+        torque_nm[of_recording] -= np.quantile(torque_nm[of_recording], _RELEASED)
 
-    each = [np.flatnonzero(recording == one) for one in range(len(tools))]
+    each = [np.flatnonzero(recording == number) for number in range(len(tools))]
     if _have_torque_in_common(features, torque_nm, each):
         return None
     gains = np.array([np.sqrt((torque_nm[rows] ** 2).mean()) for rows in each])
@@ -236,7 +240,7 @@ def adapt(
     calibration.gain_regressor()
     matcher = calibration.matcher((physics or Physics()).bank)
     check_finite(recordings)
-    recordings = [one.select_sides(calibration.sides) for one in recordings]
+    recordings = [recording.select_sides(calibration.sides) for recording in recordings]
     first_frames = first_frames or [0] * len(recordings)
     rows = _replay(calibration, matcher, recordings)
     if rows is not None:
@@ -248,12 +252,12 @@ def adapt(
             "no frame is gripped and undisturbed for long enough; `shearloop evaluate` lists the reasons; "
             "twist the gripped tool again"
         )
-    for number, one in enumerate(recordings):
+    for number, recording in enumerate(recordings):
         name = names[number] if names else f"recording {number + 1} of {len(recordings)}"
-        _check_new(calibration.learned, one, rows.frame[rows.recording == number], name)
+        _check_new(calibration.learned, recording, rows.frame[rows.recording == number], name)
     features = rows.features[:, calibration.estimator.columns["torque"]]
     adapted, correction = calibration.correct_gain(features, rows.torque_nm, is_first)
-    used = [one.channels[first:] for one, first in zip(recordings, first_frames, strict=True)]
+    used = [recording.channels[first:] for recording, first in zip(recordings, first_frames, strict=True)]
     learned = calibration.learned.with_frames(used)
     return replace(adapted, source=f"{calibration.source}, adapted on {source}", learned=learned), correction
 
@@ -286,6 +290,9 @@ def _replay(
             if processed.reasons or not np.isfinite(truth[0]):
                 continue
             features = estimator.features(Reading.of(processed, t_s, matcher))
-            places = ((one / estimator.scale).ravel() for one in (processed.difference, processed.mean_difference))
+            places = (
+                (difference / estimator.scale).ravel()
+                for difference in (processed.difference, processed.mean_difference)
+            )
             rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, *truth, grip))
     return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None

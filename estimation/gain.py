@@ -86,7 +86,7 @@ class GainSpread:
         """
         rows_of_grips = [np.flatnonzero(grips == grip) for grip in np.unique(grips)]
         found = [_GripGains.of(predicted[rows], truth[rows], is_first[rows]) for rows in rows_of_grips]
-        errors_nm = [one for grip in found for one in grip.errors_nm]
+        errors_nm = [error_nm for grip in found for error_nm in grip.errors_nm]
         noise_nm = float(np.sqrt(np.mean(np.concatenate(errors_nm) ** 2))) if errors_nm else 0.0
         least_noise_nm = _LEAST_NOISE * float(np.abs(truth).max(initial=0.0))
         # A tool's own gain is not a difference between twists, so each grip counts from its own mean.
@@ -104,9 +104,9 @@ class GainSpread:
             max(within, _LEAST_WITHIN),
             max(noise_nm, least_noise_nm),
             first=first,
-            first_spread=_pooled(first_prior, _PRIOR_RECORDINGS, [(one - first) ** 2 for one in firsts]),
+            first_spread=_pooled(first_prior, _PRIOR_RECORDINGS, [(deviation - first) ** 2 for deviation in firsts]),
         )
-        spread = prior._with_recordings([one**2 for one in left_out])
+        spread = prior._with_recordings([logarithm**2 for logarithm in left_out])
         between_halves = float(np.mean(np.square(halves))) if len(halves) else 0.0
         return replace(spread, drift=math.sqrt(max(between_halves - spread.between**2, 0.0)))
 
@@ -225,10 +225,10 @@ class GainSpread:
         """
         # Along its torque, a twist's noise grows with the power of the torque, an error of the gain with its square.
         along = [truth[rows] for rows in twists]
-        power = np.array([float(one @ one) for one in along])
+        power = np.array([float(torque @ torque) for torque in along])
         errors = np.diag(power * (self.noise_nm**2 + own * power)) + common * np.outer(power, power)
         whiten = np.linalg.inv(np.linalg.cholesky(errors))
-        of_parts = np.array([one @ parts[rows] for one, rows in zip(along, twists, strict=True)])
+        of_parts = np.array([torque @ parts[rows] for torque, rows in zip(along, twists, strict=True)])
         # The first twist reads the gain times its own deviation from the later ones.
         deviation = np.exp(np.where(is_first, self.first, 0.0))[:, None]
         loaded = np.concatenate(twists)
@@ -240,7 +240,7 @@ class GainSpread:
         of_offset_nm = max(self.zero, _LEAST_ZERO) * load_nm
         return _Equations(
             of_parts=whiten @ (deviation * of_parts),
-            of_offset=whiten @ np.array([one.sum() for one in along]),
+            of_offset=whiten @ np.array([torque.sum() for torque in along]),
             known=whiten @ power,
             parts=parts[unloaded],
             weight=weight,
@@ -423,8 +423,8 @@ class ToolLaw:
         slope, intercept = np.polyfit(x, y, 1)
         tools = np.unique(x).tolist()
         squares = [
-            float(np.mean((y[x == one] - np.polyval(np.polyfit(x[x != one], y[x != one], 1), one)) ** 2))
-            for one in tools
+            float(np.mean((y[x == tool] - np.polyval(np.polyfit(x[x != tool], y[x != tool], 1), tool)) ** 2))
+            for tool in tools
         ]
         # A line through two points says little of how far a third one lies, so the prior stays.
         spread = max(_pooled(TOOL_SPREAD, _PRIOR_RECORDINGS, squares), TOOL_SPREAD)

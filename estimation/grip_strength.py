@@ -35,7 +35,7 @@ class CalibratedStrength:
     @classmethod
     def fit(cls, weights: FloatArray, grips: Sequence[FloatArray]) -> Self:
         """Fit to the (n, c) relative changes of each grip's frames."""
-        strengths = [median((one @ weights).tolist()) for one in grips]
+        strengths = [median((grip @ weights).tolist()) for grip in grips]
         return cls(weights, min(strengths), max(strengths))
 
     def ratio(self, strength: float) -> float:

@@ -46,7 +46,7 @@ class IdleFrames:
         if n == self._wanted:
             self.baselines, self._followed, self.taring = np.mean(self._tare_frames, axis=0), True, False
             for layer, frames in enumerate(self._frames):
-                frames.extend(one[layer] for one in self._tare_frames)
+                frames.extend(frame[layer] for frame in self._tare_frames)
             self._update()
         return f"taking the idle frame, {n} of {self._wanted}"
 
@@ -59,13 +59,13 @@ class IdleFrames:
         """Return the sides where a frame without a grip is idle."""
         first, self._followed = not self._followed, True
         found = []
-        for layer, one in enumerate(self._sides):
+        for layer, validator in enumerate(self._sides):
             frames = self._frames[layer]
             # One frame is a poor baseline: accept the first few unless they look clearly gripped.
             learned = len(frames) >= self._least
-            limit = 0.5 * one.grip_threshold if learned else max(_OUTRIGHT, one.grip_threshold)
-            following = bool(frames) and one.grip_score(channels[layer], self.baselines[layer]) < limit
-            if following or (first and one.looks_idle(channels[layer])):
+            limit = 0.5 * validator.grip_threshold if learned else max(_OUTRIGHT, validator.grip_threshold)
+            following = bool(frames) and validator.grip_score(channels[layer], self.baselines[layer]) < limit
+            if following or (first and validator.looks_idle(channels[layer])):
                 found.append(layer)
         return found
 
@@ -80,9 +80,9 @@ class IdleFrames:
     def _update(self) -> None:
         self.complete = all(self._frames)
         self.least_scores = [
-            max(_OUTRIGHT, one.grip_threshold) if 0 < len(frames) < self._least else -np.inf
-            for one, frames in zip(self._sides, self._frames, strict=True)
+            max(_OUTRIGHT, validator.grip_threshold) if 0 < len(frames) < self._least else -np.inf
+            for validator, frames in zip(self._sides, self._frames, strict=True)
         ]
         if self.complete:
-            gains = [one.gain(idle) for one, idle in zip(self._sides, self.baselines, strict=True)]
+            gains = [validator.gain(idle) for validator, idle in zip(self._sides, self.baselines, strict=True)]
             self.gains = np.array(gains)[:, None]

@@ -66,7 +66,7 @@ def fit_interval_regressor(
 
     parts = [refit(past) for past, _ in blocks]
     raw = [part.predict(features[future]) for part, (_, future) in zip(parts, blocks, strict=True)]
-    reported = np.concatenate([reported_values(part, one) for part, one in zip(parts, raw, strict=True)])
+    reported = np.concatenate([reported_values(part, prediction) for part, prediction in zip(parts, raw, strict=True)])
     predicted, rows = np.concatenate(raw), np.concatenate([future for _, future in blocks])
     point, truth = fit(features, values, strength), values[rows]
     residuals = reported - truth
@@ -78,7 +78,7 @@ def fit_interval_regressor(
     least = LEAST_HALF_WIDTH * float(np.ptp(values))
     intervals, widening = Intervals.fit(predicted, residuals, edges, inflation, least, of_loads), 1.0
     # Before widening for unknown times: a load that is not seen is not seen at any time.
-    half = np.array([intervals.half_width(one) for one in predicted])
+    half = np.array([intervals.half_width(prediction) for prediction in predicted])
     misses_loads = _misses_loads(truth, np.abs(residuals) <= half)
     if bounds is not None:
         if not (twists or left_out):
@@ -129,9 +129,9 @@ def _gains_of_halves(features: FloatArray, values: FloatArray, grips: IntArray, 
     `grips` (n,) is the number of each row's grip. Grips with fewer than three twists in a half have none.
     """
     gains: list[float] = []
-    for own in (np.flatnonzero(grips == grip) for grip in np.unique(grips)):
-        twists = [own[rows] for rows in find_twists(values[own])]
-        for half, out in _halves(own, twists):
+    for grip_rows in (np.flatnonzero(grips == grip) for grip in np.unique(grips)):
+        twists = [grip_rows[rows] for rows in find_twists(values[grip_rows])]
+        for half, out in _halves(grip_rows, twists):
             part = refit(np.setdiff1d(np.arange(len(values)), out))
             gain = log_gain(reported_values(part, part.predict(features[half])), values[half])
             if gain is not None:
@@ -196,6 +196,6 @@ def best_strength(
         point = fit(features[past], values[past], strength)
         return float(((reported_values(point, point.predict(features[future])) - values[future]) ** 2).mean())
 
-    errors = {one: float(np.mean([squared_error(one, *split) for split in splits])) for one in strengths}
+    errors = {strength: float(np.mean([squared_error(strength, *split) for split in splits])) for strength in strengths}
     best = max(strength for strength, error in errors.items() if error <= min(errors.values()) * 1.001)
     return best, errors[best]

@@ -89,7 +89,7 @@ class IntervalRegressor:
         """
         point = self.point
         least_nm = LOADED_SHARE * max(abs(self.range.low), abs(self.range.high))
-        twists = [one for one in find_twists(torque_nm) if np.abs(torque_nm[one]).max() >= least_nm]
+        twists = [twist for twist in find_twists(torque_nm) if np.abs(torque_nm[twist]).max() >= least_nm]
         if not twists:
             raise CalibrationError(
                 f"no twist reaches {least_nm:.3g} N·m while an estimate is possible; twist further, some seconds "

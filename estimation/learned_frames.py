@@ -59,6 +59,6 @@ def frame_digests(channels: FloatArray) -> IntArray:
     # 0 and -0 are one value.
     values = np.ascontiguousarray(channels, dtype="<f8") + 0.0
     found = b"".join(
-        hashlib.blake2b(one.tobytes(), digest_size=_DIGEST_BYTES).digest() for frame in values for one in frame
+        hashlib.blake2b(signals.tobytes(), digest_size=_DIGEST_BYTES).digest() for frame in values for signals in frame
     )
     return np.frombuffer(found, dtype="<i8").astype(np.int64).reshape(n, m)

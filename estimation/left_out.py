@@ -16,7 +16,7 @@ FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
 
 def left_out_groups(numbers: IntArray) -> list[tuple[IntArray, IntArray]]:
     """Return (rest, group) for each group of rows, from the group's number of each of (n,) rows."""
-    return [(np.flatnonzero(numbers != one), np.flatnonzero(numbers == one)) for one in np.unique(numbers)]
+    return [(np.flatnonzero(numbers != number), np.flatnonzero(numbers == number)) for number in np.unique(numbers)]
 
 
 def left_out_blocks(n: int) -> list[tuple[IntArray, IntArray]]:

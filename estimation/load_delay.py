@@ -104,7 +104,9 @@ def measure_timing(recordings: Sequence[FrameSeries], others: Sequence[FrameSeri
     if not recordings:
         return TRUSTED
     check_finite(recordings)
-    timed: Sequence[tuple[FrameSeries, LoadDelay | None]] = [(one, find_load_delay(one)) for one in recordings]
+    timed: Sequence[tuple[FrameSeries, LoadDelay | None]] = [
+        (recording, find_load_delay(recording)) for recording in recordings
+    ]
     if all(delay is None or delay.few_frames for _, delay in timed):
         timed = _sure_delays(others) or timed
     sure = [None if delay is None or delay.few_frames else delay for _, delay in timed]
@@ -117,10 +119,10 @@ def measure_timing(recordings: Sequence[FrameSeries], others: Sequence[FrameSeri
             )
     error_s = min((delay.error_s for delay in sure if delay is not None), default=np.inf)
     uncertainty_s = min(TWO_SIDED_95 * error_s, _UNCHECKED_S) if error_s > _LARGE_ERROR_S else 0.0
-    if any(one.load_doubt for one in recordings):
+    if any(recording.load_doubt for recording in recordings):
         # Another recording's delay says nothing of how long these values waited.
         uncertainty_s = _BUFFERED_S
-    return LoadTiming([one for one, _ in timed], sure, [_doubt(*one) for one in timed], uncertainty_s)
+    return LoadTiming([recording for recording, _ in timed], sure, [_doubt(*pair) for pair in timed], uncertainty_s)
 
 
 def find_load_delay(series: FrameSeries) -> LoadDelay | None:
@@ -132,7 +134,7 @@ def find_load_delay(series: FrameSeries) -> LoadDelay | None:
     if (n := len(series.t_s[part])) < _WARN_FRAMES:
         return None
     sides = (_delay_of_side(series, part, layer) for layer in range(len(series.sides)))
-    best = max((one for one in sides if one is not None), key=lambda one: one.explained, default=None)
+    best = max((delay for delay in sides if delay is not None), key=lambda delay: delay.explained, default=None)
     if best is None:
         return None
     return replace(best, late_s=_lateness(series, best), few_frames=0 if n >= _SURE_FRAMES else n)
@@ -146,10 +148,14 @@ def measured_delay(fingertips: Sequence[FrameSeries]) -> LoadDelay | None:
 def _sure_delays(recordings: Sequence[FrameSeries]) -> list[tuple[FrameSeries, LoadDelay]]:
     """Return the recordings that show a sure delay; others, as of a dead board, are left out."""
     found = []
-    for one in recordings:
+    for recording in recordings:
         with contextlib.suppress(CalibrationError):
-            if np.isfinite(one.channels).all() and (delay := find_load_delay(one)) is not None and not delay.few_frames:
-                found.append((one, delay))
+            if (
+                np.isfinite(recording.channels).all()
+                and (delay := find_load_delay(recording)) is not None
+                and not delay.few_frames
+            ):
+                found.append((recording, delay))
     return found
 
 
@@ -184,7 +190,7 @@ def torque_bounds(series: FrameSeries, uncertainty_s: float) -> tuple[FloatArray
 def _lateness(series: FrameSeries, found: LoadDelay) -> float:
     """Return the delay beyond the load cell's own one in s, 0 for a usual delay."""
     period_s = float(np.median(np.diff(series.torque_t_s)))
-    earliest_s, latest_s = (each * period_s for each in _USUAL_PERIODS[is_filtered(series.torque_nm)])
+    earliest_s, latest_s = (periods * period_s for periods in _USUAL_PERIODS[is_filtered(series.torque_nm)])
     tolerance_s = _STAMPS_S + _CERTAIN * found.error_s
     if earliest_s - tolerance_s <= found.delay_s <= latest_s + tolerance_s:
         return 0.0
@@ -225,9 +231,9 @@ def _delay_of_side(series: FrameSeries, part: slice, layer: int) -> LoadDelay | 
         return None
     near = np.abs(_SHIFTS_S - _SHIFTS_S[best]) <= _APART_S / 2
     shifts_s = _SHIFTS_S[near]
-    parts = [np.add.reduceat(each[:, near], np.arange(0, len(moves), _STRETCH_FRAMES)) for each in (total, rest)]
+    parts = [np.add.reduceat(squares[:, near], np.arange(0, len(moves), _STRETCH_FRAMES)) for squares in (total, rest)]
     drawn = np.random.default_rng(0).integers(0, len(parts[0]), (_DRAWS, len(parts[0])))
-    peaks = [_peak(shifts_s, _explained(*(each[some].sum(axis=0) for each in parts))) for some in drawn]
+    peaks = [_peak(shifts_s, _explained(*(squares[some].sum(axis=0) for squares in parts))) for some in drawn]
     # Half of the central two thirds: a few draws find another peak.
     error_s = float(np.diff(np.quantile(peaks, [0.16, 0.84]))[0]) / 2
     return LoadDelay(_peak(shifts_s, explained[near]), error_s, float(explained[best]))

@@ -111,12 +111,12 @@ class MotionFit:
     @property
     def n_directions(self) -> int:
         """The maximum number of directions of a candidate."""
-        return max(one.n_directions for one in self.candidates)
+        return max(candidate.n_directions for candidate in self.candidates)
 
     @property
     def n_steps(self) -> int:
         """The maximum number of steps of a candidate."""
-        return max(one.n_steps for one in self.candidates)
+        return max(candidate.n_steps for candidate in self.candidates)
 
     @property
     def first_direction(self) -> int:
@@ -131,7 +131,7 @@ class MotionFit:
 
     def fit(self, features: FloatArray, values: FloatArray, _strength: float = 0.0) -> Ridge:
         """Return the mean of the candidates' fits to (n, d) features and (n,) values, divided by the slope."""
-        members = [self._fit_candidate(one, features, values) for one in self.candidates]
+        members = [self._fit_candidate(candidate, features, values) for candidate in self.candidates]
         return mean_ridge(members).scaled(1.0 / self.slope)
 
     def fit_used(self, features: FloatArray, values: FloatArray, strength: float = 0.0) -> Ridge:
@@ -151,14 +151,14 @@ class MotionFit:
 
 def mean_ridge(members: Sequence[Ridge]) -> Ridge:
     """Return the linear map that predicts the mean of the members' predictions."""
-    centre = np.mean([one.mean for one in members], axis=0)
-    weights = np.mean([one.weights for one in members], axis=0)
-    offset = float(np.mean([one.offset + (centre - one.mean) @ one.weights for one in members]))
+    centre = np.mean([member.mean for member in members], axis=0)
+    weights = np.mean([member.weights for member in members], axis=0)
+    offset = float(np.mean([member.offset + (centre - member.mean) @ member.weights for member in members]))
     first = members[0]
     if isinstance(first, CensoredRidge):
-        squares = [one.sigma**2 for one in members if isinstance(one, CensoredRidge)]
+        squares = [member.sigma**2 for member in members if isinstance(member, CensoredRidge)]
         first = replace(first, sigma=float(np.sqrt(np.mean(squares))))
-    strength = float(np.mean([one.strength for one in members]))
+    strength = float(np.mean([member.strength for member in members]))
     return replace(first, mean=centre, weights=weights, offset=offset, strength=strength)
 
 
@@ -200,11 +200,11 @@ def choose_motion(
     windows = range(layout.n_windows if can_choose else 1)
     combinations = itertools.product(directions, steps, _PENALTIES, windows)
     candidates = tuple(itertools.starmap(Candidate, combinations))
-    fits = [MotionFit(layout, fit_one, position, (one,)) for one in candidates]
-    predicted = np.array([_predict_left_out(one, features, torque_nm, left_out) for one in fits])
+    fits = [MotionFit(layout, fit_one, position, (candidate,)) for candidate in candidates]
+    predicted = np.array([_predict_left_out(fit, features, torque_nm, left_out) for fit in fits])
     judged = _LeftOutFits(
         predicted,
-        np.array([one.window for one in candidates]),
+        np.array([candidate.window for candidate in candidates]),
         torque_nm,
         partial(reported_values, fits[0].fit(features, torque_nm)),
     )
@@ -249,9 +249,9 @@ class _LeftOutFits:
 
         def squared_error(settings: Settings) -> float:
             errors: list[FloatArray] = []
-            for own in parts:
-                good, slope = self.choose(settings, np.setdiff1d(loaded, own))
-                errors.append(self.mean(good, own) / slope - self.torque_nm[own])
+            for part in parts:
+                good, slope = self.choose(settings, np.setdiff1d(loaded, part))
+                errors.append(self.mean(good, part) / slope - self.torque_nm[part])
             return float((np.concatenate(errors) ** 2).sum())
 
         return min(choices, key=squared_error)

@@ -66,8 +66,10 @@ class TemporalFeatures(Motion):
 
         windows = _NESTED_DIRECTION_FRAMES if nested else _DIRECTION_FRAMES
         directions = [
-            np.vstack([main_directions([part[:, layer] for part in parts], one.noise, frames) for frames in windows])
-            for layer, one in enumerate(validators)
+            np.vstack(
+                [main_directions([part[:, layer] for part in parts], validator.noise, frames) for frames in windows]
+            )
+            for layer, validator in enumerate(validators)
         ]
         return cls(np.array(directions), np.array(MEMORY_EDGES), uses_position=True)
 
@@ -97,12 +99,12 @@ class TemporalFeatures(Motion):
     ) -> FloatArray:
         """Return a motion (m, c), unusable channels along the directions, and from idle along the grip too."""
         imputed = []
-        for layer, one in enumerate(sides):
-            alive = np.isfinite(one.noise)
-            modes = self.directions[layer] * np.where(alive, one.noise, 0.0) ** 2
+        for layer, validator in enumerate(sides):
+            alive = np.isfinite(validator.noise)
+            modes = self.directions[layer] * np.where(alive, validator.noise, 0.0) ** 2
             if from_idle:
-                modes = np.vstack([modes, one.gripped - one.idle])
-            weights = np.where(usable[layer] & alive, 1.0 / one.noise, 0.0)
+                modes = np.vstack([modes, validator.gripped - validator.idle])
+            weights = np.where(usable[layer] & alive, 1.0 / validator.noise, 0.0)
             found = np.linalg.lstsq((modes * weights).T, moved[layer] * weights, rcond=None)[0]
             imputed.append(found @ modes)
         return np.where(usable, moved, imputed)
@@ -224,5 +226,5 @@ class MotionRegression(Estimator):
         """Return the diameter's model from rows of known diameters, by age."""
         from shearloop.estimation.cylinder_fit import fit_cylinders
 
-        grips = [rows.where(rows.recording == one) for one in np.unique(rows.recording)]
+        grips = [rows.where(rows.recording == recording) for recording in np.unique(rows.recording)]
         return OutputModel(fit_cylinders(grips, self.table), np.zeros(0))

@@ -87,7 +87,7 @@ class PaperSession(Session):
         if averaged and frame.t_s - averaged[-1][0] > self._max_gap_s:
             averaged.clear()
         averaged.append((frame.t_s, channels))
-        mean = np.mean([one for _, one in averaged], axis=0)
+        mean = np.mean([signals for _, signals in averaged], axis=0)
         difference = mean - untouched.idle_frame
         n = len(averaged)
         noise = untouched.noise * math.sqrt(1.0 / n + 1.0 / untouched.wanted)

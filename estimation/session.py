@@ -131,7 +131,7 @@ class Session:
         self._timer = FrameTimer(self._period_s)
         self._checks = ChannelChecks(fingertips, motion)
         self._idle = IdleFrames(fingertips, idle_frames)
-        self._grips = [GripDetector(one) for one in fingertips.sides]
+        self._grips = [GripDetector(validator) for validator in fingertips.sides]
         self._memory = GripMemory(motion, fingertips.idle.shape)
 
     def give_up_tare(self) -> None:
@@ -283,10 +283,10 @@ class Session:
             from_idle = self._motion.impute(from_idle, usable, sides, from_idle=True)
         # At the calibration's gain. It does not change while gripped.
         difference = from_idle / idle.gains
-        for layer, (one, grip) in enumerate(zip(sides, self._grips, strict=True)):
+        for layer, (validator, grip) in enumerate(zip(sides, self._grips, strict=True)):
             known = idle.baselines[layer], idle.gains[layer], idle.least_scores[layer]
             if not grip.update(channels[layer], *known):
-                loose.append(one.side)
+                loose.append(validator.side)
         if loose:
             self._memory.forget()
             reason = f"no grip at the {' and '.join(loose)} fingertip"
@@ -296,7 +296,9 @@ class Session:
         memory = self._memory
         # Motion is read in volts: after a release a gel's idle voltages recover for minutes, which is no gain.
         recent = memory.remember(channels, from_idle, difference, missing)
-        self._strengths = {one.side: grip.strength.ratio for one, grip in zip(sides, self._grips, strict=True)}
+        self._strengths = {
+            validator.side: grip.strength.ratio for validator, grip in zip(sides, self._grips, strict=True)
+        }
         if reasons := (recent,) if recent else strength_reasons(self._strengths):
             return ProcessedFrame(difference, reasons, usable, GripState.HELD)
         return ProcessedFrame(
@@ -378,8 +380,8 @@ class Session:
         value = model.regressor.predict(features, usable_share)
         dead: tuple[str, ...] = ()
         if len(errors):
-            changed = [self._regressor_inputs(quantity, reading, frame.difference + one) for one in errors]
-            error = TWO_SIDED_95 * math.hypot(*(model.regressor.predict(one)[0] - value[0] for one in changed))
+            changed = [self._regressor_inputs(quantity, reading, frame.difference + error) for error in errors]
+            error = TWO_SIDED_95 * math.hypot(*(model.regressor.predict(inputs)[0] - value[0] for inputs in changed))
             # The gain's error is the same with all channels.
             reach = model.regressor.gain.reach(value[0])
             own = [math.sqrt(max(ends[0] ** 2 - ends[1] ** 2, 0.0)) for ends in zip(value[1:], reach, strict=True)]
@@ -402,12 +404,14 @@ class Session:
 
 def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: BoolArray) -> tuple[str, ...]:
     """Return which fingertips lack channels that worked at calibration, as reasons against an estimate."""
-    missing = [int(np.sum(~mask & np.isfinite(one.noise))) for one, mask in zip(validators, usable, strict=True)]
+    missing = [
+        int(np.sum(~mask & np.isfinite(validator.noise))) for validator, mask in zip(validators, usable, strict=True)
+    ]
     return tuple(
-        f"{one.side} fingertip: the estimate depends on every channel that worked at calibration, and "
+        f"{validator.side} fingertip: the estimate depends on every channel that worked at calibration, and "
         f"{counted(n, 'is', 'are')} dead or saturated; check the ribbon cable, calibrate again, or use the "
         "estimator motion_regression"
-        for one, n in zip(validators, missing, strict=True)
+        for validator, n in zip(validators, missing, strict=True)
         if n
     )
 

@@ -30,9 +30,9 @@ class TorqueProfile:
         """Return the profile of recordings, None without a known torque."""
         offsets = np.arange(-_REACH_S, _REACH_S + _STEP_S / 2, _STEP_S)
         twists = [
-            np.interp(middle + offsets, one.torque_t_s, one.torque_nm, left=np.nan, right=np.nan)
-            for one in recordings
-            for middle in _middles(one)
+            np.interp(middle + offsets, recording.torque_t_s, recording.torque_nm, left=np.nan, right=np.nan)
+            for recording in recordings
+            for middle in _middles(recording)
         ]
         rows = np.array(twists).reshape(-1, len(offsets))
         known = np.isfinite(rows).any(axis=0) if len(rows) else np.zeros(len(offsets), dtype=np.bool_)

@@ -14,13 +14,13 @@ def find_twists(torque_nm: FloatArray, largest_nm: float | None = None) -> list[
     """Return the rows of each stretch of loaded frames in (n,) torques; the largest torque is given or found."""
     largest_nm = float(np.abs(torque_nm).max(initial=0.0)) if largest_nm is None else largest_nm
     rows = np.flatnonzero(np.abs(torque_nm) > LOADED_SHARE * largest_nm)
-    return [one for one in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(one)]
+    return [twist for twist in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(twist)]
 
 
 def first_twists(torque_nm: FloatArray, grips: IntArray) -> BoolArray:
     """Return which of (n,) frames belong to the first twist of their grip, from the number of each frame's grip."""
     found: BoolArray = np.zeros(len(torque_nm), dtype=np.bool_)
-    for rows in (np.flatnonzero(grips == one) for one in np.unique(grips)):
+    for rows in (np.flatnonzero(grips == grip) for grip in np.unique(grips)):
         for first in find_twists(torque_nm[rows])[:1]:
             found[rows[first]] = True
     return found

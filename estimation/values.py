@@ -256,7 +256,7 @@ def torque_at(t_s: FloatArray, torque_t_s: FloatArray, torque_nm: FloatArray) ->
 
 def check_finite(recordings: Sequence[FrameSeries]) -> None:
     """Raise CalibrationError for a recording without frames, or with values that are not finite."""
-    check_finite_values([(one.t_s, one.channels, one.torque_nm) for one in recordings])
+    check_finite_values([(recording.t_s, recording.channels, recording.torque_nm) for recording in recordings])
 
 
 def check_finite_values(recordings: Sequence[tuple[FloatArray, ...]]) -> None:
@@ -265,7 +265,7 @@ def check_finite_values(recordings: Sequence[tuple[FloatArray, ...]]) -> None:
         which = f"recording {number} of {len(recordings)}"
         if not len(values[0]):
             raise CalibrationError(f"{which} has no frames to calibrate on; leave it out, or use a longer part of it")
-        wrong = sum(int(np.count_nonzero(~np.isfinite(one))) for one in values)
+        wrong = sum(int(np.count_nonzero(~np.isfinite(array))) for array in values)
         if wrong:
             found = counted(wrong, "value that is not a finite number", "values that are not finite numbers")
             raise CalibrationError(f"{which} holds {found}; leave those frames out")
@@ -286,10 +286,13 @@ def distinct(measured: Sequence[Measured]) -> list[Measured]:
     Two measurements are of one thing if their 95 % intervals cannot separate them.
     """
     things: list[Measured] = []
-    for one in sorted(measured, key=lambda one: (one.half_width, one.value)):
-        if all(abs(one.value - other.value) > math.hypot(one.half_width, other.half_width) for other in things):
-            things.append(one)
-    return sorted(things, key=lambda one: one.value)
+    for measurement in sorted(measured, key=lambda measurement: (measurement.half_width, measurement.value)):
+        if all(
+            abs(measurement.value - other.value) > math.hypot(measurement.half_width, other.half_width)
+            for other in things
+        ):
+            things.append(measurement)
+    return sorted(things, key=lambda measurement: measurement.value)
 
 
 def combine(*measured: Measured | None) -> Measured | None:
@@ -297,12 +300,12 @@ def combine(*measured: Measured | None) -> Measured | None:
 
     Where they differ by more than their intervals allow, the half width grows accordingly (Birge 1932).
     """
-    present = [one for one in measured if one is not None]
+    present = [measurement for measurement in measured if measurement is not None]
     if not present:
         return None
-    if any(one.half_width <= 0 for one in present):
+    if any(measurement.half_width <= 0 for measurement in present):
         raise ValueError("a measurement without uncertainty has no weight")
-    weighted = [(one.half_width**-2, one.value) for one in present]
+    weighted = [(measurement.half_width**-2, measurement.value) for measurement in present]
     total = sum(weight for weight, _ in weighted)
     if not total:  # every half width is infinite
         return None

@@ -93,7 +93,7 @@ def design_yaml(design: Design, fingertip: Path, recording: Path) -> str:
 def doubts(design: Design) -> list[str]:
     """Return reasons not to build a bank of this design, in sentences; empty for frames of a grip."""
     found = []
-    least = min(one.penalised for one in design.models)
+    least = min(fit.penalised for fit in design.models)
     if least > _MAX_UNEXPLAINED:
         found.append(
             f"even the best model leaves {least:.1%} of a frame unexplained, against 61% of the paper's slices: "
@@ -110,10 +110,10 @@ def doubts(design: Design) -> list[str]:
 def choice_lines(design: Design) -> list[str]:
     """Return each choice with its error and the next finer step's."""
     found = []
-    for one in design.choices:
-        step, after = one.chosen, one.next_step
-        text = f"{one.name}: {step.setting:g} {one.unit} ({step.cost}) adds {step.added:.2f} of the noise"
-        if not one.enough:
+    for choice in design.choices:
+        step, after = choice.chosen, choice.next_step
+        text = f"{choice.name}: {step.setting:g} {choice.unit} ({step.cost}) adds {step.added:.2f} of the noise"
+        if not choice.enough:
             text += ", more than a third: the finest tried"
         elif after is not None:
             text += f"; {after.setting:g} would add {after.added:.2f}"

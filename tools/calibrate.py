@@ -60,7 +60,7 @@ class CalibrationResult:
         if self.regressor is not None:
             found["sees_loads"] = not self.regressor.misses_loads
         if timing.references:
-            found["load_cell_delay_s"] = [one and round(one.delay_s, 3) for one in timing.delays]
+            found["load_cell_delay_s"] = [delay and round(delay.delay_s, 3) for delay in timing.delays]
             found["load_cell_warnings"] = list(self.doubts)
             found["timing_uncertainty_s"] = round(timing.uncertainty_s, 3)
         if self.left_out:
@@ -90,8 +90,8 @@ def calibrate(
     begun = time.perf_counter()
     calibration = fit(estimator, read.parts, source, physics, timing=read.timing)
     fit_s = time.perf_counter() - begun
-    frames = sum(len(one.t_s) for one in read.parts)
-    tools = distinct([one.tool_mm for one in read.parts if one.tool_mm is not None])
+    frames = sum(len(part.t_s) for part in read.parts)
+    tools = distinct([part.tool_mm for part in read.parts if part.tool_mm is not None])
     return CalibrationResult(calibration, frames, read.timing, read.doubts, tools, read.parts, fit_s, read.left_out)
 
 
@@ -130,19 +130,19 @@ def read_parts(
             # Other sides may show the load cell's delay better.
             not_fitted = [series_of(recording, (side,), tool_mm) for side in recording.sides if side not in sides]
         chosen.append((path, part_of(series_of(recording, sides, tool_mm), *time_range)))
-        others += [(f"{path.name}, {one.sides[0]}", part_of(one, *time_range)) for one in not_fitted]
+        others += [(f"{path.name}, {series.sides[0]}", part_of(series, *time_range)) for series in not_fitted]
     parts = [part for _, part in chosen]
     check_no_copies([(str(path), part) for path, part in chosen])
     if load_cell_delay_s:
-        parts = [replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s) for one in parts]
-    timing = TRUSTED if load_cell_delay_s is not None else measure_timing(parts, [one for _, one in others])
+        parts = [replace(part, torque_t_s=part.torque_t_s - load_cell_delay_s) for part in parts]
+    timing = TRUSTED if load_cell_delay_s is not None else measure_timing(parts, [part for _, part in others])
     if all_live:
         # One clock stamped frames and torques at their arrival; the motion's delay does not count.
         timing = replace(timing, uncertainty_s=0.0)
-    named = [*((path.name, one) for path, one in chosen), *others]
-    warned = [each for each in zip(timing.references, timing.warnings, strict=True) if each[1]]
-    doubts = [f"{name}: {why}" for name, one in named for reference, why in warned if one is reference]
-    left_out = [f"{path.name}: {'; '.join(one.left_out)}" for path, one in chosen if one.left_out]
+    named = [*((path.name, part) for path, part in chosen), *others]
+    warned = [pair for pair in zip(timing.references, timing.warnings, strict=True) if pair[1]]
+    doubts = [f"{name}: {why}" for name, part in named for reference, why in warned if part is reference]
+    left_out = [f"{path.name}: {'; '.join(part.left_out)}" for path, part in chosen if part.left_out]
     return ReadParts(parts, [path for path, _ in chosen], timing, doubts, left_out)
 
 
@@ -162,12 +162,15 @@ def adapt_to_recordings(
     """
     check_paths_differ(paths)
     start, stop = time_range
-    named = [(str(path), one) for path in paths for one in read_series(path, calibration.sides, tool_mm)]
+    named = [(str(path), recording) for path in paths for recording in read_series(path, calibration.sides, tool_mm)]
     check_no_copies(named)
-    series = [one for _, one in named]
+    series = [recording for _, recording in named]
     # Earlier frames show the session the idle fingertip.
-    until = [part_of(replace(one, torque_t_s=one.torque_t_s - load_cell_delay_s), 0.0, stop) for one in series]
-    first = [part_of(one, start, stop).first_frame for one in series]
+    until = [
+        part_of(replace(recording, torque_t_s=recording.torque_t_s - load_cell_delay_s), 0.0, stop)
+        for recording in series
+    ]
+    first = [part_of(recording, start, stop).first_frame for recording in series]
     source, names = source_text(paths, time_range, load_cell_delay_s), [str(path) for path in paths]
     return adapt(calibration, until, source, physics, first_frames=first, names=names)
 

@@ -111,7 +111,7 @@ def _check_experiment(
     from shearloop.daemon.experiment_files import check_experiment, read_document
     from shearloop.daemon.torques import WRENCH
 
-    warm_up_s = max((one.warm_up_s for one in sources.values() if one.measures_torque), default=0.0)
+    warm_up_s = max((source.warm_up_s for source in sources.values() if source.measures_torque), default=0.0)
     if config.experiment is not None:
         document = read_document(config.experiment)
         mistakes = experiment_mistakes(document.content, config, sources, robot)

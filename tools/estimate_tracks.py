@@ -46,7 +46,11 @@ class EstimateTrack:
     @property
     def without_torque(self) -> int:
         """The number of valid frames without a torque because of the held tool."""
-        return sum(one.valid and one.torque_nm is None for one in self.estimates) if self.why_no_torque else 0
+        return (
+            sum(estimate.valid and estimate.torque_nm is None for estimate in self.estimates)
+            if self.why_no_torque
+            else 0
+        )
 
 
 def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> EstimateTrack:

@@ -54,13 +54,13 @@ def evaluate_recordings(
 ) -> Evaluation:  # fmt: skip
     """Return a calibration's estimates of these shares (0 to 1) of recordings; raises UserError for copies."""
     start, stop = time_range
-    parts = [part_of(one, start, stop) for _, one in named]
+    parts = [part_of(series, start, stop) for _, series in named]
     check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
     if bank is not None:
         Bank.open(bank)
     shared = (calibration, None if bank is None else str(bank.resolve()))
     # Frames before the part show the idle fingertip, as live.
-    estimated = pool.map(estimate_in_worker, shared, [part_of(one, 0.0, stop) for _, one in named])
+    estimated = pool.map(estimate_in_worker, shared, [part_of(series, 0.0, stop) for _, series in named])
     tracks = [track.since(part.first_frame) for track, part in zip(estimated, parts, strict=True)]
     warned = [(path.name, load_delay_warning(part)) for (path, _), part in zip(named, parts, strict=True)]
     return Evaluation(
@@ -73,11 +73,11 @@ def evaluate_recordings(
         known_data(calibration.learned, tracks, [path for path, _ in named])
         + [f"{name}: {warning}" for name, warning in warned if warning],
         [
-            f"{path.name}: {'; '.join(one.left_out)}"
-            for (path, _), one in zip(named, parts, strict=True)
-            if one.left_out
+            f"{path.name}: {'; '.join(part.left_out)}"
+            for (path, _), part in zip(named, parts, strict=True)
+            if part.left_out
         ],
-        list(dict.fromkeys(path.name for (path, _), one in zip(named, parts, strict=True) if one.emulated)),
+        list(dict.fromkeys(path.name for (path, _), part in zip(named, parts, strict=True) if part.emulated)),
     )
 
 
@@ -136,10 +136,10 @@ def write_estimates(tracks: Sequence[EstimateTrack], names: Sequence[str], path:
         table.writerow(["recording", "frame", "t_s", "truth_nm", *values, "valid", "reason"])
         for track, name in zip(tracks, names, strict=True):
             series = track.series
-            truths = [None if math.isnan(one) else one for one in series.torque_at_frames().tolist()]
+            truths = [None if math.isnan(truth) else truth for truth in series.torque_at_frames().tolist()]
             frames = enumerate(zip(series.t_s.tolist(), truths, track.estimates, strict=True), series.first_frame)
             for number, (t_s, truth, estimate) in frames:
-                cells = [getattr(estimate, one) for one in values]
+                cells = [getattr(estimate, column) for column in values]
                 reason = _joined(estimate.reasons)
                 if estimate.valid and estimate.torque_nm is None:
                     reason = track.why_no_torque

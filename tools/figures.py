@@ -48,7 +48,7 @@ class Frames:
 
     def with_more(self, others: Sequence[Self]) -> Self:
         """Return these frames and others after them."""
-        columns = ([getattr(one, column.name) for one in (self, *others)] for column in fields(self))
+        columns = ([getattr(frames, column.name) for frames in (self, *others)] for column in fields(self))
         return type(self)(*map(np.concatenate, columns))
 
 

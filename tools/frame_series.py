@@ -72,7 +72,7 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
     return FrameSeries(
         wanted,
         t_s,
-        np.stack([recording.table.channels_of_line(one) for one in lines], axis=1),
+        np.stack([recording.table.channels_of_line(line) for line in lines], axis=1),
         (recording.torque_t_ns - start) / 1e9,
         recording.torque_nm,
         np.full(len(t_s), diameter_mm),
@@ -114,7 +114,7 @@ def tool_of(recording: Recording, t_ns: IntArray, given_mm: float | None = None)
     held = _held_mm(recording, t_ns)
     conflict = ""
     if len(held) > 1:
-        conflict = f"the gripper held tools of {' and '.join(f'{one.value:.1f}' for one in held)} mm"
+        conflict = f"the gripper held tools of {' and '.join(f'{tool.value:.1f}' for tool in held)} mm"
     elif held and _is_another(held[0].value, Measured(named_mm, held[0].half_width)):
         conflict = f"it names a tool of {named_mm:g} mm, and the gripper held one of {held[0].value:.1f} mm"
     if conflict and given_mm is None:
@@ -149,8 +149,8 @@ def _held_mm(recording: Recording, t_ns: IntArray) -> list[Measured]:
     held = [tool for row in rows.tolist() if row >= 0 and (tool := tools[row]) is not None]
     if not held:
         return []
-    usual = sorted(held, key=lambda one: one.value)[len(held) // 2]
-    others = [one for one in held if _is_another(one.value, usual)]
+    usual = sorted(held, key=lambda tool: tool.value)[len(held) // 2]
+    others = [tool for tool in held if _is_another(tool.value, usual)]
     return [usual] if len(others) <= _MOMENTARY * len(held) else [usual, others[len(others) // 2]]
 
 
@@ -174,8 +174,8 @@ def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:
     A copy is no second measurement: intervals fitted to it are too narrow, and figures count frames twice.
     """
     known: list[tuple[str, IntArray]] = []
-    for name, one in series:
-        digests = frame_digests(one.channels)
+    for name, recording in series:
+        digests = frame_digests(recording.channels)
         for other, of_other in known:
             shared = int(np.isin(digests, of_other).any(axis=1).sum())
             if shared > _MOST_SHARED * min(len(digests), len(of_other)):

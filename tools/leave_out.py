@@ -81,7 +81,7 @@ class Recipe:
         if block.adapted is None:
             return Judged(self._tracks(recordings, block, calibration))
         adapted = _adapted(self, recordings, block, calibration)
-        before, after = (self._tracks(recordings, block, one) for one in (calibration, adapted))
+        before, after = (self._tracks(recordings, block, version) for version in (calibration, adapted))
         return Judged(after, before)
 
     def _tracks(
@@ -111,13 +111,15 @@ class LeftOut:
     @property
     def all_tracks(self) -> list[EstimateTrack]:
         """The tracks of all blocks."""
-        return [one for tracks in self.tracks for one in tracks]
+        return [track for tracks in self.tracks for track in tracks]
 
     @property
     def not_judged(self) -> list[str]:
         """Why blocks have no part in the figures, each in one sentence without its point."""
         blocks = zip(self.names, self.tracks, strict=True)
-        refused = [f"{name} is not judged: no torque was estimated on it" for name, own in blocks if _lacks_torque(own)]
+        refused = [
+            f"{name} is not judged: no torque was estimated on it" for name, tracks in blocks if _lacks_torque(tracks)
+        ]
         return [*self.without_rest, *refused]
 
     def figures(self, loaded_nm: float = LOADED_NM) -> dict[str, object]:
@@ -157,8 +159,8 @@ class Plan:
     def judge(self, pool: Executor) -> LeftOut:
         """Fit and judge each block; raises CalibrationError where the rest determines no calibration."""
         judged = list(pool.map(judge_block, (self.recipe, self.recordings), self.blocks))
-        tracks, names = tuple(one.tracks for one in judged), tuple(one.name for one in self.blocks)
-        before = tuple(track for one in judged for track in one.before)
+        tracks, names = tuple(result.tracks for result in judged), tuple(block.name for block in self.blocks)
+        before = tuple(track for result in judged for track in result.before)
         return LeftOut(self.kind, names, tracks, self.advice(tracks), self.clock, before, self.without_rest)
 
 
@@ -176,8 +178,8 @@ def plan_left_out(
     With `adapt_twists` the gain is adapted to as many twists at the beginning of each judged recording, which are
     neither fitted nor judged. Raises UserError for recordings without two such blocks.
     """
-    sides = [side for side in recordings[0].sides if all(side in one.sides for one in recordings)]
-    chosen = tuple(one.select_sides(tuple(sides)) for one in recordings) if sides else tuple(recordings)
+    sides = [side for side in recordings[0].sides if all(side in recording.sides for recording in recordings)]
+    chosen = tuple(recording.select_sides(tuple(sides)) for recording in recordings) if sides else tuple(recordings)
     blocks = find_blocks(kind, chosen, names)
     advice = partial(advice_on, kind, chosen, adapted=bool(adapt_twists))
     if not adapt_twists:
@@ -216,7 +218,7 @@ def advice_on(
     kind: Kind, recordings: Sequence[FrameSeries], tracks: Sequence[Sequence[EstimateTrack]], *, adapted: bool
 ) -> str:
     """Return one sentence of advice for a better calibration; `adapted`: its gain was adapted to twists."""
-    judged = [one for each in tracks for one in each]
+    judged = [track for block_tracks in tracks for track in block_tracks]
     loaded = figures_by_load(judged)["loaded"]
     if loaded["baseline_ratio"] is None:
         return NO_ESTIMATE

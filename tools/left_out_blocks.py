@@ -53,14 +53,14 @@ def find_blocks(kind: Kind, recordings: Sequence[FrameSeries], names: Sequence[s
 
 def usual_kind(recordings: Sequence[FrameSeries]) -> Kind:
     """Return the widest kind that recordings allow: tools, else grips, else twists."""
-    if len(tools_of(recordings)) > 1 and all(one.tool_mm is not None for one in recordings):
+    if len(tools_of(recordings)) > 1 and all(recording.tool_mm is not None for recording in recordings):
         return "tools"
     return "grips" if number_of_grips(recordings) > 1 else "twists"
 
 
 def number_of_grips(recordings: Sequence[FrameSeries]) -> int:
     """Return how many grips the recordings hold together."""
-    return sum(len(find_grips(one)) for one in recordings)
+    return sum(len(find_grips(recording)) for recording in recordings)
 
 
 def _grips(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
@@ -81,11 +81,11 @@ def _grips(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Bloc
 
 def _tools(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Block]:
     """Return a block for each diameter, with all of its recordings."""
-    unnamed = [name for name, one in zip(names, recordings, strict=True) if one.tool_mm is None]
+    unnamed = [name for name, recording in zip(names, recordings, strict=True) if recording.tool_mm is None]
     if unnamed:
         raise UserError(f"{unnamed[0]} does not name its tool's diameter; name it with --tool-mm")
-    sizes = [one.tool_mm.value for one in recordings if one.tool_mm is not None]
-    tools = [one.value for one in tools_of(recordings)]
+    sizes = [recording.tool_mm.value for recording in recordings if recording.tool_mm is not None]
+    tools = [tool.value for tool in tools_of(recordings)]
     if len(tools) < 2:
         raise UserError(
             f"there is one tool, of {tools[0]:.3g} mm, which leaves nothing to fit; record four tools, or use "
@@ -94,7 +94,7 @@ def _tools(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Bloc
     of = [min(tools, key=lambda tool: abs(tool - size)) for size in sizes]
     return [
         _without_recordings(
-            recordings, [number for number, own in enumerate(of) if own == tool], f"the tool of {tool:.3g} mm"
+            recordings, [number for number, nearest in enumerate(of) if nearest == tool], f"the tool of {tool:.3g} mm"
         )
         for tool in tools
     ]
@@ -102,16 +102,16 @@ def _tools(recordings: Sequence[FrameSeries], names: Sequence[str]) -> list[Bloc
 
 def tools_of(recordings: Sequence[FrameSeries]) -> list[Measured]:
     """Return the known diameters in mm of the recordings' different tools."""
-    return distinct([tool for one in recordings if (tool := one.tool_mm) is not None])
+    return distinct([tool for recording in recordings if (tool := recording.tool_mm) is not None])
 
 
 def _without_recordings(recordings: Sequence[FrameSeries], left_out: Sequence[int], name: str) -> Block:
-    fitted = tuple(np.full(len(one.t_s), number not in left_out) for number, one in enumerate(recordings))
+    fitted = tuple(np.full(len(recording.t_s), number not in left_out) for number, recording in enumerate(recordings))
     return Block(name, fitted, tuple(Span(number, 0, len(recordings[number].t_s)) for number in left_out))
 
 
 def _without_span(recordings: Sequence[FrameSeries], span: Span, name: str) -> Block:
-    fitted = [np.ones(len(one.t_s), dtype=np.bool_) for one in recordings]
+    fitted = [np.ones(len(recording.t_s), dtype=np.bool_) for recording in recordings]
     fitted[span.recording][span.first : span.stop] = False
     return Block(name, tuple(fitted), (span,))
 
@@ -150,20 +150,20 @@ def _twist_edges(series: FrameSeries, grip: Grip) -> list[int]:
 def kept(recordings: Sequence[Series], rows: Sequence[BoolArray]) -> list[Series]:
     """Return the recordings with only these rows and the torques nearest to them; drop recordings without rows."""
     found: list[Series] = []
-    for one, own in zip(recordings, rows, strict=True):
-        if not own.any():
+    for recording, chosen in zip(recordings, rows, strict=True):
+        if not chosen.any():
             continue
-        middles = one.t_s[:-1] + np.diff(one.t_s) / 2
-        near = own[np.searchsorted(middles, one.torque_t_s)]
+        middles = recording.t_s[:-1] + np.diff(recording.t_s) / 2
+        near = chosen[np.searchsorted(middles, recording.torque_t_s)]
         found.append(
             replace(
-                one,
-                t_s=one.t_s[own],
-                channels=one.channels[own],
-                diameter_mm=one.diameter_mm[own],
-                fingers_moved=None if one.fingers_moved is None else one.fingers_moved[own],
-                torque_t_s=one.torque_t_s[near],
-                torque_nm=one.torque_nm[near],
+                recording,
+                t_s=recording.t_s[chosen],
+                channels=recording.channels[chosen],
+                diameter_mm=recording.diameter_mm[chosen],
+                fingers_moved=None if recording.fingers_moved is None else recording.fingers_moved[chosen],
+                torque_t_s=recording.torque_t_s[near],
+                torque_nm=recording.torque_nm[near],
             )
         )
     return found
@@ -181,13 +181,13 @@ def after_twists(blocks: Sequence[Block], recordings: Sequence[FrameSeries], n_t
 
     These twists are neither fitted nor judged. Raises UserError where nothing remains to be judged.
     """
-    grips = [find_grips(one) for one in recordings]
+    grips = [find_grips(recording) for recording in recordings]
     found: list[Block] = []
     not_judged: list[str] = []
     for block in blocks:
         for span in block.judged:
             series = recordings[span.recording]
-            grip = [one for one in grips[span.recording] if one.idle.start <= span.first][-1]
+            grip = [grip for grip in grips[span.recording] if grip.idle.start <= span.first][-1]
             edges = _twist_edges(series, grip)
             n_of_grip = len(edges) - 1
             if n_of_grip <= n_twists:

@@ -118,7 +118,7 @@ def _press(
 ) -> list[Line]:
     """Ask for one press on the tool, and return the lines on the moments at which the devices saw it."""
     config = context.config
-    slowest_s = max([own.frame_period_s for own in config.fingertips.values()], default=0.0)
+    slowest_s = max([fingertip.frame_period_s for fingertip in config.fingertips.values()], default=0.0)
     level_s = _LEVEL_S + _LEVEL_FRAMES * slowest_s
     context.operator.say(f"Keep away from the tool for {level_s:.0f} s.")
     context.observer.forget()
@@ -203,7 +203,8 @@ def judge_load(
 ) -> list[Line]:
     """Return the lines on the load cell, at rest and with a known torque. The sign is judged in stage 7."""
     noise_nm = statistics.stdev(sample.torque_nm for sample in rest)
-    found_nm = statistics.mean(one.torque_nm for one in loaded) - statistics.mean(one.torque_nm for one in rest)
+    rest_nm = statistics.mean(sample.torque_nm for sample in rest)
+    found_nm = statistics.mean(sample.torque_nm for sample in loaded) - rest_nm
     scale = abs(found_nm) / known_nm
     rate = (len(rest) - 1) / ((rest[-1].t_arrival_ns - rest[0].t_arrival_ns) / 1e9) / rate_hz
     return [

@@ -107,7 +107,7 @@ def _outage(context: Context, asked_ns: int) -> Found | None:
 def _is_whole(observer: Observer, before: Seen, rest: Seen) -> bool:
     """Return whether no sample is missing between two."""
     samples = observer.since(before.made_ns, rest.made_ns + 1)
-    return all(later.made_ns - one.made_ns < INTERRUPTED_NS for one, later in pairwise(samples))
+    return all(later.made_ns - earlier.made_ns < INTERRUPTED_NS for earlier, later in pairwise(samples))
 
 
 LAYERS: Final = (

@@ -47,7 +47,7 @@ class Turn:
     def cruise(self) -> list[float]:
         """Return the speeds after the start and before the stop, as fractions of the asked one."""
         fractions = [seen.wrist_rad_per_s / self.asked_rad_per_s for seen in self.samples]
-        fast = [number for number, one in enumerate(fractions) if one > 0.5]
+        fast = [number for number, fraction in enumerate(fractions) if fraction > 0.5]
         if len(fast) < 10:
             return fractions[fast[0] : fast[-1] + 1] if fast else []
         quarter = (fast[-1] - fast[0]) // 4
@@ -116,7 +116,7 @@ def judge_turns(turns: Sequence[Turn], context: Context, noise_rad_per_s: float)
     threshold = max(noise_rad_per_s, 0.02 * SPEED_RAD_PER_S)
     delays_s = [turn.delay_s(threshold) for turn in turns]
     p99_s = percentile_99(delays_s)
-    fractions = [one for turn in turns for one in turn.cruise()]
+    fractions = [fraction for turn in turns for fraction in turn.cruise()]
     reached = statistics.mean(fractions) if fractions else 0.0
     acceleration = max(turn.largest_acceleration() for turn in turns)
     hard = settings.limits.wrist_acceleration_rad_per_s2.hard

@@ -78,7 +78,7 @@ class Operator:
             answer = self.ask(f"{question} {' or '.join(choices)}?", played).lower()
             if answer in choices:
                 return answer
-            self.say(f"{answer!r} is not {' or '.join(f'`{one}`' for one in choices)}.")
+            self.say(f"{answer!r} is not {' or '.join(f'`{choice}`' for choice in choices)}.")
         raise UserError(f"neither {' nor '.join(choices)} was given: {question}")
 
     def allow(self, motion: str) -> None:

@@ -101,7 +101,9 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
         done = context.report.stage(stage[0])
         if (done is not None and done.passed and stage[0] not in only) or (only and stage[0] not in only):
             continue
-        if failed := [one.stage for one in context.report.stages if not one.passed and one.stage < stage]:
+        if failed := [
+            earlier.stage for earlier in context.report.stages if not earlier.passed and earlier.stage < stage
+        ]:
             raise UserError(f"stage {failed[0]} failed: mend it and run it again before stage {stage}")
         operator.say(f"Stage {stage}")
         with left.during(stage) as context.operator:

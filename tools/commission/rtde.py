@@ -28,7 +28,7 @@ def measure(context: Context) -> Measured:
     if len(samples) < 2:
         raise UserError("the observer received nothing from the controller: look at its cable")
     lines = judge_samples(samples, context.settings.rate_hz, context.limits)
-    same = sum(one == value for one, value in zip(read, _WRITTEN, strict=True))
+    same = sum(read_value == value for read_value, value in zip(read, _WRITTEN, strict=True))
     lines.append(
         judged(
             "registers read back",
@@ -100,7 +100,7 @@ def _uploads(context: Context) -> list[Line]:
 def _uploaded(started: int, context: Context, *reasons: str) -> Line:
     times_s = context.counts.uploads_after_s
     return judged(
-        f"uploads after {', '.join(f'{one:g}' for one in times_s)} s",
+        f"uploads after {', '.join(f'{time_s:g}' for time_s in times_s)} s",
         f"{started} of {len(times_s)}" + (f": {reasons[0]}" if reasons else ""),
         "all",
         "the robot recovers after a stop",

@@ -131,7 +131,7 @@ class StraightMove:
         """Return the distance from the pose along the tool's axis, positive away from the robot."""
         here = seen.outputs.tcp_pose[:3]
         axis = tool_axis(self._home)
-        return sum(one * (at - home) for one, at, home in zip(axis, here, self._home[:3], strict=True))
+        return sum(component * (at - home) for component, at, home in zip(axis, here, self._home[:3], strict=True))
 
 
 def rising_speeds(speeds_rad_per_s: Sequence[float], fastest_rad_per_s: float) -> list[float]:
@@ -154,7 +154,7 @@ def measure(context: Context) -> Measured:
         stops, found = _all_layers(context, WristTurn(context, speed))
         lines += found
         if has_failed(found):
-            if blocked := [f"{one:g}" for one in speeds if one > speed]:
+            if blocked := [f"{faster:g}" for faster in speeds if faster > speed]:
                 lines.append(
                     Line(what="blocked speeds", value=f"{', '.join(blocked)} rad/s: a layer failed below them")
                 )

@@ -63,7 +63,7 @@ class TactileSensor:
         self._next()
         torques_nm: list[float] = []
         for _ in range(_MOST_FRAMES):
-            torques_nm += [one.torque_nm for one in self._next() if one.torque_nm is not None]
+            torques_nm += [estimate.torque_nm for estimate in self._next() if estimate.torque_nm is not None]
             if len(torques_nm) >= ESTIMATES:
                 return statistics.fmean(torques_nm)
         return None
@@ -77,4 +77,4 @@ def calibrated_sessions(config: DaemonConfig) -> dict[str, tuple[Session, Sequen
     if config.combined is not None:
         combined = open_combined(config.combined, config.fingertips)
         found[COMBINED] = combined, combined.calibration.sides
-    return {name: one for name, one in found.items() if one[0].calibration.measures_torque}
+    return {name: opened for name, opened in found.items() if opened[0].calibration.measures_torque}

@@ -83,7 +83,7 @@ def measure(context: Context) -> Measured:
     lines += [*turned, *judge_twists(held, spring)]
     delay_s = statistics.median(delays_s)
     lines.append(Line(what="torque behind the angle", value=f"{1e3 * delay_s:.0f} ms (median)", count=len(delays_s)))
-    largest_nm = max(abs(one.load_nm - held[0].load_nm) for one in held)
+    largest_nm = max(abs(hold.load_nm - held[0].load_nm) for hold in held)
     return Measured(lines, Supplied() if has_failed(lines) else Supplied(torque_nm=round(largest_nm, 4)))
 
 
@@ -251,11 +251,11 @@ def judge_twists(held: Sequence[Held], spring: float) -> list[Line]:
     """Return the lines on stiffness and slip; the first and the last measurements are at the pose."""
     first, *twisted, last = held
     stiffnesses = [
-        (one.load_nm - before.load_nm) / (one.wrist_rad - before.wrist_rad)
-        for before, one in zip([first, *twisted], twisted, strict=False)
+        (after.load_nm - before.load_nm) / (after.wrist_rad - before.wrist_rad)
+        for before, after in zip([first, *twisted], twisted, strict=False)
     ]
     found = abs(statistics.fmean(stiffnesses))
-    largest_nm = max(abs(one.load_nm - first.load_nm) for one in twisted)
+    largest_nm = max(abs(hold.load_nm - first.load_nm) for hold in twisted)
     # The last angle differs a little from the first, and explains a part of the torque; the rest is slip.
     expected_nm = statistics.fmean(stiffnesses) * (last.wrist_rad - first.wrist_rad)
     slip = abs(last.load_nm - first.load_nm - expected_nm) / largest_nm if largest_nm else 1.0

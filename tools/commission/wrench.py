@@ -103,11 +103,15 @@ def judge_rest(readings: Sequence[Reading], settings: UrSettings) -> list[Line]:
     lines: list[Line] = []
     for what, unit, bias, sigma, noise, inner in (
         (
-            *("force", "N", max(one.force_n for one in readings), max(one.force_sigma_n for one in readings)),
+            *("force", "N"),
+            max(reading.force_n for reading in readings),
+            max(reading.force_sigma_n for reading in readings),
             *(facts.noise_n, limits.force_n.inner),
         ),
         (
-            *("torque", "N·m", max(one.torque_nm for one in readings), max(one.torque_sigma_nm for one in readings)),
+            *("torque", "N·m"),
+            max(reading.torque_nm for reading in readings),
+            max(reading.torque_sigma_nm for reading in readings),
             *(facts.noise_nm, limits.torque_nm.inner),
         ),
     ):

@@ -197,7 +197,7 @@ def check_files(
     for name, mistake in parts.mistakes.items():
         kind = from_file if "\n" in mistake else from_error
         finding = kind(f"files of {name}", mistake, "the daemon does not start")
-        if name not in elsewhere and finding.found not in [one.found for one in banks]:
+        if name not in elsewhere and finding.found not in [bank.found for bank in banks]:
             yield finding
     yield check_keys(config.curve, config.network_addresses)
 

@@ -181,17 +181,17 @@ def check_daemon(
     """Judge a running daemon by its tasks and by the frames of its fingertips."""
     for name, status in tasks.items():
         yield check_task(name, status)
-    for name, own in config.fingertips.items():
+    for name, fingertip in config.fingertips.items():
         if frames := received.get(name):
             # The daemon opens a silent board again; such a pause is no period of the board.
             period_s = _usual_period_s(frames)
             if period_s:
                 measured_hz = 1.0 / period_s
                 key = f"fingertips.{name}.frame_period_s"
-                yield check_rate(f"rate of {name}", measured_hz, 1.0 / own.frame_period_s, key, as_period=True)
+                yield check_rate(f"rate of {name}", measured_hz, 1.0 / fingertip.frame_period_s, key, as_period=True)
             saturated = max(int(frame.get("saturated") or 0) for frame in frames)
             channels = np.array([frame["channels"] for frame in frames], dtype=np.float64)
-            yield check_channels(name, channels, saturated, table_of(own))
+            yield check_channels(name, channels, saturated, table_of(fingertip))
 
 
 def _usual_period_s(frames: Sequence[Mapping[str, Any]]) -> float:

@@ -124,7 +124,9 @@ class IntactRecords:
     @property
     def identity(self) -> dict[str, str]:
         """What each intact chunk says of the recording, or nothing where its writer did not repeat that."""
-        return next((dict(one.metadata) for one in self.channels.values() if "format_version" in one.metadata), {})
+        return next(
+            (dict(channel.metadata) for channel in self.channels.values() if "format_version" in channel.metadata), {}
+        )
 
     @property
     def is_damaged(self) -> bool:
@@ -173,8 +175,8 @@ class IntactRecords:
                     inside = _opened(record)
                     in_damaged_chunk = inside is None
                     self.damaged_chunks += in_damaged_chunk
-                    for one in inside or ():
-                        yield from self._usable(one)
+                    for inner_record in inside or ():
+                        yield from self._usable(inner_record)
                 case MessageIndex() if in_damaged_chunk:
                     self._counts.damaged[record.channel_id] += len(record.records)
                 case Footer():
@@ -195,9 +197,9 @@ class IntactRecords:
         self.schemas.update(index.schemas)
         if index.statistics is not None:
             self._counts.written = dict(index.statistics.channel_message_counts)
-        chunks = [one.chunk_start_offset for one in index.chunk_indexes]
-        attachments = [one.offset for one in index.attachment_indexes]
-        metadata = [one.offset for one in index.metadata_indexes]
+        chunks = [chunk.chunk_start_offset for chunk in index.chunk_indexes]
+        attachments = [attachment.offset for attachment in index.attachment_indexes]
+        metadata = [entry.offset for entry in index.metadata_indexes]
         return sorted([*chunks, *attachments, *metadata, begins])
 
     def _usable(self, record: McapRecord) -> Iterator[Message | Metadata | Attachment]:

@@ -147,7 +147,7 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
         raise UserError(f"{path}: nothing to export; a dataset needs one of the topics {', '.join(_FEATURES)}")
     _check_span(path, held)
     experiment = recording.metadata.get(schema.EXPERIMENT_METADATA, {}).get("name", "no experiment")
-    units = {one.feature: one.units for one in held.values()}
+    units = {message.feature: message.units for message in held.values()}
     about = {"recording": path.name, "identity": recording.identity, "configuration": configuration, "units": units}
     with ExitStack() as files:
         dataset = Dataset(out, held, files)
@@ -184,8 +184,8 @@ class Dataset:
         self._files: list[Path] = []
         self._replaced = replaced
         self._held = held
-        vectors = {one.feature: ("float32", one.names) for one in held.values()}
-        vectors[_AGE] = ("float32", [one.feature.removeprefix("observation.") for one in held.values()])
+        vectors = {message.feature: ("float32", message.names) for message in held.values()}
+        vectors[_AGE] = ("float32", [message.feature.removeprefix("observation.") for message in held.values()])
         indices = dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), ("int64", [""]))
         self._columns = {**vectors, "timestamp": ("float32", [""]), **indices}
         self._statistics = {name: _Statistics(len(names)) for name, (_, names) in self._columns.items()}
@@ -220,7 +220,7 @@ class Dataset:
 
     def finish(self, task: str, about: Mapping[str, Any], attachments: Mapping[str, bytes]) -> list[Path]:
         """Write the descriptions of the rows, the episode and the recording; return all files."""
-        statistics = {name: one.result() for name, one in self._statistics.items()}
+        statistics = {name: statistic.result() for name, statistic in self._statistics.items()}
         self._write_json("meta/info.json", self._info())
         self._write_json("meta/stats.json", statistics)
         self._write_json("meta/shearloop.json", {**about, "started_unix_ns": self._started_ns})
@@ -252,8 +252,8 @@ class Dataset:
             yield heapq.heappop(waiting)
 
     def _row(self, now_ns: int) -> list[NDArray[np.float32]]:
-        ages = np.array([one.age_s(now_ns) for one in self._held.values()], dtype=np.float32)
-        return [*(one.vector for one in self._held.values()), ages]
+        ages = np.array([message.age_s(now_ns) for message in self._held.values()], dtype=np.float32)
+        return [*(message.vector for message in self._held.values()), ages]
 
     def _table(self, rows: list[list[NDArray[np.float32]]]) -> Any:
         """Return a table of rows, and count them in the statistics."""

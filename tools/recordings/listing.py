@@ -51,7 +51,7 @@ def _listed(path: Path) -> ListedRecording:
             if summary is None or summary.statistics is None:
                 return ListedRecording(str(path), size, closed=False)
             counts = summary.statistics
-            experiments = [one for one in reader.iter_metadata() if one.name == schema.EXPERIMENT_METADATA]
+            experiments = [record for record in reader.iter_metadata() if record.name == schema.EXPERIMENT_METADATA]
             follows_wall_clock = any(
                 channel.topic == schema.CLOCK_TOPIC and not has_one_offset(channel.metadata)
                 for channel in summary.channels.values()
@@ -63,7 +63,7 @@ def _listed(path: Path) -> ListedRecording:
     duration_s = (counts.message_end_time - counts.message_start_time) / 1e9
     if whole is not None:
         first_ns, duration_s = whole.first_unix_ns, whole.duration_s
-    names = tuple(one.metadata.get("name", "") for one in experiments)
+    names = tuple(experiment.metadata.get("name", "") for experiment in experiments)
     return ListedRecording(
         str(path), size, closed=True, first_unix_ns=first_ns, duration_s=duration_s, experiments=names
     )

@@ -319,10 +319,10 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
         load, streams, sure = _loop_times(load, streams, remarks)
     load = _valid_load(load, remarks)
     remarks += _missing_load(load.unix_s)
-    arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in one.unix_s] for side, one in streams.items()}
-    middles = {side: frame_middles(one) for side, one in arrivals.items()}
-    remarks += [_missing(side, one) for side, one in arrivals.items() if pauses(one)]
-    delay = measured_delay([_series_of_side(side, one, middles[side], load) for side, one in streams.items()])
+    arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in stream.unix_s] for side, stream in streams.items()}
+    middles = {side: frame_middles(arrivals_ns) for side, arrivals_ns in arrivals.items()}
+    remarks += [_missing(side, arrivals_ns) for side, arrivals_ns in arrivals.items() if pauses(arrivals_ns)]
+    delay = measured_delay([_series_of_side(side, stream, middles[side], load) for side, stream in streams.items()])
     if delay is not None and delay.late_s:
         load = replace(load, unix_s=load.unix_s - delay.late_s)
         remarks.append(
@@ -448,7 +448,7 @@ def _rise(height: FloatArray, at: int) -> float:
 
 def _check_whole(stamps_s: FloatArray) -> None:
     """Raise UserError for a loop that paused: how many load values its buffer has lost meanwhile is unknown."""
-    found = pauses([round(float(one) * 1e9) for one in stamps_s])
+    found = pauses([round(float(stamp_s) * 1e9) for stamp_s in stamps_s])
     if found:
         at = found[0]
         raise UserError(
@@ -517,8 +517,8 @@ def _loop_times(load: Stream, streams: dict[str, Stream], remarks: list[str]) ->
     )
     frames = {
         # The next stamp less half a period: the first rows were stamped before the loop waited for its frames.
-        side: replace(one, unix_s=np.append(one.unix_s[1:] - late_s, one.unix_s[-1] + late_s))
-        for side, one in streams.items()
+        side: replace(stream, unix_s=np.append(stream.unix_s[1:] - late_s, stream.unix_s[-1] + late_s))
+        for side, stream in streams.items()
     }
     return replace(load, unix_s=t_s), frames, True
 

@@ -44,7 +44,7 @@ def columns(name: str) -> Mapping[str, Column]:
     """Return the columns of a schema by their names, in its order."""
     optional = schema.optional_keys(name)
     described = schema.schemas()[name]["properties"].items()
-    return {key: Column(key, one["type"], key in optional) for key, one in described}
+    return {key: Column(key, definition["type"], key in optional) for key, definition in described}
 
 
 @cache

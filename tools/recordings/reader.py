@@ -77,7 +77,7 @@ class OpenRecording:
 
     def attachments(self) -> dict[str, bytes]:
         """Return the attached files by name."""
-        return {one.name: one.data for one in self._reader.iter_attachments()}
+        return {attachment.name: attachment.data for attachment in self._reader.iter_attachments()}
 
     def messages(self, topics: Iterable[str] | None = None, *, by_time: bool = True) -> Messages:
         """Return the messages of some topics or of all, by time or in the order of the file.

@@ -182,8 +182,8 @@ class _RerunFile:
             for unit, name in _CHARTS.items()
         }
         charts = [blueprint.TimeSeriesView(name=name, contents=lines) for name, lines in charted.items() if lines]
-        images = [blueprint.Spatial2DView(name=one, origin=one) for one in sorted(self._images)]
-        poses = [blueprint.Spatial3DView(name=one, contents=[one]) for one in sorted(self._poses)]
+        images = [blueprint.Spatial2DView(name=entity, origin=entity) for entity in sorted(self._images)]
+        poses = [blueprint.Spatial3DView(name=entity, contents=[entity]) for entity in sorted(self._poses)]
         columns = [blueprint.Vertical(*views) for views in (charts, [*images, *poses]) if views]
         return blueprint.Blueprint(blueprint.Horizontal(*columns))
 

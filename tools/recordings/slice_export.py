@@ -73,11 +73,11 @@ def export_slices(
         )
     written: list[Path] = []
     try:
-        for one in slices:
-            _save_slice(out, one, written)
-        torques = [one for one in slices if one.diameter_mm is None]
+        for new_slice in slices:
+            _save_slice(out, new_slice, written)
+        torques = [new_slice for new_slice in slices if new_slice.diameter_mm is None]
         if torques:
-            _save_raw(out / TORQUE_FOLDER, max(torques, key=lambda one: abs(one.torque_nm)), written)
+            _save_raw(out / TORQUE_FOLDER, max(torques, key=lambda new_slice: abs(new_slice.torque_nm)), written)
     except BaseException:
         # The next export would number their slices a second time.
         for file in written:

@@ -106,7 +106,7 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         first_unix_ns=first_unix_ns,
         duration_s=0.0 if first_unix_ns is None else (max(last for _, last in spans.values()) - first_unix_ns) / 1e9,
         same_code=metadata.get("code_sha256") == schema.code_digest(),
-        experiments=[one.get("name", "") for one in experiments],
+        experiments=[experiment.get("name", "") for experiment in experiments],
         tool_mm=(experiments or [metadata])[-1].get(schema.DIAMETER_NOTE),
         metadata=metadata,
         attachments=attachments,

@@ -119,7 +119,7 @@ class TwistPlayer:
 
 def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
     """Return the default estimator's calibration for these fingertips."""
-    chosen = [one.select_sides(sides) for one in recordings]
+    chosen = [recording.select_sides(sides) for recording in recordings]
     return fit("motion_regression", chosen, SOURCE, timing=measure_timing(chosen, recordings))
 
 
@@ -172,7 +172,7 @@ def calibrate_rig(bank: Path, folder: Path) -> None:
         calibration = calibrate(recordings, sides)
         path = folder / ("rig.cal" if sides == both else f"rig-{sides[0]}.cal")
         calibration.save(path)
-        figures = figures_of([estimate_series(calibration, one) for one in apart])
+        figures = figures_of([estimate_series(calibration, recording) for recording in apart])
         print(
             f"{path}: root mean square errors {figures['rmse_nm']:.4f} N·m and {figures['diameter_rmse_mm']:.1f} mm; "
             f"{figures['valid_fraction']:.0%} of frames have a torque, "

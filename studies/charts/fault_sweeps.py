@@ -183,9 +183,9 @@ class FaultCurve:
 def fault_curve(fault: str, unit: str, estimator: str, levels: Iterable[FaultLevel]) -> FaultCurve:
     """Return a curve with its breaking point."""
     found = tuple(levels)
-    broken = [one.level for one in found if one.false_valid > BROKEN_SHARE]
+    broken = [level.level for level in found if level.false_valid > BROKEN_SHARE]
     # Levels go from mild to grave, or through 0 for a fault with two directions.
-    if any(one.level < 0 for one in found):
+    if any(level.level < 0 for level in found):
         broken.sort(key=abs)
     mildest = broken[0] if broken else None
     return FaultCurve(fault, unit, estimator, found, mildest)
@@ -218,7 +218,7 @@ def estimate_frames(
         tracker.reset()
     masks = repeat(None) if usable is None else usable
     frames = zip(series.t_s.tolist(), series.channels, masks, strict=False)
-    return [tracker.estimate(TactileFrame.of(*one)) for one in frames]
+    return [tracker.estimate(TactileFrame.of(*frame)) for frame in frames]
 
 
 def true_torques(series: FrameSeries) -> FloatArray:
@@ -299,7 +299,9 @@ def sweeps(
 ) -> list[FaultCurve]:
     """Return the curves of all estimators through all faults; each estimator is one task for the workers."""
     shared = scene_for(split, bank), str(bank.path.resolve())
-    return [one for curves in executor.map(sweep_estimator, shared, fitted(split, names, physics)) for one in curves]
+    return [
+        curve for curves in executor.map(sweep_estimator, shared, fitted(split, names, physics)) for curve in curves
+    ]
 
 
 def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration | SliceCalibration) -> list[FaultCurve]:
@@ -311,8 +313,8 @@ def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration | S
 
 def sweeps_figure(title: str, curves: Sequence[FaultCurve], panels: int = 3) -> Figure:
     """Draw bias, valid and false-valid share of every estimator, one row per fault; more panels stay empty."""
-    faults = list(dict.fromkeys((one.fault, one.unit) for one in curves))
-    names = list(dict.fromkeys(one.estimator for one in curves))
+    faults = list(dict.fromkeys((curve.fault, curve.unit) for curve in curves))
+    names = list(dict.fromkeys(curve.estimator for curve in curves))
     made = figure(5 * panels, 2.75 * len(faults) + 1.0)
     rows = made.subplots(len(faults), panels, squeeze=False)
     for row, (fault, unit) in zip(rows, faults, strict=True):
@@ -325,9 +327,9 @@ def sweeps_figure(title: str, curves: Sequence[FaultCurve], panels: int = 3) -> 
         row[2].axhline(BROKEN_SHARE, color="#999999", linewidth=1.2, linestyle=(0, (1, 2)))
         for panel in row[1:3]:
             panel.set_ylim(-0.04, 1.04)
-        for one in curves:
-            if one.fault == fault:
-                _draw_curve(row, one, names.index(one.estimator), len(names))
+        for curve in curves:
+            if curve.fault == fault:
+                _draw_curve(row, curve, names.index(curve.estimator), len(names))
     made.legend(*rows[0, 2].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=len(names))
     made.suptitle(
         f"{title}\n× breaks silently: more than {BROKEN_SHARE:.0%} of the frames are called valid and miss their 95 % "

@@ -57,8 +57,8 @@ def forward_methods(
         once = mesh.refined()
         meshes.append(("--mesh", ", the given mesh", mesh, converged(once, once.refined(), 2.0)))
     solvers = [
-        (f"{kind}, {name}", f"{family}{given}", own, solver(own), true)
-        for name, given, own, true in meshes
+        (f"{kind}, {name}", f"{family}{given}", solved_mesh, solver(solved_mesh), true)
+        for name, given, solved_mesh, true in meshes
         for kind, family, solver in (("direct", "direct", direct), ("batch", BATCH, batch))
     ]
     times_ms: dict[str, list[float]] = {name: [] for name, *_ in solvers}
@@ -69,12 +69,16 @@ def forward_methods(
             times_ms[name].append(1e3 * (time.perf_counter() - begun) / solved)
     found = [
         SolvedForward(
-            name, family, len(own.triangles), float(np.median(times_ms[name])), error_of(solve()[: len(CELLS)], true)
+            name,
+            family,
+            len(solved_mesh.triangles),
+            float(np.median(times_ms[name])),
+            error_of(solve()[: len(CELLS)], true),
         )
-        for name, family, own, solve, true in solvers
+        for name, family, solved_mesh, solve, true in solvers
     ]
     # EIDORS solves the same model: its error is known where the paper's mesh is given. pyEIT's electrodes are points.
-    paper = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
+    paper = next((method.error for method in found if method.triangles == PAPER_TRIANGLES), None)
     cited = (("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, paper), ("pyEIT", "pyEIT", PYEIT_CELL_S, None))
     return found + [
         SolvedForward(f"{name} (cited)", family, PAPER_TRIANGLES, 1e3 * cell_s, error, cited=True)

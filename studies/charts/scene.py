@@ -29,7 +29,7 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
     """
     titles = [split.title.split(",", maxsplit=1)[0] for split in parts]
     wholes = [split.whole for split in parts]
-    scenes = [scene_of_slices(one) if isinstance(one, SliceSeries) else scene_of(one) for one in wholes]
+    scenes = [scene_of_slices(whole) if isinstance(whole, SliceSeries) else scene_of(whole) for whole in wholes]
     found = list(executor.map(design_bank, own_fingertip(_MESH_SIZE_CM), scenes))
     written = []
     for title, design in zip(titles, found, strict=True):
@@ -60,8 +60,9 @@ def write(title: str, design: Design, out: Path) -> list[Path]:
         fontsize=13,
     )  # fmt: skip
     content = asdict(design) | {
-        "allowed": ALLOWED, "chosen": {one.name: asdict(one.chosen) | {"enough": one.enough} for one in design.choices},
-    }  # fmt: skip
+        "allowed": ALLOWED,
+        "chosen": {choice.name: asdict(choice.chosen) | {"enough": choice.enough} for choice in design.choices},
+    }
     return save(made, content, out, f"scene-{slug(title)}")
 
 
@@ -94,13 +95,13 @@ def _draw_choice(axes: Axes, choice: DesignChoice) -> None:
 
 
 def _draw_models(axes: Axes, design: Design) -> None:
-    ranked = sorted(design.models, key=lambda one: one.penalised)
-    for i, one in enumerate(ranked):
-        axes.barh(i, one.penalised, xerr=one.standard_error, color="#d9d9d9", edgecolor="black", capsize=3,
-                  hatch="//" if one.model == design.model else None)  # fmt: skip
-        axes.plot(one.error, i, "|", color="black", markersize=16, markeredgewidth=2)
+    ranked = sorted(design.models, key=lambda fit: fit.penalised)
+    for i, fit in enumerate(ranked):
+        axes.barh(i, fit.penalised, xerr=fit.standard_error, color="#d9d9d9", edgecolor="black", capsize=3,
+                  hatch="//" if fit.model == design.model else None)  # fmt: skip
+        axes.plot(fit.error, i, "|", color="black", markersize=16, markeredgewidth=2)
     axes.axvline(design.relative_noise, color="black", linestyle=":", linewidth=1.2)
-    axes.set_yticks(range(len(ranked)), [f"{one.model}\n({one.parameters} parameters)" for one in ranked], fontsize=8.5)
+    axes.set_yticks(range(len(ranked)), [f"{fit.model}\n({fit.parameters} parameters)" for fit in ranked], fontsize=8.5)
     axes.invert_yaxis()
     axes.set(
         xlabel="unexplained on other injections, share of a frame\n(bar: penalised; tick: not; dotted: the noise)",
@@ -110,9 +111,9 @@ def _draw_models(axes: Axes, design: Design) -> None:
 
 def _draw_table(axes: Axes, choices: Sequence[DesignChoice]) -> None:
     rows = []
-    for one in choices:
-        step, after = one.chosen, one.next_step
-        row = [one.name, f"{step.setting:g}", f"{step.added:.2f}", "–", "–", "–"]
+    for choice in choices:
+        step, after = choice.chosen, choice.next_step
+        row = [choice.name, f"{step.setting:g}", f"{step.added:.2f}", "–", "–", "–"]
         if after is not None:
             buys = np.sqrt(1 + step.added**2) - np.sqrt(1 + after.added**2)
             row[3:] = f"{after.setting:g}", f"{buys:.1%} less error", after.cost.split(";", maxsplit=1)[0]

@@ -230,8 +230,8 @@ def run(
         for sample in plant.collect():
             if keep(count):
                 latest.append(sample)
-                middles_ns = [nanoseconds(one.t_mid_s) for one in latest]
-                torque_nm = float(np.mean([one.torque_nm for one in latest]))
+                middles_ns = [nanoseconds(measurement.t_mid_s) for measurement in latest]
+                torque_nm = float(np.mean([measurement.torque_nm for measurement in latest]))
                 controller.measure(torque_nm, round(float(np.mean(middles_ns))), now_ns)
             count += 1
         command = controller.command(now_ns, plant.angle_rad)
@@ -413,7 +413,7 @@ def chart(out: Path, seeds: int = 20) -> list[Path]:
     made = drawing.figure(12.0, 4.4)
     content = {}
     for axes, (name, rows) in zip(made.subplots(1, 3, sharey=True), held_loops(seeds).items(), strict=True):
-        settled_nm = [one.torque_nm[one.t_s >= one.t_s[0] + SCENARIOS[0].settled_s] for one, _ in rows]
+        settled_nm = [trace.torque_nm[trace.t_s >= trace.t_s[0] + SCENARIOS[0].settled_s] for trace, _ in rows]
         share = float(np.mean(np.abs(np.concatenate(settled_nm) / _TARGET_NM - 1.0) <= BAND))
         back_s = [after.back_after_s(_TARGET_NM) for _, after in rows]
         content[name] = {"time_in_band": share, "kick_back_s": back_s}

@@ -236,11 +236,13 @@ def write(
         "bank": {"model": bank.model, "shape": list(bank.signals.shape), "identity": bank.identity},
         # The first method is the paper's, where it was run.
         "methods": {
-            split.title: [asdict(one) | {"latency_ratio": one.latency_ms / methods[0].latency_ms} for one in methods]
+            split.title: [
+                asdict(method) | {"latency_ratio": method.latency_ms / methods[0].latency_ms} for method in methods
+            ]
             for split, methods in compared
         },
-        "forward": [asdict(one) for one in solved],
-        "loop": {"gain": GAIN, "runs": [asdict(one) for one in loop]},
+        "forward": [asdict(method) for method in solved],
+        "loop": {"gain": GAIN, "runs": [asdict(run) for run in loop]},
     }
     panels = len(compared) + 2
     rows = (panels + 1) // 2
@@ -256,9 +258,13 @@ def write(
     drawing.lay_out(made)
     for (_, methods), panel in zip(compared, axes, strict=False):
         often = often_valid(methods)
-        points = [(one.latency_ms, one.rmse_nm, _short(one, i in often)) for i, one in enumerate(methods)]
+        points = [(method.latency_ms, method.rmse_nm, _short(method, i in often)) for i, method in enumerate(methods)]
         drawing.write_names(panel, points)
-    named = [(one.cell_ms, one.error, f"{one.name}\n{one.triangles} triangles") for one in solved if one.error]
+    named = [
+        (method.cell_ms, method.error, f"{method.name}\n{method.triangles} triangles")
+        for method in solved
+        if method.error
+    ]
     drawing.write_names(axes[len(compared)], named)
     return drawing.save(made, content, out, "speed-accuracy")
 
@@ -267,10 +273,10 @@ def _draw_methods(axes: Axes, split: Split, methods: Sequence[MeasuredMethod]) -
     drawing.plain_log(axes)
     often = often_valid(methods)
     costs, errors = ([getattr(methods[i], name) for i in often] for name in ("latency_ms", "rmse_nm"))
-    best = [often[i] for i in drawing.draw_frontier(axes, costs, errors, max(one.latency_ms for one in methods))]
-    for number, family in enumerate(dict.fromkeys(one.family for one in methods)):
+    best = [often[i] for i in drawing.draw_frontier(axes, costs, errors, max(method.latency_ms for method in methods))]
+    for number, family in enumerate(dict.fromkeys(method.family for method in methods)):
         style = drawing.look(number)
-        members = [i for i, one in enumerate(methods) if one.family == family]
+        members = [i for i, method in enumerate(methods) if method.family == family]
         if family in _JOINED:
             joined = style | {"marker": "", "linewidth": 1, "zorder": 1}
             axes.plot([methods[i].latency_ms for i in members], [methods[i].rmse_nm for i in members], **joined)
@@ -289,15 +295,15 @@ def _draw_methods(axes: Axes, split: Split, methods: Sequence[MeasuredMethod]) -
     )
     axes.grid(alpha=0.25, which="both")
     # Leave room for the legend below the frontier.
-    low, high = min(one.rmse_nm for one in methods), max(one.rmse_nm for one in methods)
+    low, high = min(method.rmse_nm for method in methods), max(method.rmse_nm for method in methods)
     axes.set_ylim(low * (low / high) ** 0.55, high * 1.25)
     axes.legend(fontsize=8, loc="lower right", title="filled: on the frontier", title_fontsize=8, ncols=2)
 
 
 def often_valid(methods: Sequence[MeasuredMethod]) -> list[int]:
     """Return the numbers of the methods with about as many valid frames as the best one."""
-    most = max(one.valid_fraction for one in methods)
-    return [i for i, one in enumerate(methods) if one.valid_fraction >= _OFTEN_VALID * most]
+    most = max(method.valid_fraction for method in methods)
+    return [i for i, method in enumerate(methods) if method.valid_fraction >= _OFTEN_VALID * most]
 
 
 def _short(one: MeasuredMethod, is_often_valid: bool) -> str:
@@ -309,22 +315,22 @@ def _short(one: MeasuredMethod, is_often_valid: bool) -> str:
 
 def _draw_forward(axes: Axes, solved: Sequence[SolvedForward]) -> None:
     drawing.plain_log(axes)
-    known = [(one.cell_ms, one.error) for one in solved if one.error is not None]
+    known = [(method.cell_ms, method.error) for method in solved if method.error is not None]
     costs = [cost for cost, _ in known]
     drawing.draw_frontier(axes, costs, [error for _, error in known], max(costs))
     axes.margins(x=0.12, y=0.12)
-    for number, family in enumerate(dict.fromkeys(one.family for one in solved)):
+    for number, family in enumerate(dict.fromkeys(method.family for method in solved)):
         style = drawing.look(number)
-        members = [one for one in solved if one.family == family]
-        placed = sorted((one.cell_ms, one.error) for one in members if one.error is not None)
+        members = [method for method in solved if method.family == family]
+        placed = sorted((method.cell_ms, method.error) for method in members if method.error is not None)
         if placed:
             fill = "white" if members[0].cited else style["color"]
             points = style | {"linewidth": 1, "markersize": 8, "markerfacecolor": fill}
             axes.plot(*zip(*placed, strict=True), label=family, **points)
-        for one in members:
-            if one.error is None:
-                label = f"{one.name}, {one.triangles} triangles"
-                axes.axvline(one.cell_ms, label=label, **style | {"marker": ""})
+        for method in members:
+            if method.error is None:
+                label = f"{method.name}, {method.triangles} triangles"
+                axes.axvline(method.cell_ms, label=label, **style | {"marker": ""})
     axes.set(
         title=f"Forward methods, {len(CELLS)} cells of the Gaussian derivative",
         xlabel="time per cell, ms (one thread; cited ones from elsewhere)",
@@ -336,15 +342,15 @@ def _draw_forward(axes: Axes, solved: Sequence[SolvedForward]) -> None:
 
 def _draw_loop(axes: Axes, loop: Sequence[TrackingError]) -> None:
     axes.set(yscale="log")
-    noises = sorted({one.noise_nm for one in loop})
+    noises = sorted({run.noise_nm for run in loop})
     for number, name in enumerate(LOOPS):
         for noise, line, fill in zip(noises, LINES, _FILLS, strict=False):
-            runs = [one for one in loop if one.loop == name and one.noise_nm == noise]
-            rms = [one.rms_nm for one in runs]
-            bars = [[one.rms_nm - one.rms_low_nm for one in runs], [one.rms_high_nm - one.rms_nm for one in runs]]
+            runs = [run for run in loop if run.loop == name and run.noise_nm == noise]
+            rms = [run.rms_nm for run in runs]
+            bars = [[run.rms_nm - run.rms_low_nm for run in runs], [run.rms_high_nm - run.rms_nm for run in runs]]
             # A single point has no line: its fill shows the noise.
             axes.errorbar(
-                [one.delay_s for one in runs], rms, yerr=bars, marker=MARKS[number], color=SHADES[number],
+                [run.delay_s for run in runs], rms, yerr=bars, marker=MARKS[number], color=SHADES[number],
                 linestyle=line if len(runs) > 1 else "none", linewidth=1.2, elinewidth=0.7,
                 markersize=6 if len(runs) > 1 else 8, fillstyle="full" if len(runs) > 1 else fill,
                 markerfacecoloralt="white", zorder=3 if len(runs) == 1 else 2,
@@ -356,7 +362,7 @@ def _draw_loop(axes: Axes, loop: Sequence[TrackingError]) -> None:
                     runs[least].delay_s, rms[least], "o", markersize=14, markerfacecolor="none", color=SHADES[number],
                 )  # fmt: skip
     axes.set_ylim(top=0.5)
-    frames = {one.frames: one.delay_s for one in loop}
+    frames = {run.frames: run.delay_s for run in loop}
     top = axes.secondary_xaxis("top")
     top.set_xticks(list(frames.values()), [str(count) for count in frames], fontsize=8)
     top.set_xlabel("frames averaged")

@@ -69,7 +69,7 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
         if of_slices:
             written += _of_slices(split, bank, mesh, out, executor)
     _report("the rim of the bank")
-    synthetic = next(one for one in splits([], 0.6, scratch) if isinstance(one.past, SliceSeries))
+    synthetic = next(split for split in splits([], 0.6, scratch) if isinstance(split.past, SliceSeries))
     curves = list(sweep_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
     written += _written("stability-rims", "the rim of the bank, on synthetic slices", curves, out)
     _report("the loop on the skin")
@@ -84,19 +84,21 @@ def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Execut
     """Write the charts of slices: continuity, and torques beyond the calibrated ones."""
     name, physics = slug(split.title), Physics(bank, mesh)
     found = walks(split, bank, fitted(split, ("regression", "motion_regression"), physics))
-    content: dict[str, Any] = {"steps": STEPS, "walks": [asdict(one) for one in found]}
+    content: dict[str, Any] = {"steps": STEPS, "walks": [asdict(walk) for walk in found]}
     written = save(continuity_figure(split.title, found), content, out, f"continuity-{name}")
     beyond = extrapolate(split, SLICE_NAMES, bank, mesh, executor)
     content = {
         "broken_share": BROKEN_SHARE,
         "title": split.title,
-        "extrapolations": [asdict(one) | {"times_good": one.times_good} for one in beyond],
+        "extrapolations": [
+            asdict(extrapolation) | {"times_good": extrapolation.times_good} for extrapolation in beyond
+        ],
     }
     return written + save(extrapolation_figure(split.title, beyond), content, out, f"extrapolation-{name}")
 
 
 def _written(name: str, title: str, curves: Sequence[FaultCurve], out: Path) -> list[Path]:
-    content = {"broken_share": BROKEN_SHARE, "title": title, "curves": [asdict(one) for one in curves]}
+    content = {"broken_share": BROKEN_SHARE, "title": title, "curves": [asdict(curve) for curve in curves]}
     return save(sweeps_figure(f"Estimators under faults: {title}", curves), content, out, name)
 
 
@@ -123,7 +125,7 @@ def walks(split: Split, bank: Bank, calibrations: Sequence[AnyCalibration]) -> l
     torque_nm = split.future.torque_at_frames()
     frames = np.abs(split.future.channels[np.argsort(torque_nm), 0])
     shares = np.linspace(0.0, 1.0, STEPS, endpoint=False)[:, None]
-    path = np.concatenate([*((1 - shares) * one + shares * other for one, other in pairwise(frames)), frames[-1:]])
+    path = np.concatenate([*((1 - shares) * frame + shares * other for frame, other in pairwise(frames)), frames[-1:]])
     share_nm = float(np.ptp(torque_nm)) / len(path)
     locators: dict[str, bank_match.BankMatcher] = {
         "paper: the maximum of all lags": bank_match.PaperMatcher(bank),
@@ -133,10 +135,10 @@ def walks(split: Split, bank: Bank, calibrations: Sequence[AnyCalibration]) -> l
     torques: dict[str, FloatArray] = {}
     for name, locator in locators.items():
         torque_nm_of = parabola(split, partial(matched_sigma, locator))
-        torques[name] = np.array([torque_nm_of(one) for one in path])
+        torques[name] = np.array([torque_nm_of(frame) for frame in path])
     for calibration in calibrations:
         tracker = reading_with(calibration, bank)
-        estimates = [tracker.estimate(TactileFrame.of(0.0, one[None])) for one in path]
+        estimates = [tracker.estimate(TactileFrame.of(0.0, frame[None])) for frame in path]
         torques[calibration.estimator.name] = values_of(estimates)[0]
     found = []
     for name, torque in torques.items():
@@ -238,7 +240,7 @@ def judge_others(
         return FaultLevel(limit_nm), None, str(error)
     others = select_rows(series, judged)
     estimates = estimate_frames(SliceReader(calibration, bank), others)
-    _, low_nm, high_nm = values_of([one for one in estimates if one.valid])
+    _, low_nm, high_nm = values_of([estimate for estimate in estimates if estimate.valid])
     width_nm = float(np.median(high_nm - low_nm)) if len(low_nm) else None
     return judge_level(estimates, others.torque_nm, limit_nm), width_nm, ""
 
@@ -261,7 +263,9 @@ def sweep_rims(calibrations: Sequence[AnyCalibration], bank: Bank, scratch: Path
         (f"k at the rim of the grid ({k_end:g} cm) and beyond", "k, cm", ks, [(k, _SIGMA) for k in ks]),
         (f"σ at the rim of the grid ({sigma_end:g} cm) and beyond", "σ, cm", sigmas, [(_K, sigma) for sigma in sigmas]),
     )  # fmt: skip
-    k_grid, sigma_grid = (np.unique(each) for each in np.array([place for *_, places in rims for place in places]).T)
+    k_grid, sigma_grid = (
+        np.unique(coordinates) for coordinates in np.array([place for *_, places in rims for place in places]).T
+    )
     # The same idle frame as the slices': its noise is in every difference.
     slices = SyntheticSlices(played_bank(scratch, Grid(k_grid, sigma_grid)))
     trackers = [reading_with(calibration, bank) for calibration in calibrations]
@@ -269,8 +273,8 @@ def sweep_rims(calibrations: Sequence[AnyCalibration], bank: Bank, scratch: Path
         series = [slices.series([(k, s, 1.0)] * _FRAMES, np.full(_FRAMES, torque_of(s))) for k, s in places]
         for tracker in trackers:
             levels = [
-                judge_level(estimate_frames(tracker, one), one.torque_nm, level)
-                for level, one in zip(settings, series, strict=True)
+                judge_level(estimate_frames(tracker, slice_series), slice_series.torque_nm, level)
+                for level, slice_series in zip(settings, series, strict=True)
             ]
             yield fault_curve(name, unit, tracker.calibration.estimator.name, levels)
 
@@ -280,14 +284,14 @@ def extrapolation_figure(title: str, found: Sequence[Extrapolation]) -> Figure:
     made = sweeps_figure(
         f"Torques beyond the calibrated ones: {title}\nat “all”: calibrated on the earlier slices, judged on the later "
         "ones; else all other slices are judged; below each limit: number of calibrated slices",
-        [one.curve for one in found], panels=4,
+        [extrapolation.curve for extrapolation in found], panels=4,
     )  # fmt: skip
-    for first, (_, group) in enumerate(groupby(found, key=lambda one: one.curve.fault)):
+    for first, (_, group) in enumerate(groupby(found, key=lambda extrapolation: extrapolation.curve.fault)):
         here, row = list(group), made.axes[4 * first : 4 * first + 4]
         label_panel(row[3], here[0].curve.unit, "median width ÷ that at “all”")
         row[3].axhline(1.0, color="#999999", linewidth=0.8)
-        for number, one in enumerate(here):
-            times = np.array(one.times_good, dtype=float)
+        for number, extrapolation in enumerate(here):
+            times = np.array(extrapolation.times_good, dtype=float)
             x = offset_places(len(times), number, len(here))
             row[3].plot(x, times, linewidth=1.3, markersize=5, **look(number))
         row[3].set_ylim(bottom=0.0)

@@ -214,9 +214,9 @@ def analyse_torque(slices: Slices, on_focused: Matches, on_wide: Matches) -> Tor
 def analyse_diameter(slices: Slices, single: Matches, wide: Bank) -> DiameterResult:
     """Relate k to diameter, from the matches of slices, smoothed along the channels, in the wide bank."""
     diameters = np.unique(slices.diameter_mm)
-    heatmaps = np.array([single.heatmaps[slices.diameter_mm == each].mean(axis=0) for each in diameters])
+    heatmaps = np.array([single.heatmaps[slices.diameter_mm == diameter].mean(axis=0) for diameter in diameters])
     accumulated = _best_matches(heatmaps, wide)
-    sums = [single.heatmaps[slices.diameter_mm == each].cumsum(axis=0) for each in diameters]
+    sums = [single.heatmaps[slices.diameter_mm == diameter].cumsum(axis=0) for diameter in diameters]
     # Slices stand by rising diameter.
     running_k = _best_matches(np.concatenate(sums), wide).k
     return DiameterResult(
@@ -247,7 +247,9 @@ def score_models(slices: Slices, raw_difference: FloatArray | None, mesh: Mesh) 
                 raw_difference, simulated_signals(forward, model, centred_settings(model, middle))
             )
     by_slice = [{model: float(found[i]) for model, found in of_slices.items()} for i in range(len(slices.numbers))]
-    by_envelope = [{model: found[one] for model, found in envelopes.items() if one in found} for one in ENVELOPES]
+    by_envelope = [
+        {model: found[settings] for model, found in envelopes.items() if settings in found} for settings in ENVELOPES
+    ]
     return ModelScores(
         envelope={model: found.get(PAPER_ENVELOPE) for model, found in envelopes.items()} or None,
         matching={model: float(of_slices[model].mean()) if model in of_slices else None for model in MODELS},
@@ -329,11 +331,11 @@ def place_in_series(values: FloatArray) -> tuple[IntArray, IntArray] | None:
     steps = np.diff(values)[~falls]
     if len(length) < 2 or length.max() < 3 or np.mean(steps > 0) < _RISING_SHARE:
         return None
-    complete = [values[repeat == each] for each in np.flatnonzero(length == length.max())]
+    complete = [values[repeat == number] for number in np.flatnonzero(length == length.max())]
     means = np.mean(complete, axis=0)
     level = np.empty(len(values), dtype=np.int64)
-    for each in range(len(length)):
-        members = np.flatnonzero(repeat == each)
+    for number in range(len(length)):
+        members = np.flatnonzero(repeat == number)
         level[members] = np.sort(linear_sum_assignment((values[members, None] - means) ** 2)[1])
     return level, repeat
 
@@ -347,7 +349,7 @@ def kmeans_groups(values: FloatArray, n_groups: int) -> IntArray:
     distinct, of_value, weight = np.unique(values, return_inverse=True, return_counts=True)
     centred, n = distinct - distinct.mean(), len(distinct)
     sums = (np.append(0.0, np.cumsum(weight * centred**power)) for power in (0, 1, 2))
-    count, total, squares = (each[:, None] - each for each in sums)
+    count, total, squares = (running_sum[:, None] - running_sum for running_sum in sums)
     # squared[j, i]: the sum of squares around the mean of the values from i to before j.
     squared = np.where(count > 0, squares - total**2 / np.maximum(count, 1), np.inf)
     # least[j]: the least sum of squares of the first j values in the groups so far; begin[g][j] begins the last group.

@@ -92,7 +92,7 @@ def regress_on_channels(slices: Slices, parts: IntArray) -> list[ChannelRegressi
             for i, count in enumerate(counts):
                 weights = np.linalg.lstsq(x[~out, :count], torque[~out] - mean, rcond=None)[0]
                 predicted[i, out] = x[out, :count] @ weights + mean
-        r = np.array([np.corrcoef(one, torque)[0, 1] for one in predicted])
+        r = np.array([np.corrcoef(prediction, torque)[0, 1] for prediction in predicted])
         r2 = 1.0 - ((predicted - torque) ** 2).mean(axis=1) / torque.var()
         found.append(ChannelRegression(ranking, counts, r, r2))
     return found
@@ -154,10 +154,22 @@ def _draw_torques(axes: Axes, slices: Slices, parts: IntArray) -> None:
 
 
 def _draw_regressions(axes: Axes, regressions: Sequence[ChannelRegression]) -> None:
-    for one, line in zip(regressions, ("-", "--"), strict=True):
-        axes.plot(one.counts, one.r / one.r[-1], line, color=_SHADES[1], label=f"correlation, {one.ranking}")
-        if one.r2[-1] > 0:
-            axes.plot(one.counts, one.r2 / one.r2[-1], line, color=_SHADES[2], label=f"R², {one.ranking}")
+    for regression, line in zip(regressions, ("-", "--"), strict=True):
+        axes.plot(
+            regression.counts,
+            regression.r / regression.r[-1],
+            line,
+            color=_SHADES[1],
+            label=f"correlation, {regression.ranking}",
+        )
+        if regression.r2[-1] > 0:
+            axes.plot(
+                regression.counts,
+                regression.r2 / regression.r2[-1],
+                line,
+                color=_SHADES[2],
+                label=f"R², {regression.ranking}",
+            )
     axes.axhline(PAPER_SHARE, color="black", linewidth=0.8, linestyle=":")
     axes.plot(PAPER_CHANNELS, PAPER_SHARE, "D", color="black", label=f"paper: {PAPER_CHANNELS} channels, 80 %")
     axes.set(

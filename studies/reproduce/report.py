@@ -97,8 +97,9 @@ def table(found: Reproduction) -> str:
             ("torque of a single slice, RMSE cross-validated, N·m", "", _number(torque.rmse_nm)),
             ("   beside the torques' standard deviation, N·m", "", _number(float(torque.slices.torque_nm.std()))),
         ]
-    for one in found.regressions[:1]:
-        share, needed = _number(one.r_share_at(PAPER_CHANNELS)), _count_range(one.counts_reaching(PAPER_SHARE))
+    for regression in found.regressions[:1]:
+        share = _number(regression.r_share_at(PAPER_CHANNELS))
+        needed = _count_range(regression.counts_reaching(PAPER_SHARE))
         rows += [
             (f"linear regression: r of {PAPER_CHANNELS} channels over r of all", f"{PAPER_SHARE:.4f}", share),
             ("linear regression: channels for 80 % of R²", str(PAPER_CHANNELS), needed),
@@ -156,7 +157,7 @@ def explanations(found: Reproduction) -> list[str]:
 
 
 def _regression_explanation(regressions: Sequence[ChannelRegression]) -> str:
-    by_all, by_fitted = (_count_range(one.counts_reaching(PAPER_SHARE)) for one in regressions)
+    by_all, by_fitted = (_count_range(regression.counts_reaching(PAPER_SHARE)) for regression in regressions)
     return (
         "Linear regression: least squares on the best channels, each part of the recording left out and predicted. "
         "R² first has 80 % of all channels' at the smaller number and keeps it from the larger one: "

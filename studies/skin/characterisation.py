@@ -213,7 +213,9 @@ def _upturns(models: _Models) -> list[float]:
     """Return by how much (%) the last response of a loading to 1.6 N exceeds the line through the origin to 1.2 N."""
     shear_n, straight = loading(1.6), slice(len(loading(PAPER_LINEAR_N)))
     found = models.both(shear_n, 1.0)
-    return [100 * (each[-1] / (1.6 * origin_slope(shear_n[straight], each[straight])) - 1) for each in found]
+    return [
+        100 * (response[-1] / (1.6 * origin_slope(shear_n[straight], response[straight])) - 1) for response in found
+    ]
 
 
 def _prediction_rows(models: _Models) -> list[FigureOfMerit]:
@@ -224,9 +226,9 @@ def _prediction_rows(models: _Models) -> list[FigureOfMerit]:
     return [
         FigureOfMerit("95 % prediction interval", "± N", "", "0.0802"),
         FigureOfMerit(
-            "  from friction alone, loading ± 1 N", "± N", "", "", *(one.prediction_half_width_n for one in loaded)
+            "  from friction alone, loading ± 1 N", "± N", "", "", *(line.prediction_half_width_n for line in loaded)
         ),
         FigureOfMerit(
-            "  from friction alone, whole loop ± 1 N", "± N", "", "", *(one.prediction_half_width_n for one in cycled)
+            "  from friction alone, whole loop ± 1 N", "± N", "", "", *(line.prediction_half_width_n for line in cycled)
         ),
     ]

@@ -130,7 +130,7 @@ class FiniteStrainSkin:
         """Return the (states, 2) changes of resistance of both gauges, ΔR/R₀ = mean of λ² − 1."""
         line = self._line
         stretches = (_stretch(line.basis, state.displacement_mm) for state in states)
-        return np.array([line.weights @ (each**2 - 1) @ line.shares for each in stretches])
+        return np.array([line.weights @ (stretch**2 - 1) @ line.shares for stretch in stretches])
 
     def strain_map(self, state: FiniteState) -> tuple[FloatArray, FloatArray]:
         """Return a moved grid of places in each element, (2, elements, 3, 3) in mm, and λ − 1 along the skin there."""

@@ -27,7 +27,7 @@ class SliceResult:
     @property
     def frames(self) -> int:
         """The number of slices."""
-        return sum(len(one.t_s) for one in self.parts)
+        return sum(len(part.t_s) for part in self.parts)
 
     @property
     def range(self) -> SliceRange | None:

@@ -133,11 +133,11 @@ class CurveMean:
         cls, frames: FloatArray, values: FloatArray, degrees: Sequence[int], n_drift: int, *, trend: bool = False
     ) -> Self:
         """Fit a curve of each degree as `InverseCalibration.fit` does."""
-        return cls(tuple(InverseCalibration.fit(frames, values, one, n_drift, trend=trend) for one in degrees))
+        return cls(tuple(InverseCalibration.fit(frames, values, degree, n_drift, trend=trend) for degree in degrees))
 
     def predict(self, features: FloatArray) -> FloatArray:
         """Return the values of (…, d + 1) frames; the last column is the time."""
-        return np.asarray(np.mean([one.predict(features) for one in self.curves], axis=0))
+        return np.asarray(np.mean([curve.predict(features) for curve in self.curves], axis=0))
 
 
 def _slope_penalty(frames: FloatArray, columns: FloatArray, penalties: FloatArray) -> float:

@@ -43,11 +43,11 @@ def fit_slices(
     estimator = prepared(name, physics, table)
     with_bank = estimator.needs == "bank" and physics.bank is not None
     matcher = estimator.matcher(physics.bank) if with_bank and physics.bank is not None else None
-    slices = np.abs(np.concatenate([one.differences for one in recordings]))
-    times = _consecutive([one.t_s for one in recordings])
+    slices = np.abs(np.concatenate([recording.differences for recording in recordings]))
+    times = _consecutive([recording.t_s for recording in recordings])
     truths: dict[Quantity, FloatArray] = {
-        "torque": np.concatenate([torques_of(one) for one in recordings]),
-        "diameter": np.concatenate([one.diameter_mm for one in recordings]),
+        "torque": np.concatenate([torques_of(recording) for recording in recordings]),
+        "diameter": np.concatenate([recording.diameter_mm for recording in recordings]),
     }
     models: dict[Quantity, SliceModel] = {}
     for quantity, values in truths.items():
@@ -66,7 +66,7 @@ def fit_slices(
         models.get("diameter"),
         ("full range",) if full_range and "torque" in models else (),
         SliceProfile.fit(recordings),
-        LearnedFrames.of(one.channels for one in recordings),
+        LearnedFrames.of(recording.channels for recording in recordings),
     )
 
 
@@ -90,10 +90,10 @@ def _fit_model(
     novelty = NoveltyDetector.fit(slices, estimator.table)
     every = np.ones((1, slices.shape[1]), dtype=np.bool_)
     readings = (
-        Reading.of(ProcessedFrame(one[None], (), every), t_s, matcher)
-        for one, t_s in zip(slices, times.tolist(), strict=True)
+        Reading.of(ProcessedFrame(frame[None], (), every), t_s, matcher)
+        for frame, t_s in zip(slices, times.tolist(), strict=True)
     )
-    features = np.array([estimator.features(one) for one in readings])
+    features = np.array([estimator.features(reading) for reading in readings])
     of_value, line = fits_of(estimator, quantity, values)
     regressor = fit_slice_regressor(
         features[:, estimator.columns[quantity]],
@@ -110,7 +110,7 @@ def _fit_model(
 def _consecutive(times: list[FloatArray]) -> FloatArray:
     """Return the times of several series one after another; each starts one after the end of the last, or later."""
     shifted: list[FloatArray] = []
-    for one in times:
-        begins_early = bool(shifted) and one[0] <= shifted[-1][-1]
-        shifted.append(one - one[0] + shifted[-1][-1] + 1.0 if begins_early else one)
+    for t_s in times:
+        begins_early = bool(shifted) and t_s[0] <= shifted[-1][-1]
+        shifted.append(t_s - t_s[0] + shifted[-1][-1] + 1.0 if begins_early else t_s)
     return np.concatenate(shifted)

@@ -71,8 +71,8 @@ def find_levels(recordings: Sequence[SliceSeries]) -> list[Block]:
 
     The stopwatch knows the earlier slices of all levels: it reads the place in the sequence, and no sensor.
     """
-    torque = np.concatenate([torques_of(one) for one in recordings])
-    places = [(number, row) for number, one in enumerate(recordings) for row in range(len(one.t_s))]
+    torque = np.concatenate([torques_of(recording) for recording in recordings])
+    places = [(number, row) for number, recording in enumerate(recordings) for row in range(len(recording.t_s))]
     known = np.flatnonzero(np.isfinite(torque))
     parts = later_levels(torque[known]) if len(known) else []
     if not parts:
@@ -87,20 +87,20 @@ def find_levels(recordings: Sequence[SliceSeries]) -> list[Block]:
         earlier = known[: int(rest[-1]) + 1]
         fitted = _rows_of(recordings, np.isin(np.arange(len(torque)), known[rest]))
         timed = _rows_of(recordings, np.isin(np.arange(len(torque)), earlier))
-        spans = tuple(Span(number, row, row + 1) for number, row in (places[one] for one in known[later].tolist()))
+        spans = tuple(Span(number, row, row + 1) for number, row in (places[index] for index in known[later].tolist()))
         blocks.append(Block(level, fitted, spans, timed))
     return blocks
 
 
 def _rows_of(recordings: Sequence[SliceSeries], rows: BoolArray) -> tuple[BoolArray, ...]:
     """Return rows of all recordings together as rows (n,) of each."""
-    ends = np.cumsum([len(one.t_s) for one in recordings])
+    ends = np.cumsum([len(recording.t_s) for recording in recordings])
     return tuple(np.split(rows, ends[:-1]))
 
 
 def _advice(tracks: Sequence[Sequence[EstimateTrack]]) -> str:
     """Return one sentence: what to do first for a better calibration."""
-    judged = [one for each in tracks for one in each]
+    judged = [track for block_tracks in tracks for track in block_tracks]
     if figures_by_load(judged)["loaded"]["baseline_ratio"] is None:
         return NO_ESTIMATE
     return no_better_than_place(judged) or advice_of_coverage(judged, LEVELS)

@@ -56,7 +56,7 @@ class ReciprocityCheck:
         residuals, every = [], np.ones(table.n_channels, dtype=np.bool_)
         for rest, block in left_out_blocks(len(differences)):
             part = cls._model(differences[rest], table, np.inf)
-            residuals += [part.residual(one, every) for one in differences[block]]
+            residuals += [part.residual(difference, every) for difference in differences[block]]
         return cls._model(differences, table, _RECIPROCITY_MARGIN * max(residuals))
 
     @classmethod
@@ -102,12 +102,12 @@ class NoveltyDetector:
         q_and_outlying, t2, responses = [], [], []
         for rest, block in left_out_blocks(n):
             part = cls._model(differences[rest])
-            q_and_outlying += [part.q_residual(one, every) for one in differences[block]]
-            t2 += [part.t2(one, every) for one in differences[block]]
-            responses += [part.response_share(one, every) for one in differences[block]]
+            q_and_outlying += [part.q_residual(difference, every) for difference in differences[block]]
+            t2 += [part.t2(difference, every) for difference in differences[block]]
+            responses += [part.response_share(difference, every) for difference in differences[block]]
         largest_q, outlying = np.array(q_and_outlying).max(axis=0)
         whole = cls._model(differences)
-        largest_t2 = max(*t2, *(whole.t2(one, every) for one in differences))
+        largest_t2 = max(*t2, *(whole.t2(difference, every) for difference in differences))
         least = 0.5 * float(np.linalg.norm(differences, axis=1).min() / np.sqrt(table.n_channels))
         return replace(
             whole,

@@ -23,12 +23,12 @@ class SliceProfile:
     @classmethod
     def fit(cls, recordings: Sequence[SliceSeries]) -> Self | None:
         """Return the profile of slices, None without a known torque."""
-        places = np.concatenate([_places(one.torque_at_frames()) for one in recordings])
-        torque_nm = np.concatenate([one.torque_at_frames() for one in recordings])
+        places = np.concatenate([_places(recording.torque_at_frames()) for recording in recordings])
+        torque_nm = np.concatenate([recording.torque_at_frames() for recording in recordings])
         each = np.unique(places[np.isfinite(torque_nm)])
         if not len(each):
             return None
-        return cls(each.astype(np.float64), np.array([np.nanmean(torque_nm[places == one]) for one in each]))
+        return cls(each.astype(np.float64), np.array([np.nanmean(torque_nm[places == place]) for place in each]))
 
     def predict(self, series: SliceSeries) -> FloatArray:
         """Return the (n,) torques by the places of the slices."""

@@ -11,7 +11,7 @@ from shearloop.tools.bank_design import no_torque, residual_noise
 
 def scene_of_folder(folder: Path, side: str | None) -> MeasuredFrames:
     """Return what a design needs of a folder of slices; raises UserError without a torque."""
-    series = [one for one in read_slices(folder) if one.torque_t_s.size]
+    series = [recording for recording in read_slices(folder) if recording.torque_t_s.size]
     if not series:
         raise no_torque(folder)
     return scene_of_slices(series[0] if side is None else series[0].select_sides((side,)))

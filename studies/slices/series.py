@@ -51,8 +51,8 @@ def read_slices(folder: Path) -> list[SliceSeries]:
     """
     inside = [folder / name for name in (TORQUE_FOLDER, DIAMETER_FOLDER) if (folder / name).is_dir()]
     if inside:
-        return [series for one in inside for series in read_slices(one)]
-    names = [one.name for one in folder.iterdir()]
+        return [series for subfolder in inside for series in read_slices(subfolder)]
+    names = [path.name for path in folder.iterdir()]
     if any(name.startswith("Data_Slice_") for name in names):
         return [_series_of(read_torque_slices(folder))]
     if any("mm_Data_" in name for name in names):
@@ -80,9 +80,9 @@ def read_parts(folders: Sequence[Path], time_range: tuple[float, float]) -> tupl
     Raises UserError for a folder that is given twice, and for copies of a slice.
     """
     check_paths_differ(folders)
-    named = [(folder, part_of(one, *time_range)) for folder in folders for one in read_slices(folder)]
+    named = [(folder, part_of(series, *time_range)) for folder in folders for series in read_slices(folder)]
     check_no_copies(named)
-    return [folder for folder, _ in named], [one for _, one in named]
+    return [folder for folder, _ in named], [series for _, series in named]
 
 
 def check_no_copies(named: Sequence[tuple[Path, SliceSeries]]) -> None:
@@ -92,7 +92,7 @@ def check_no_copies(named: Sequence[tuple[Path, SliceSeries]]) -> None:
     """
     known: dict[bytes, str] = {}
     copies = []
-    for name, frame in (each for folder, one in named for each in _measurements(folder, one)):
+    for name, frame in (measurement for folder, series in named for measurement in _measurements(folder, series)):
         first = known.setdefault(hashlib.sha256(np.ascontiguousarray(frame).data).digest(), name)
         if first is not name:
             copies.append((name, first))
@@ -119,10 +119,10 @@ def check_slices(recordings: Sequence[SliceSeries]) -> str:
     if not recordings:
         raise CalibrationError("there is no recording to calibrate on")
     # A slice without a torque may be of a cylinder.
-    check_finite_values([(one.t_s, one.channels) for one in recordings])
-    if len({one.table for one in recordings}) > 1:
+    check_finite_values([(recording.t_s, recording.channels) for recording in recordings])
+    if len({recording.table for recording in recordings}) > 1:
         raise CalibrationError("the recordings are of different kinds of fingertips; make a calibration of each")
-    sides = tuple(side for side in recordings[0].sides if all(side in one.sides for one in recordings))
+    sides = tuple(side for side in recordings[0].sides if all(side in recording.sides for recording in recordings))
     if len(sides) != 1:
         raise CalibrationError(
             f"slices of {len(sides)} fingertips ({', '.join(sides)}) do not fit into one calibration; make one for each"

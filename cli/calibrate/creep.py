@@ -22,13 +22,15 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.bank_file import Bank
     from shearloop.tools.creep import fit_creep, grips_of
     from shearloop.tools.estimate_tracks import estimate_series
+    from shearloop.tools.evaluate import known_data
     from shearloop.tools.frame_series import check_no_copies
 
     judges_slices(args.calibration, args.recordings)
     calibration, named = read_judged(args.calibration, args.recordings)
     check_no_copies([(str(path), series) for path, series in named])
     bank = Bank.open(args.bank) if args.bank else None
-    grips = [grip for _, series in named for grip in grips_of(estimate_series(calibration, series, bank))]
+    tracks = [estimate_series(calibration, series, bank) for _, series in named]
+    grips = [grip for track in tracks for grip in grips_of(track)]
     found = fit_creep(grips)
     share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)
     result = {
@@ -46,6 +48,7 @@ def run(args: argparse.Namespace) -> int:
         f"From {result['frames']} frames of {counted(len(grips), 'grip')}: the estimates, scaled by {found.scale:.3f} "
         f"and shifted by {1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} "
         f"mN·m instead of {1e3 * found.before_nm:.1f} (standard deviation).",
+        *known_data(calibration.learned, tracks, [path for path, _ in named]),
         "The line above does not correct scale and zero. If the scale is far from 1, calibrate the estimator again; if "
         "the shift is far from 0, tare untouched.",
     ]

@@ -10,6 +10,7 @@ from shearloop.daemon.control.creep import Creep
 from shearloop.emulators.scene import Twin, TwinSettings
 from shearloop.errors import UserError
 from shearloop.estimation import Estimate, FrameSeries
+from shearloop.estimation.learned_frames import LearnedFrames
 from shearloop.tools.creep import Stretch, fit_creep, grips_of
 from shearloop.tools.estimate_tracks import EstimateTrack
 
@@ -113,9 +114,9 @@ def test_a_grip_is_a_stretch_of_torques_and_single_frames_do_not_end_it():
     np.testing.assert_array_equal(first.t_s[:2], track().series.t_s[[2, 4]])
 
 
-def played(monkeypatch: pytest.MonkeyPatch, found: EstimateTrack) -> None:
-    """Have every recording and every calibration give these estimates."""
-    loaded = SimpleNamespace(sides=("right",))
+def played(monkeypatch: pytest.MonkeyPatch, found: EstimateTrack, *, learned: bool = False) -> None:
+    """Have every recording and calibration give these estimates; `learned`: the calibration is of their frames."""
+    loaded = SimpleNamespace(sides=("right",), learned=LearnedFrames.of([found.series.channels] if learned else []))
     monkeypatch.setattr("shearloop.cli.calibrate.creep.judges_slices", lambda *_: False)
     monkeypatch.setattr("shearloop.estimation.Calibration.load", lambda _: loaded)
     monkeypatch.setattr("shearloop.tools.frame_series.read_series", lambda *_: [found.series])
@@ -137,6 +138,12 @@ def test_it_prints_the_line_of_the_configuration(monkeypatch, ran, tmp_path, res
     assert "does not correct scale and zero" in beside
     assert line == f"creep: {{share: {result['share']:g}, time_s: {result['time_s']:g}}}"
     CreepConfig(share=result["share"], time_s=result["time_s"])
+
+
+def test_frames_that_the_calibration_has_learned_from_are_named(monkeypatch, ran):
+    played(monkeypatch, track(), learned=True)
+    said = ran("calibrate", "creep", "held.mcap", "--calibration", "right.cal").out
+    assert "the calibration has learned from 1109 of 1109 judged frames of held.mcap" in said
 
 
 def test_a_recording_without_held_twists_is_refused(monkeypatch, mistake):

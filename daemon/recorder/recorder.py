@@ -199,7 +199,10 @@ class Recorder:
             folder.mkdir(parents=True, exist_ok=True)
             self._current = self._new_file(lost_before=0)
         except OSError as error:
-            raise UserError(f"{folder}: cannot record there: {error.strerror}; choose another folder") from error
+            # `mkdir` only says of such a link that a file exists.
+            lost = folder.is_symlink() and not folder.exists()
+            why = f"it is a link to {folder.readlink()}, which does not exist" if lost else error.strerror
+            raise UserError(f"{folder}: cannot record there: {why}; choose another folder") from error
 
     @property
     def path(self) -> Path:

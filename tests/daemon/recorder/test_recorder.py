@@ -399,6 +399,9 @@ def test_an_unwritable_folder_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot record there"):
         Recorder(tmp_path / "file", IDENTITY, Clock())
+    (tmp_path / "link").symlink_to("missing")
+    with pytest.raises(UserError, match="it is a link to missing, which does not exist"):
+        Recorder(tmp_path / "link", IDENTITY, Clock())
 
 
 @pytest.mark.parametrize("removed", ["file", "folder", "replaced"])

@@ -119,9 +119,9 @@ def build_sensors(
         tareable[COMBINED] = pairs
     if config.skin is not None:
         # Only a rig with a skin loads its modules.
-        from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, ReplayedSkin, SkinTask
+        from shearloop.daemon.sensing.skin_task import SKIN, SKIN_CURRENT, SKIN_SOURCES, SkinTask
 
-        sources = {name: inputs(name) for name in ReplayedSkin.sources}
+        sources = {name: inputs(name) for name in SKIN_SOURCES}
         tareable[SKIN] = tasks[SKIN] = skin = SkinTask(config.skin, publisher, clock, loop, sources)
         tasks[SKIN_CURRENT] = skin.source
     load_cell: LoadCell | None = None

@@ -28,22 +28,25 @@ ValueT_co = TypeVar("ValueT_co", covariant=True)
 
 
 class InputKind(Enum):
-    """What a parser is given; the value is the name in recordings."""
+    """What a source's parser or estimator is given; the value is the name in recordings."""
 
+    # To a parser.
     OPENED = "opened"  # the port was opened, a half-received line is void
-    STARTED = "started"  # a silent board was started again; only in older recordings
     ASKED = "asked"  # an instrument was sent the query in `data`; its reply follows
     DATA = "data"  # bytes arrived
+    # To a load cell's parser, with the zero, or to an estimator.
     TARE = "tare"  # a new zero was asked for, or found
+    # To the estimator alone.
     TOOL = "tool"  # the gripped tool changed
     MOVED = "moved"  # the fingers moved while a frame was acquired
     ADAPT = "adapt"  # the gain was corrected by the torques in `data`
-    STATE = "state"  # the state of parser and estimator, in a recording that begins in the middle of a run
+    # To both.
+    STATE = "state"  # what both know, in a recording that begins in the middle of a run
 
 
 @dataclass(frozen=True, slots=True)
 class RawEvent:
-    """One input of a parser at `t_ns` (monotonic), as it is recorded and replayed; `data` depends on the kind."""
+    """One input of a source at `t_ns` (monotonic), as it is recorded and replayed; `data` depends on the kind."""
 
     kind: InputKind
     t_ns: int

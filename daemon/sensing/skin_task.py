@@ -1,4 +1,4 @@
-"""The shear skin's task: builds instruments and estimator, publishes the shear force, takes the zero, replays."""
+"""The shear skin's task: builds instruments and estimator, publishes the shear force, takes the zero."""
 
 import contextlib
 from collections.abc import Mapping
@@ -13,29 +13,13 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
-from shearloop.daemon.sensing.snapshots import record_state, restored
+from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.sensing.zero_request import ZeroRequest, ZeroState
 from shearloop.daemon.torques import SensorListener, TorqueSample, TorqueSource
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
-from shearloop.drivers.shear_skin.instruments import (
-    OUTPUT,
-    READ,
-    SCAN,
-    SOURCE_PERIOD_S,
-    AdcBoard,
-    Daq,
-    Keithley6430,
-    PairParser,
-    ReplayedInstrument,
-    ScpiScanner,
-    SourceReading,
-    Voltages,
-    read_elements,
-    read_output,
-    read_scan,
-)
-from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, ShearSkin, SkinSample
+from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
+from shearloop.drivers.shear_skin.skin import ShearSkin, SkinSample
 from shearloop.errors import UserError
 from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
 from shearloop.estimation.skin.membrane import joule_heating_k
@@ -43,12 +27,14 @@ from shearloop.estimation.skin.membrane import joule_heating_k
 SKIN = "skin"
 # The instruments' names in health and in recordings.
 SKIN_CURRENT, SKIN_DAQ = f"{SKIN}.source", f"{SKIN}.daq"
+# All sources of a skin's recorded inputs.
+SKIN_SOURCES = SKIN, SKIN_CURRENT, SKIN_DAQ
 # A zero takes two seconds, and longer from averaged samples.
 ZERO_TIMEOUT_S = 15.0
 # The paper's bound.
 MAX_WARMING_K = 5.0
 # The recorded data where a zero is given up before its time is over, because nobody waits for it any longer.
-_GIVEN_UP = b"given up"
+GIVEN_UP = b"given up"
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,16 +72,16 @@ class SkinTask:
         self._skin = ShearSkin(
             _current_source(config, inputs.get(SKIN_CURRENT)),
             _daq(config, inputs.get(SKIN_DAQ)),
-            _gauge_ohm(calibration),
+            gauge_ohm(calibration),
             config.daq.averaged,
         )
         self.source = SkinCurrentTask(self._skin)
-        self._estimator = _estimator(config, calibration)
+        self._estimator = estimator_of(config, calibration)
         self._publisher = publisher
         self._clock = clock
         self._loop = loop
         self._inputs = inputs.get(SKIN)
-        self._radius_m = _radius_m(config)
+        self._radius_m = tool_radius_m(config)
         self._zero_timeout_s = zero_timeout_s(config)
         # The latest request for a zero. The first zero is taken without one.
         self._zero: ZeroRequest | None = None
@@ -130,12 +116,12 @@ class SkinTask:
             return await zero.wait(within_s, lambda: self._not_taken(within_s))
         finally:
             if zero is self._zero and zero.state is ZeroState.EXPIRED and not self._estimator.given_up:
-                self._record(self._clock.now_ns(), _GIVEN_UP)
+                self._record(self._clock.now_ns(), GIVEN_UP)
                 self._estimator.give_up_zero()
 
     def _request_zero(self) -> ZeroRequest:
         now_ns = self._clock.now_ns()
-        self._zero = ZeroRequest(now_ns, now_ns + _ns(self._zero_timeout_s), self._zero)
+        self._zero = ZeroRequest(now_ns, now_ns + round(self._zero_timeout_s * 1e9), self._zero)
         self._record(now_ns)
         self._skin.restart_average()
         self._estimator.tare(now_ns, self._zero.until_ns)
@@ -187,56 +173,6 @@ class SkinTask:
         if self._radius_m is not None and self._loop is not None:
             self._loop.on_torque(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
         self._publisher.publish(message)
-
-
-class ReplayedSkin:
-    """The skin's parsers, validator and estimator, for the replay of recorded events."""
-
-    sources = (SKIN, SKIN_CURRENT, SKIN_DAQ)
-
-    def __init__(self, config: SkinConfig) -> None:
-        """Raises BankError for an unusable calibration."""
-        calibration = load_calibration(config.calibration)
-        self._estimator = _estimator(config, calibration)
-        current_a = config.source.current_ma * 1e-3
-        daq_period_s = 1.0 / config.daq.rate_hz
-        self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
-        self._averager = SampleAverager(config.daq.averaged)
-        self._radius_m = _radius_m(config)
-        self._zero_timeout_ns = _ns(zero_timeout_s(config))
-        self._source = ReplayedInstrument({READ: read_elements, OUTPUT: read_output})
-        adc = config.daq.adc
-        self._daq: ReplayedInstrument[Voltages] | PairParser = (
-            ReplayedInstrument({SCAN: read_scan}) if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
-        )
-        self._latest: SourceReading | None = None
-
-    def restore(self, text: bytes) -> None:
-        """Continue from a recorded state; raises SnapshotError for one that does not fit."""
-        like = {"estimator": self._estimator, "validator": self._validator, "averager": self._averager}
-        state = restored(text, self._estimator.fixed, like)
-        self._validator, self._averager = state["validator"], state["averager"]
-        self._latest, self._estimator = state["latest"], state["estimator"]
-        self._daq = state.get("parser", self._daq)
-
-    def handle(self, source: str, event: RawEvent) -> list[SkinShear]:
-        """Return the messages that a source's event leads to, without processing time."""
-        if source == SKIN_CURRENT:
-            readings = self._source.handle(event)
-            self._latest = readings[-1] if readings else self._latest
-        elif source == SKIN_DAQ:
-            samples = (self._validator.sample(voltages, self._latest) for voltages in self._daq.handle(event))
-            return [
-                shear_message(sample, self._estimator.update(sample), self._radius_m, sample.t_arrival_ns)
-                for sample in map(self._averager.add, samples)
-                if sample is not None
-            ]
-        elif event.kind is InputKind.TARE and event.data == _GIVEN_UP:
-            self._estimator.give_up_zero()
-        elif event.kind is InputKind.TARE:
-            self._averager.restart()
-            self._estimator.tare(event.t_ns, event.t_ns + self._zero_timeout_ns)
-        return []
 
 
 def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | None, now_ns: int) -> SkinShear:
@@ -313,19 +249,18 @@ def zero_timeout_s(config: SkinConfig) -> float:
     return max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples * config.daq.sample_period_s)
 
 
-def _ns(time_s: float) -> int:
-    return round(time_s * 1e9)
-
-
-def _radius_m(config: SkinConfig) -> float | None:
+def tool_radius_m(config: SkinConfig) -> float | None:
+    """Return the tool's radius in m, None if the skin gives no torque."""
     return None if config.tool_radius_mm is None else config.tool_radius_mm * 1e-3
 
 
-def _gauge_ohm(calibration: SkinCalibration) -> float:
+def gauge_ohm(calibration: SkinCalibration) -> float:
+    """Return the mean resistance of a gauge at rest."""
     return sum(calibration.rest_ohm) / 2.0
 
 
-def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimator:
+def estimator_of(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimator:
+    """Return the estimator of a configured skin, before its first sample."""
     return SkinEstimator(
         calibration, normal_n=config.normal_n, zero_samples=config.zero_samples, drift_per_hour=config.drift_per_hour
     )

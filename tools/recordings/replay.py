@@ -35,7 +35,7 @@ from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.load_cell_task import load_message
 from shearloop.daemon.sensing.session_inputs import SESSION_KINDS, before_frame
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session
-from shearloop.daemon.sensing.skin_task import SKIN, ReplayedSkin
+from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCES
 from shearloop.daemon.sensing.snapshots import SnapshotError, restored
 from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.daemon.torques import LOAD_CELL
@@ -47,6 +47,7 @@ from shearloop.estimation import BeforeFrame, HeldTool, Session
 from shearloop.mistakes import validated
 from shearloop.tools.recordings.message_content import ContentError
 from shearloop.tools.recordings.reader import open_recording, reading
+from shearloop.tools.recordings.replayed_skin import ReplayedSkin
 
 # Topics that a replay computes. All others are sent as they were recorded.
 _COMPUTED = messages.EitFrame, messages.EitEstimate, messages.EitAdapted, messages.LoadTorque, messages.SkinShear
@@ -375,7 +376,7 @@ class Replay:
         elif source == LOAD_CELL and self._load_parser is not None:
             for sample in self._load_parser.handle(event):
                 self._publisher.publish(load_message(sample))
-        elif self._skin is not None and source in self._skin.sources:
+        elif self._skin is not None and source in SKIN_SOURCES:
             # A query before the state may have its reply after it.
             for message in self._skin.handle(source, event):
                 if SKIN not in self.comparison.awaited:

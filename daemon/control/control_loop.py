@@ -234,10 +234,9 @@ class ControlLoop:
 
     def stop(self, reason: str, fault: Fault) -> None:
         """End the experiment, if one runs, and stand still until the operator acknowledges the stop."""
-        running = self.running
-        self.safety.stop(fault, reason if running is None else "")
-        if running is not None:
-            running.stop(reason)
+        self.safety.stop(fault, reason)
+        if self.running is not None:
+            self.running.stop(reason)
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command."""

@@ -321,7 +321,7 @@ class Stop:
     faults: tuple[Fault, ...]
     # Grows with each cause that begins a stop or joins one.
     number: int
-    # What stopped the rig while no experiment ran; empty where the stop has ended an experiment.
+    # Why somebody asked for it, as the status shows it; empty for a stop that nobody asked for.
     reason: str = ""
     # Whether it has opened the gripper.
     released: bool = False

@@ -541,6 +541,10 @@ def test_a_stop_after_the_end_has_a_reason_of_its_own():
     loop.stop("the second operator stopped it", Fault(FaultCode.OPERATOR_STOP, "two"))
     rig.run(0.1)
     assert loop.status.activity == "the second operator stopped it"
+    rig.arm = replace(rig.arm, emergency_stop=True)
+    rig.run(0.1)
+    assert loop.status.activity == "the second operator stopped it", "also after another cause has joined"
+    rig.arm = replace(rig.arm, emergency_stop=False)
     loop.acknowledge()
     rig.run(0.1)
     assert "second" not in loop.status.activity

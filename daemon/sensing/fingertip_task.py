@@ -31,7 +31,7 @@ from shearloop.estimation import (
     torque_at,
 )
 from shearloop.timeouts import timeout
-from shearloop.words import counted
+from shearloop.words import CountedReasons, counted
 
 # A correction of the gain begins with a frame.
 _LONGEST_WAIT_S = 5.0
@@ -62,25 +62,6 @@ class ToolHolder(Protocol):
         """Return whether the fingers moved at any time of an interval, as far as is known."""
 
 
-class _RefusedFrames:
-    """The reasons why a tare's frames gave no estimate."""
-
-    def __init__(self) -> None:
-        # By the reason without its numbers: the count, and the latest reason.
-        self._reasons: dict[str, tuple[int, str]] = {}
-
-    def add(self, reason: str) -> None:
-        """Take the reason of a frame."""
-        kind = "".join(letter for letter in reason if not letter.isdigit())
-        self._reasons[kind] = self._reasons.get(kind, (0, ""))[0] + 1, reason
-
-    @property
-    def sentence(self) -> str:
-        """The reasons with their counts, the most frequent first; empty without a frame."""
-        often = sorted(self._reasons.values(), reverse=True)
-        return ", ".join(f"{counted(count, 'frame')}: {reason}" for count, reason in often)
-
-
 @dataclass(slots=True)
 class FingertipTask:
     """The I/O of one session: frames of one fingertip or of several together in, estimates out.
@@ -101,7 +82,8 @@ class FingertipTask:
     count: int = 0
     # The latest request for an idle frame, and why its frames were refused.
     _zero: ZeroRequest | None = None
-    _refused: _RefusedFrames = field(default_factory=_RefusedFrames)
+    # Why the frames of the present tare gave no estimate.
+    _refused: CountedReasons = field(default_factory=CountedReasons)
     _held: Measured | None = None
     # Whether the gripper has not said yet that nothing was held in an idle frame that nobody asked for.
     _unconfirmed: bool = field(init=False)
@@ -151,7 +133,7 @@ class FingertipTask:
 
     def _request_zero(self, within_s: float) -> ZeroRequest:
         now_ns = self.clock.now_ns()
-        self._zero, self._refused = ZeroRequest(now_ns, now_ns + round(within_s * 1e9), self._zero), _RefusedFrames()
+        self._zero, self._refused = ZeroRequest(now_ns, now_ns + round(within_s * 1e9), self._zero), CountedReasons()
         return self._zero
 
     def _before(self, frames: tuple[Frame, ...], now_ns: int) -> BeforeFrame:
@@ -175,7 +157,7 @@ class FingertipTask:
         if zero is None:
             return False, False
         if zero.is_too_late(began_ns):
-            why = self._refused.sentence or "no frame came in time"
+            why = self._refused_frames or "no frame came in time"
             zero.expire(f"the idle frame of {self.name} was not taken: {why}")
             structlog.get_logger().warning(zero.reason)
         begins = zero.state is ZeroState.REQUESTED and began_ns >= zero.from_ns
@@ -236,11 +218,17 @@ class FingertipTask:
         self.publisher.publish(adapted_message(self.name, frames, reference, corrected))
         ended.set_result(None)
 
+    @property
+    def _refused_frames(self) -> str:
+        """Why the frames of the present tare gave no estimate, the most frequent reason first; empty without one."""
+        reasons = self._refused.most_frequent_first
+        return ", ".join(f"{counted(count, 'frame')}: {reason}" for count, reason in reasons)
+
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new idle frame and wait until it is complete; return None, or why it is not."""
         what = f"the idle frame of {self.name} could not be taken within {within_s:.3g} s"
         zero = self._request_zero(within_s)
-        return await zero.wait(within_s, lambda: f"{what}: {self._refused.sentence or 'no frame came'}")
+        return await zero.wait(within_s, lambda: f"{what}: {self._refused_frames or 'no frame came'}")
 
     async def adapt(self, reference: str) -> None:
         """Correct the gain by this source's torque during this grip; raises ActionError."""

@@ -357,6 +357,8 @@ async def twisted(config: Path, bank: Path, path: Path) -> tuple[Published, Watc
     """Return what the daemon of an emulated rig publishes during an experiment, and what is heard of it."""
     async with watching(config.parent) as watched:
         async with running_rig(config, bank) as (_, watcher, _fault, command):
+            # Whoever is connected late on a busy computer misses the command.
+            await watched.until_begun()
             await started(watcher, command, str(path))
             state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
             assert state["phase"] == "done", state["activity"]

@@ -102,6 +102,10 @@ class Watched:
             await later.until(topic, **values)
             reading.cancel()
 
+    async def until_begun(self) -> None:
+        """Wait until both have heard of the robot."""
+        await asyncio.gather(self.listened.until("robot.state"), self.paged.until("robot.state"))
+
     async def until_ended(self) -> None:
         """Wait until both have said that the daemon ended."""
         await asyncio.gather(self.listened.until("daemon.end"), self.paged.until("daemon.end"))

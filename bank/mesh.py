@@ -18,7 +18,7 @@ from shearloop.words import counted
 
 # A triangle with a smaller area over its longest edge squared is an error of the mesh.
 _THINNEST = 1e-8
-_MOST_NODES = 1e9
+_MAX_NODES = 1e9
 _FARTHEST_CM = 1e6
 # The unit of coordinates in the digest: far below any mesh size, far above rounding.
 _DIGEST_UNIT_CM = 1e-9
@@ -173,7 +173,7 @@ def _eidors_fields(path: Path) -> dict[str, Any]:
 def _numbers(values: Any) -> IntArray:
     """Return MATLAB's numbers of nodes, which begin with 1, as ours; raises ValueError for other numbers."""
     found = np.asarray(values, np.float64)
-    if not (np.abs(found) < _MOST_NODES).all() or (found % 1).any():
+    if not (np.abs(found) < _MAX_NODES).all() or (found % 1).any():
         raise ValueError("the number of a node is not whole")
     return found.astype(np.int64) - 1
 

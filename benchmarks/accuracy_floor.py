@@ -29,7 +29,7 @@ from shearloop.tools.recordings.frames import read_recording
 
 # Increments, in frames. The least bound over these numbers of directions counts; each direction needs some increments.
 SHORT, LONG = 1, 6
-DIRECTIONS, LEAST_PER_DIRECTION = (8, 16, 32), 5
+DIRECTIONS, MIN_PER_DIRECTION = (8, 16, 32), 5
 # An estimator remembers the first number of frames, with known torques. The second number is a twist of 2.7 s.
 KNOWN, UNKNOWN = 13, 5
 DEGREES = (1, 2, 3)
@@ -37,7 +37,7 @@ DEGREES = (1, 2, 3)
 TOLERANCE = 0.15
 COLUMNS = ("always 0", "floor", "channels", "load cell", "alignment")
 # Standard deviation of normal noise over the median of its absolute values; frames with less torque show the drift.
-_MAD, _UNLOADED_NM, _LEAST_NOISE_V = 1.4826, 0.002, 1e-5
+_MAD, _UNLOADED_NM, _MIN_NOISE_V = 1.4826, 0.002, 1e-5
 
 
 def bound_nm(response: FloatArray, white: float, drift: FloatArray) -> float:
@@ -57,7 +57,7 @@ def least_bound_nm(short: FloatArray, long: FloatArray, responses: tuple[FloatAr
     """
     first, second = responses
     axes, found = np.linalg.svd(long, full_matrices=False)[2], []
-    for k in (one for one in DIRECTIONS if LEAST_PER_DIRECTION * one <= len(long)):
+    for k in (one for one in DIRECTIONS if MIN_PER_DIRECTION * one <= len(long)):
         rows = axes[:k]
         at_short, at_long = (rows @ (each.T @ each / len(each)) @ rows.T for each in (short, long))
         white = (float((short**2).sum() / len(short)) - np.trace(at_short)) / (short.shape[1] - k) / 2
@@ -106,7 +106,7 @@ def slices_floor_nm(series: FrameSeries, degree: int) -> float:
     powers = np.column_stack([torque_nm**d for d in range(1, degree + 1)])
     fitted = np.linalg.lstsq(np.diff(powers, axis=0), np.diff(frames, axis=0), rcond=None)[0]
     left = frames - powers @ fitted
-    noise = np.sqrt(np.mean(np.diff(left, axis=0) ** 2, axis=0) / 2).clip(_LEAST_NOISE_V)
+    noise = np.sqrt(np.mean(np.diff(left, axis=0) ** 2, axis=0) / 2).clip(_MIN_NOISE_V)
     slopes = np.column_stack([d * torque_nm ** (d - 1) for d in range(1, degree + 1)]) @ fitted / noise
     short, long = (left[lag:] / noise - left[:-lag] / noise for lag in (SHORT, LONG))
     return float(np.sqrt(np.mean([least_bound_nm(short, long, (one, one)) ** 2 for one in slopes])))

@@ -41,9 +41,9 @@ LOADED = {
 ALL = {"all: RMSE, N·m or mm": "rmse_nm", "r": "r"}
 
 # Three and four of five repeats; about half of the cylinders' slices; five of ten twists.
-SLICE_SHARES = (0.592, 0.796)
-CYLINDER_SHARE = 0.62
-TWIST_SHARE = 0.457
+SLICE_FRACTIONS = (0.592, 0.796)
+CYLINDER_FRACTION = 0.62
+TWIST_FRACTION = 0.457
 # Frames before the judged part that fill an estimator's memory.
 _WARM_UP = 0.015
 STREAMS = {
@@ -73,17 +73,17 @@ def splits(recordings: Path, scratch: Path) -> Iterator[tuple[str, FrameSeries, 
     That is the earlier part with all sides.
     """
     (torque,) = read_slices(recordings / "torque_slices")
-    for share in SLICE_SHARES:
+    for share in SLICE_FRACTIONS:
         yield f"torque slices, first {share:.0%}", part_of(torque, 0, share), part_of(torque, share, 1), []
     (cylinders,) = read_slices(recordings / "diameter_slices")
-    known, unknown = part_of(cylinders, 0, CYLINDER_SHARE), part_of(cylinders, CYLINDER_SHARE, 1)
-    yield f"cylinders, first {CYLINDER_SHARE:.0%}", known, unknown, []
+    known, unknown = part_of(cylinders, 0, CYLINDER_FRACTION), part_of(cylinders, CYLINDER_FRACTION, 1)
+    yield f"cylinders, first {CYLINDER_FRACTION:.0%}", known, unknown, []
     recording = read_recording(imported_stream(recordings, "3 December", scratch))
-    timed_by = [part_of(series_of(recording, None), 0, TWIST_SHARE)]
+    timed_by = [part_of(series_of(recording, None), 0, TWIST_FRACTION)]
     for sides in FINGERTIPS:
         twists = series_of(recording, sides)
-        past, future = part_of(twists, 0, TWIST_SHARE), part_of(twists, TWIST_SHARE - _WARM_UP, 1)
-        yield f"stream, {' and '.join(sides)}, first {TWIST_SHARE:.0%}", past, future, timed_by
+        past, future = part_of(twists, 0, TWIST_FRACTION), part_of(twists, TWIST_FRACTION - _WARM_UP, 1)
+        yield f"stream, {' and '.join(sides)}, first {TWIST_FRACTION:.0%}", past, future, timed_by
 
 
 def later_frames(recordings: Path, scratch: Path, physics: Physics) -> Iterator[Judged]:

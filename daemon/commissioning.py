@@ -30,7 +30,7 @@ CAPPED_RAD_PER_S: Final = 0.2
 CAPPED_M_PER_S: Final = 0.05
 CAPPED_NM: Final = 0.3
 # A report counts for this time after its oldest stage.
-MOST_AGE_DAYS: Final = 180
+MAX_AGE_DAYS: Final = 180
 # This computer's clock may be this much behind the clock that dated the report.
 _CLOCKS_DIFFER = timedelta(days=1)
 # A measured value beyond this multiple of a capped speed stops the motion.
@@ -294,8 +294,8 @@ def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
     if not report.stages:
         return f"{config.commissioned} has no stage"
     dates = [stage.date for stage in report.stages]
-    if now - min(dates) > timedelta(days=MOST_AGE_DAYS):
-        return f"{config.commissioned} is of {min(dates):%Y-%m-%d}, older than {MOST_AGE_DAYS} days"
+    if now - min(dates) > timedelta(days=MAX_AGE_DAYS):
+        return f"{config.commissioned} is of {min(dates):%Y-%m-%d}, older than {MAX_AGE_DAYS} days"
     if max(dates) - now > _CLOCKS_DIFFER:
         return f"{config.commissioned} is of {max(dates):%Y-%m-%d}, which is in the future by this computer's clock"
     return ""

@@ -12,7 +12,7 @@ from shearloop.files import expanded_path
 from shearloop.yaml_files import Document
 
 # No length of a tool, a grip or a lever is smaller.
-LEAST_MM = 0.1
+MIN_MM = 0.1
 
 
 def _holds(annotation: Any, kind: type) -> bool:
@@ -46,7 +46,7 @@ class ConfigModel(BaseModel):
     @field_validator("*")
     @classmethod
     def _check(cls, value: object, info: ValidationInfo) -> object:
-        if str(info.field_name).endswith("_mm") and isinstance(value, float) and 0 < abs(value) < LEAST_MM:
+        if str(info.field_name).endswith("_mm") and isinstance(value, float) and 0 < abs(value) < MIN_MM:
             raise ValueError(f"{value:g} is too small for mm; did you mean {1000 * value:g}, the thousandfold?")
         if isinstance(value, Path) and (value == Path() or "\0" in str(value)):
             raise ValueError(f"must be the path of a file, not {str(value)!r}")

@@ -37,14 +37,14 @@ from shearloop.yaml_files import Document
 # A file on a network drive may never answer.
 READ_WITHIN_S = 5.0
 # The packaged experiments have less than 2 kB.
-MOST_BYTES = 1 << 15
+MAX_BYTES = 1 << 15
 # The longest path and the longest mistake in a message, in characters.
 _LONGEST_NAME = 300
 _LONGEST_MISTAKE = 500
 # So many requests may wait for their file, which leaves room for other requests of the command socket.
-_MOST_WAITING = 4
+_MAX_WAITING = 4
 # The number of a folder's files that the list examines.
-MOST_LISTED = 500
+MAX_LISTED = 500
 Found = TypeVar("Found")
 
 
@@ -70,7 +70,7 @@ def check_experiment(
 
 def read_document(path: Path) -> Document:
     """Return the content of an experiment's file; raises UserError."""
-    return Document.read(path, UserError, ExperimentFile.what, most_bytes=MOST_BYTES)
+    return Document.read(path, UserError, ExperimentFile.what, most_bytes=MAX_BYTES)
 
 
 def without_mistakes(document: Document, mistakes: Sequence[Mistake]) -> ExperimentFile:
@@ -178,7 +178,7 @@ class ExperimentFiles:
 
         Raises UserError where others wait already, or wait in vain.
         """
-        if self._abandoned or self._waiting >= _MOST_WAITING:
+        if self._abandoned or self._waiting >= _MAX_WAITING:
             raise UserError("the file of another request is being read; wait for its end")
         self._waiting += 1
         try:
@@ -226,7 +226,7 @@ class ExperimentFiles:
         """Return the name of the experiment in a file; None where `start` does not accept it."""
         # Configurations share the folder with experiments.
         with suppress(UserError, OSError):
-            document = Document.parse(path, read_file(path, MOST_BYTES), UserError, ExperimentFile.what)
+            document = Document.parse(path, read_file(path, MAX_BYTES), UserError, ExperimentFile.what)
             if isinstance(document.content, dict) and "steps" in document.content:
                 return without_mistakes(document, self._mistakes(document)).name
         return None
@@ -237,7 +237,7 @@ class ExperimentFiles:
             own = folder.resolve()
             # A link may lead elsewhere.
             paths = (path for path in own.rglob("*.yaml") if path.is_file() and path.resolve().is_relative_to(own))
-            yield from sorted(islice(paths, MOST_LISTED))
+            yield from sorted(islice(paths, MAX_LISTED))
 
     def _mistakes(self, document: Document) -> Sequence[Mistake]:
         """Return what the experiment's own limits, or the rig where it is known, do not allow."""
@@ -263,7 +263,7 @@ class ExperimentFiles:
                     f"{name} is in none of the folders of experiments ({folders}){cure} it there, or name its folder "
                     "under `experiments` in the configuration"
                 )
-            data = read_file(path, MOST_BYTES)
+            data = read_file(path, MAX_BYTES)
         except (OSError, ValueError, RuntimeError) as error:
             reason = error.strerror if isinstance(error, OSError) else str(error)
             meant = self._meant(named) if isinstance(error, FileNotFoundError) else ""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.torques import SensorListener
 
 # Texts beyond this number are dropped.
-MOST_WAITING = 10_000
+MAX_WAITING = 10_000
 # Returns to the beginning of a terminal's line and empties it.
 CLEAR_LINE = "\r\x1b[K"
 # The end waits this long for the reader.
@@ -34,7 +34,7 @@ class NonBlockingWriter:
     A line says where texts were dropped. After a broken pipe (`| head`) it stays silent.
     """
 
-    def __init__(self, stream: TextIO, most_waiting: int = MOST_WAITING) -> None:
+    def __init__(self, stream: TextIO, most_waiting: int = MAX_WAITING) -> None:
         # A terminal with another encoding may lack characters such as "…".
         self._stream = own_stream(stream)
         self._waiting: queue.Queue[str | None] = queue.Queue(most_waiting)

@@ -34,7 +34,7 @@ RELEASE_AND_TARE = "run an experiment that begins with the steps `release` and `
 # Nothing shows that another tool was clamped.
 CLAMPED_ANOTHER = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
 # A state takes some hundred bytes.
-_MOST_BYTES = 1 << 16
+_MAX_BYTES = 1 << 16
 # A name that had no address at the start is looked up again at this interval.
 LOOK_UP_S = 10.0
 
@@ -299,7 +299,7 @@ class RigMemory:
 def read_memory(path: Path) -> Remembered:
     """Return the state in a file; an unreadable file counts as a stop, a missing file as no stop."""
     try:
-        content: Any = json.loads(read_file(path, _MOST_BYTES))
+        content: Any = json.loads(read_file(path, _MAX_BYTES))
         if content.pop("version") != VERSION:
             raise ValueError("it has another version")
         return validated(content, Remembered, str(path), ValueError)

@@ -14,7 +14,7 @@ from shearloop.files import read_file, replace_file
 
 # The addresses that a name had when it was last looked up.
 ADDRESSES_SUFFIX = ".addresses"
-_MOST_BYTES = 1 << 16
+_MAX_BYTES = 1 << 16
 SUFFIXES = (".json", ".lock", ADDRESSES_SUFFIX)
 
 
@@ -148,7 +148,7 @@ def _stored_spellings() -> tuple[str, ...]:
 def _last_addresses(name: str) -> frozenset[str]:
     """Return the addresses that a name had when it was last looked up; none where it never was."""
     try:
-        return frozenset(read_file(_file(name, ADDRESSES_SUFFIX), _MOST_BYTES).decode().split())
+        return frozenset(read_file(_file(name, ADDRESSES_SUFFIX), _MAX_BYTES).decode().split())
     except (OSError, UnicodeError):
         return frozenset()
 

@@ -29,7 +29,7 @@ CAPACITY_NM = 1.75
 SLEW_NM_PER_S = 2.0
 # A calibration with more raw units in the capacity than this is of converter counts: it has millions of them, and grams
 # would be five thousand.
-_MOST_UNITS = 10_000
+_MAX_UNITS = 10_000
 # Why a line has another unit than the calibration, and the cure.
 COUNTS_REASON = (
     "the board sends counts and has no calibration; run `shearloop calibrate load` and name its file as "
@@ -76,7 +76,7 @@ class LoadCalibration(CalibrationModel):
     @property
     def takes_counts(self) -> bool:
         """Whether a line's decimal is a number of the converter's counts."""
-        return abs(self.nm_per_count) * _MOST_UNITS < CAPACITY_NM
+        return abs(self.nm_per_count) * _MAX_UNITS < CAPACITY_NM
 
     @property
     def nm_per_count(self) -> float:

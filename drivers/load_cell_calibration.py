@@ -26,7 +26,7 @@ MAX_NOISE_COUNTS = 5000.0
 # Relative to the measured change, for boards that send N·m.
 MAX_NOISE_FRACTION = 0.05
 # Cells of such levers bear some kilograms, and resolve a hundredth of a gram.
-LEAST_MASS_G, LARGEST_MASS_G = 1.0, 20_000.0
+MIN_MASS_G, LARGEST_MASS_G = 1.0, 20_000.0
 MAX_RESIDUAL_FRACTION = 0.02
 
 
@@ -124,10 +124,10 @@ def check_masses(masses_g: Sequence[float]) -> None:
     if not masses_g or any(not (0 < mass < math.inf) for mass in masses_g):
         raise DeviceCalibrationError("Give at least one mass in grams, each above zero.")
     for mass in masses_g:
-        if not LEAST_MASS_G <= mass <= LARGEST_MASS_G:
-            meant = f" Did you mean {1000 * mass:g}, {mass:g} kg in g?" if mass < LEAST_MASS_G else ""
+        if not MIN_MASS_G <= mass <= LARGEST_MASS_G:
+            meant = f" Did you mean {1000 * mass:g}, {mass:g} kg in g?" if mass < MIN_MASS_G else ""
             raise DeviceCalibrationError(
-                f"{mass:g} g cannot calibrate a load cell; give masses of {LEAST_MASS_G:g} to {LARGEST_MASS_G:g} "
+                f"{mass:g} g cannot calibrate a load cell; give masses of {MIN_MASS_G:g} to {LARGEST_MASS_G:g} "
                 f"g.{meant}"
             )
     if len(set(masses_g)) < len(masses_g):

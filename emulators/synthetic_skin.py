@@ -22,7 +22,7 @@ SLACK_RATIO = -0.125
 # The paper's response to 2 N of normal force alone.
 CROSSTALK_PER_N = 1.24e-4 / 2
 # Of the balance between contact and membrane: each step leaves at most a third of the error.
-TOLERANCE_N, MOST_STEPS = 1e-9, 30
+TOLERANCE_N, MAX_STEPS = 1e-9, 30
 
 
 class SyntheticSkin:
@@ -64,7 +64,7 @@ class SyntheticSkin:
         sticking_mm_per_n = 1.0 / CONTACT_N_PER_MM
         slipping_mm_per_n = sticking_mm_per_n + math.pi / 2 * outer_mm * self.membrane.sheet_per_n
         shear_n = self.shear_n
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             state = self.membrane.step(self.state, shear_n, self.normal_n)
             beyond_mm = way_mm - sticking_mm_per_n * shear_n - outer_mm * self.membrane.turned_rad(state)
             slips = state.net_tension_n != self.state.net_tension_n

@@ -21,7 +21,7 @@ from shearloop.timeouts import timeout
 SCRIPT_END = b"\nend\n"
 # A controller is never late. When this process was, the robot's time stands still, so that no watchdog expires on
 # heartbeats that wait in the socket. Its clock goes on: its samples are of now.
-MOST_CATCH_UP_S = 0.02
+MAX_CATCH_UP_S = 0.02
 BANNER = "Connected: Universal Robots Dashboard Server"
 _ROBOT_MODES = {MODE_POWER_OFF: "POWER_OFF", MODE_IDLE: "IDLE", MODE_RUNNING: "RUNNING"}
 # What changes the robot needs remote control; UR's words differ from version to version.
@@ -100,7 +100,7 @@ class Controller:
             dt_s = 1.0 / min(self._rate_hz, _STATES_HZ[5 if self.robot.is_e_series else 3])
             await asyncio.sleep(max(0.0, last_s + dt_s - time.monotonic()))
             now_s = time.monotonic()
-            missed_s = max(0.0, now_s - MOST_CATCH_UP_S - last_s)
+            missed_s = max(0.0, now_s - MAX_CATCH_UP_S - last_s)
             last_s += missed_s
             self.robot.stand_still(missed_s)
             while last_s + dt_s <= now_s:

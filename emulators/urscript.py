@@ -39,7 +39,7 @@ CLOCKS = (LOWER.clock, UPPER.clock)
 # What remains of 0.002 s that is added to 1024 s in 32 bits.
 FLOAT_LOSS = float(np.float32(1024.0) + np.float32(0.002) - np.float32(1024.0)) / 0.002
 # More loops than this within one cycle never end.
-MOST_LOOPS = 10_000
+MAX_LOOPS = 10_000
 # The registers of each type and direction.
 _REGISTERS = range(48)
 # Functions that use up cycles.
@@ -274,7 +274,7 @@ class Program:
     def count_loop(self) -> None:
         """End a program with a loop that takes no cycle."""
         self._loops += 1
-        if self._loops > MOST_LOOPS:
+        if self._loops > MAX_LOOPS:
             raise ProgramEndedError("a loop without sync() does not end")
 
     def sync(self) -> Thread:

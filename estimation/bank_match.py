@@ -23,7 +23,7 @@ BankSearch: TypeAlias = PrunedMatcher | PrunedZeroLagMatcher
 _ALIKE, _FAR_K_CM, _FAR_SIGMA = 0.002, 0.55, 1.5
 # A cell's weight falls by e with this drop of its score. Chosen on synthetic and recorded slices: from 0.0003 to 0.001
 # the error stays the same and the largest jump falls to a fifth.
-_SCORE_SCALE, _LEAST_WEIGHT = 0.0005, 1e-9
+_SCORE_SCALE, _MIN_WEIGHT = 0.0005, 1e-9
 # A weighted mean finds a sampled Gaussian peak if its standard deviation is at least 0.6 cells, so weights reach this
 # share of the drop to the next cell. On grids with a larger drop than _COARSE a parabola through the maximum is used.
 _RESOLVED, _COARSE = 0.7, 0.005
@@ -167,7 +167,7 @@ class RefinedMatcher:
         not (docs/charts.md).
         """
         weights = np.exp((scores - best) / width)
-        near = np.flatnonzero(weights > _LEAST_WEIGHT)
+        near = np.flatnonzero(weights > _MIN_WEIGHT)
         weights = weights[near] / weights[near].sum()
         row, column = np.divmod(self._cells[near], len(self._sigma_grid))
         k = float(weights @ self._k_grid[row])

@@ -40,7 +40,7 @@ _ONE_SIGN = {
     for sign, recorded, other in ((1, "positive", "negative"), (-1, "negative", "positive"))
 }
 # Tools differ if their diameters differ by a larger share.
-LARGEST_TOOL_SHARE = 0.15
+LARGEST_TOOL_FRACTION = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +75,7 @@ class Calibration:
         """
         law, own_mm = self.tools, self.tool_mm
         if law is None or self.torque is None:
-            if tool is None or not abs(tool.value - own_mm) > LARGEST_TOOL_SHARE * own_mm + tool.half_width:
+            if tool is None or not abs(tool.value - own_mm) > LARGEST_TOOL_FRACTION * own_mm + tool.half_width:
                 return self
             raise CalibrationError(
                 f"the tool has {tool.value:.3g} mm, and the calibration was made with a tool of {own_mm:g} mm; its "

@@ -10,7 +10,7 @@ from shearloop.estimation.fingertip_validator import FingertipValidator
 
 # Filled frames of the emulated rig, the recorded stream and formulas give estimates within a tenth of their error for
 # 2 to 16 directions.
-_MOST_DIRECTIONS = 4
+_MAX_DIRECTIONS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,11 +39,11 @@ class ChannelImputer:
         mean = positions.mean(axis=0)
         moved = positions - mean
         _, s, vt = np.linalg.svd(moved, full_matrices=False)
-        directions = vt[:_MOST_DIRECTIONS]
+        directions = vt[:_MAX_DIRECTIONS]
         # No channel is known better than its own noise, the unit here.
         rest = np.maximum((moved - moved @ directions.T @ directions).std(axis=0), 1.0).reshape(noise.shape)
         scale = np.where(alive, noise, 0.0)
-        spreads = s[:_MOST_DIRECTIONS] / np.sqrt(len(positions))
+        spreads = s[:_MAX_DIRECTIONS] / np.sqrt(len(positions))
         modes = (spreads[:, None] * directions).reshape(-1, *noise.shape) * scale
         precision = np.where(alive, (rest * noise) ** -2.0, 0.0)
         return cls(mean.reshape(noise.shape) * scale, modes, precision)

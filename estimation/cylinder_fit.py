@@ -9,16 +9,16 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.channels import ChannelTable, smoothed_along_channels
 from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.defaults import BASELINE_FRAMES
-from shearloop.estimation.estimator import LEAST_LEFT, CalibrationRows
+from shearloop.estimation.estimator import MIN_LEFT, CalibrationRows
 from shearloop.estimation.interval_regressor import IntervalRegressor
-from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange
+from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals, ValueRange
 from shearloop.estimation.ridge import Ridge
 
 # Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.
-_N_NUISANCE, _MOST_FRAMES = 16, 500
+_N_NUISANCE, _MAX_FRAMES = 16, 500
 # The tools differ along a direction where the positions vary by this factor more than their noise. At least this share
 # of the variation along the clearest direction counts as the tools', at any noise.
-_CLEAR, _LEAST_SHARE = 2.0, 0.2
+_CLEAR, _MIN_FRACTION = 2.0, 0.2
 # Centred positions have one direction less than their number; the last one is rounding.
 _ROUNDING = 1e-9
 
@@ -37,11 +37,11 @@ def fit_cylinders(grips: Sequence[CalibrationRows], table: ChannelTable) -> Inte
     for grip, diameter in zip(grips, diameters, strict=True):
         # Leave out all grips of this cylinder: another one would only confirm this diameter.
         kept = np.flatnonzero(diameters != diameter).tolist()
-        if len(set(diameters[kept].tolist())) >= LEAST_LEFT:
+        if len(set(diameters[kept].tolist())) >= MIN_LEFT:
             rest = _fit_reduced([grips[i] for i in kept], [reduced[i] for i in kept], reduction)
             squares.append(float(((rest.predict(grip.mean_position) - diameter) ** 2).mean()))
     # Each recording counts once, which is too few for a quantile.
-    half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
+    half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), MIN_HALF_WIDTH * float(np.ptp(diameters)))
     low, high = float(diameters.min()), float(diameters.max())
     intervals = Intervals(np.zeros(0), np.array([half_width]))
     return IntervalRegressor(line, intervals, ValueRange(low, high), line.mean, np.zeros(0))
@@ -72,7 +72,7 @@ def _fit_reduced(grips: Sequence[CalibrationRows], frames: Sequence[FloatArray],
     diameters = np.array([grip.diameter_mm[0] for grip in grips])
     positions = np.array([grip_frames.mean(axis=0) for grip_frames in frames])
     moved = np.concatenate([grip_frames - position for grip_frames, position in zip(frames, positions, strict=True)])
-    moved = moved[:: 1 + len(moved) // _MOST_FRAMES]
+    moved = moved[:: 1 + len(moved) // _MAX_FRAMES]
     _, sizes, directions = np.linalg.svd(moved, full_matrices=False)
     n = max(min(_N_NUISANCE, int(np.count_nonzero(sizes)) - 1), 0)
     shrink = 1.0 - sizes[n] / sizes[:n]
@@ -89,7 +89,7 @@ def _fit_reduced(grips: Sequence[CalibrationRows], frames: Sequence[FloatArray],
     squares, modes = squares[clear], modes[:, clear]
     # One recording under several diameters differs by rounding alone, and would give an arbitrarily steep line.
     least = _ROUNDING * noise + float(np.finfo(np.float64).eps * (positions**2).sum())
-    true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
+    true = np.maximum(squares - noise, _MIN_FRACTION * squares) + least
     along = centred.T @ (modes @ (modes.T @ (diameters - diameters.mean()) / true))
     mean = np.mean([grip.position.mean(axis=0) for grip in grips], axis=0)
     return Ridge(mean, reduction @ whitened(along), float(diameters.mean()), 0.0)

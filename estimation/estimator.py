@@ -29,11 +29,11 @@ Quantity = Literal["torque", "diameter"]
 # Least and largest torque (n,) that each frame may have.
 Bounds: TypeAlias = tuple[FloatArray, FloatArray]
 # Two cells of the paper's bank.
-_LEAST_MARGIN_K_CM = 0.05
+_MIN_MARGIN_K_CM = 0.05
 # A diameter is constant within a recording: more frames add nothing and take long.
-_MOST_FOR_DIAMETER = 240
+_MAX_FOR_DIAMETER = 240
 # Fewer diameters do not determine a line and its error.
-LEAST_DIAMETERS, LEAST_LEFT = 3, 2
+MIN_DIAMETERS, MIN_LEFT = 3, 2
 NO_ERRORS: FloatArray = np.zeros((0, 1, 1))
 
 
@@ -64,7 +64,7 @@ def match_reasons(k_range: FloatArray, match: "BankMatch") -> tuple[str, ...]:
     if not len(k_range):
         return ()
     low, high = k_range.tolist()
-    margin = max(high - low, _LEAST_MARGIN_K_CM)
+    margin = max(high - low, _MIN_MARGIN_K_CM)
     if low - margin <= match.k <= high + margin:
         return ()
     return (
@@ -225,10 +225,10 @@ class Estimator(ABC):
         from shearloop.estimation.left_out import left_out_groups
 
         n = len(rows.age_s)
-        rows = rows.where(np.arange(0, n, 1 + n // _MOST_FOR_DIAMETER))
+        rows = rows.where(np.arange(0, n, 1 + n // _MAX_FOR_DIAMETER))
         # A new grip is another recording, not a later part of this one.
         recordings = left_out_groups(rows.recording)
-        left_out = [pair for pair in recordings if len(np.unique(rows.diameter_mm[pair[0]])) >= LEAST_LEFT]
+        left_out = [pair for pair in recordings if len(np.unique(rows.diameter_mm[pair[0]])) >= MIN_LEFT]
         regressor = fit_interval_regressor(
             rows.features[:, self.columns["diameter"]],
             rows.diameter_mm,

@@ -20,40 +20,40 @@ from shearloop.estimation.grip_strength import CalibratedStrength, GripStrength
 
 # One step of the board's converter, measured on recorded frames. Its rounding is the smallest noise.
 _CONVERTER_STEP_V = 0.00215
-LEAST_NOISE_V = float(_CONVERTER_STEP_V / np.sqrt(12.0))
+MIN_NOISE_V = float(_CONVERTER_STEP_V / np.sqrt(12.0))
 
 # Largest median relative deviation, after the common gain, of the calibrated fingertip.
 LARGEST_DEVIATION = 0.12
 # Added to voltages in denominators: a relative change of less is noise.
 SMALL_V = 0.01
 # Channels that are compared, and the least share of them.
-_WELL_ABOVE_NOISE_V, _LEAST_COMPARED_SHARE = 0.03, 0.25
-LARGEST_JUMPING_SHARE = 0.12
-LARGEST_UNUSABLE_SHARE = 0.25
+_WELL_ABOVE_NOISE_V, _MIN_COMPARED_FRACTION = 0.03, 0.25
+LARGEST_JUMPING_FRACTION = 0.12
+LARGEST_UNUSABLE_FRACTION = 0.25
 # A channel that moves between frames by more than both of these is disturbed.
 _JUMP_NOISES, _JUMP_V = 6.0, 0.008
 # A channel this far from its expected value, relative and after the common gain, has lost its electrode. Recorded
 # frames stay within 0.4, except single channels while the grip closes.
-_LOST_SHARE = 0.6
+_LOST_FRACTION = 0.6
 # Directions of motion while gripped or idle that the grip's discriminant ignores.
 _N_NUISANCE = 2
 # Recorded frames have at most two channels at their largest value. This many are at an amplifier's rail.
-_FEWEST_AT_RAIL = 9
+_MIN_AT_RAIL = 9
 # Closing and opening take this many frames and move further than twisting under load by this factor.
 STEP_FRAMES, _STEP_MARGIN = 4, 1.25
 # A grip scores above the idle frames by this many standard deviations, and by at least this share of the calibrated
 # grip. Idle frames of other sessions score at most 0.06, their grips at least 0.12 (docs/decisions/0042).
-_IDLE_DEVIATIONS, _LEAST_RISE = 3.0, 0.08
-_LEAST_IDLE, _LEAST_GRIPPED = 5, 20
+_IDLE_DEVIATIONS, _MIN_RISE = 3.0, 0.08
+_MIN_IDLE, _MIN_GRIPPED = 5, 20
 # The first frame of a session counts as idle unless it is clearly nearer to the gripped frame. Below the second
 # deviation it is from the calibration's own session, and its score decides.
 _CLEARLY_NEARER, _SAME_SESSION, _GRIPPED_SCORE = 0.8, 0.01, 0.5
 # A grip ends when its score falls below this share of its mean over this many frames.
-_LOOSE_SHARE, _LEVEL_FRAMES = 0.4, 60
+_LOOSE_FRACTION, _LEVEL_FRAMES = 0.4, 60
 # A channel that reads 0 in more of a part's frames is dead at calibration.
-_SILENT_SHARE = 0.05
+_SILENT_FRACTION = 0.05
 # The least noise of a relative change, as a share of the median of all channels.
-_LEAST_NOISE_SHARE = 0.3
+_MIN_NOISE_FRACTION = 0.3
 # The threshold's largest share of the way from idle to the weakest grip.
 _LARGEST_RISE = 1 / 3
 
@@ -160,7 +160,7 @@ class FingertipValidator:
 
 def too_few_frames(n_idle: int, n_gripped: int) -> str:
     """Return why the frames before a grip and in it are too few to define a grip; empty if they are enough."""
-    if n_idle >= _LEAST_IDLE and n_gripped >= _LEAST_GRIPPED:
+    if n_idle >= _MIN_IDLE and n_gripped >= _MIN_GRIPPED:
         return ""
     return (
         f"{n_idle} idle and {n_gripped} gripped frames are too few to detect a grip; start the recording some seconds "
@@ -184,7 +184,7 @@ def compare_frames(
     gains[~(gains > 0)] = np.nan
     deviations = np.abs(frame / gains.reshape(*known.shape[:-1], 1) - known) / known
     medians = _medians(deviations, counts)
-    medians[(counts < _LEAST_COMPARED_SHARE * known.shape[-1]) | np.isnan(medians)] = np.inf
+    medians[(counts < _MIN_COMPARED_FRACTION * known.shape[-1]) | np.isnan(medians)] = np.inf
     return gains, deviations, medians
 
 
@@ -208,7 +208,7 @@ class FingertipSet:
         return [
             f"{validator.side} fingertip: {100 * share:.0f} % of the channels are dead or saturated; check the ribbon "
             "cable and the gel's contact with the electrodes"
-            if share > LARGEST_UNUSABLE_SHARE
+            if share > LARGEST_UNUSABLE_FRACTION
             else ""
             for validator, share in zip(self.sides, unusable.tolist(), strict=True)
         ]
@@ -220,7 +220,7 @@ class FingertipSet:
         neither grip nor twist explains: a lost electrode or a crossed wire.
         """
         _, deviations, medians = compare_frames(frame, self._frames, usable[:, None])
-        lost = deviations > _LOST_SHARE
+        lost = deviations > _LOST_FRACTION
         reasons = [""] * len(self.sides) if usable.all() else self.too_few_channels(usable)
         for number, deviation in enumerate(medians.reshape(-1, 2).min(axis=1).tolist()):
             if not reasons[number] and deviation > LARGEST_DEVIATION:
@@ -239,7 +239,7 @@ class FingertipSet:
 
     def disturbance(self, jumping_shares: FloatArray) -> str:
         """Return why shares of jumping channels mean a disturbance."""
-        number = int(np.argmax(jumping_shares > LARGEST_JUMPING_SHARE))
+        number = int(np.argmax(jumping_shares > LARGEST_JUMPING_FRACTION))
         return (
             f"{self.sides[number].side} fingertip: {100 * jumping_shares[number]:.0f} % of the channels jumped since "
             "the last frame; the tool was gripped, released or knocked, or the board is disturbed"
@@ -281,7 +281,7 @@ class GripDetector:
                 self._floor = min(self._floor, max(score, 0.0))
                 if score - self._floor > threshold:
                     self._level, self._frames = score, 1
-        elif score < max(self._floor + 0.5 * threshold, _LOOSE_SHARE * self._level):
+        elif score < max(self._floor + 0.5 * threshold, _LOOSE_FRACTION * self._level):
             self._level, self._floor = None, max(score, 0.0)
         else:
             self._frames = min(self._frames + 1, _LEVEL_FRAMES)
@@ -304,7 +304,7 @@ def mask_unmeasured(channels: FloatArray, usable: BoolArray) -> BoolArray:
     usable = usable & (channels != 0.0)
     heights = np.where(usable, channels, -np.inf)
     largest = heights == heights.max(axis=-1, keepdims=True)
-    at_rail = largest & (np.count_nonzero(largest, axis=-1) >= _FEWEST_AT_RAIL)[:, None]
+    at_rail = largest & (np.count_nonzero(largest, axis=-1) >= _MIN_AT_RAIL)[:, None]
     return np.asarray(usable & ~at_rail)
 
 
@@ -315,7 +315,7 @@ def channel_noise(frames: FloatArray) -> FloatArray:
     """
     noise = np.sqrt((np.diff(frames, 2, axis=0) ** 2).mean(axis=0) / 6.0)
     still = np.ptp(frames, axis=0) == 0
-    return np.where(still, np.inf, np.maximum(noise, LEAST_NOISE_V))
+    return np.where(still, np.inf, np.maximum(noise, MIN_NOISE_V))
 
 
 def frame_steps(frames: FloatArray, noise: FloatArray) -> FloatArray:
@@ -337,7 +337,7 @@ def _noise_of(recordings: Sequence[GripParts]) -> FloatArray:
     silent = np.max(
         [(part == 0.0).mean(axis=0) for recording in recordings for part in (recording.idle, recording.gripped)], axis=0
     )
-    return np.where(silent > _SILENT_SHARE, np.inf, noise)
+    return np.where(silent > _SILENT_FRACTION, np.inf, noise)
 
 
 def _noise_of_changes(noise: FloatArray, base: FloatArray) -> FloatArray:
@@ -347,7 +347,7 @@ def _noise_of_changes(noise: FloatArray, base: FloatArray) -> FloatArray:
     """
     alive = np.isfinite(noise)
     scale = np.where(alive, noise, 1.0) / (base + SMALL_V)
-    least = _LEAST_NOISE_SHARE * float(np.median(scale))
+    least = _MIN_NOISE_FRACTION * float(np.median(scale))
     return np.where(alive, np.maximum(scale, least), np.inf)
 
 
@@ -373,7 +373,7 @@ def _grip_weights(changes: Sequence[GripParts], scale: FloatArray, rows: slice =
 def _grip_threshold(changes: Sequence[GripParts], weights: FloatArray) -> float:
     """Return the score above which a fingertip is gripped."""
     idle_scores = np.concatenate([change.idle @ weights for change in changes])
-    rise = max(_IDLE_DEVIATIONS * float(idle_scores.std()), _LEAST_RISE)
+    rise = max(_IDLE_DEVIATIONS * float(idle_scores.std()), _MIN_RISE)
     highest_idle = float(np.quantile(idle_scores, 0.99))
     weakest_grip = min(float(np.quantile(change.gripped @ weights, 0.01)) for change in changes)
     # Idle scores of different tools scatter further than the weakest grip of them.

@@ -16,7 +16,7 @@ from shearloop.estimation.bank_match import BankMatcher
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.channel_imputer import ChannelImputer
 from shearloop.estimation.estimator import (
-    LEAST_DIAMETERS,
+    MIN_DIAMETERS,
     CalibrationRows,
     Estimator,
     Material,
@@ -34,7 +34,7 @@ from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_b
 from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
-from shearloop.estimation.twists import LOADED_SHARE, first_twists, loaded_log_gain
+from shearloop.estimation.twists import LOADED_FRACTION, first_twists, loaded_log_gain
 from shearloop.estimation.values import FrameSeries, GripState, Measured, check_finite, distinct
 from shearloop.words import counted
 
@@ -161,7 +161,7 @@ def _fit_outputs(
     # By age within the recordings, so that every part has all tools.
     order = np.argsort(rows.age_s, kind="stable")
     known = rows.where(order[np.isfinite(rows.diameter_mm[order])])
-    enough = len(np.unique(known.diameter_mm)) >= LEAST_DIAMETERS
+    enough = len(np.unique(known.diameter_mm)) >= MIN_DIAMETERS
     diameter = estimator.fit_diameter(known) if enough else None
     law = None
     if len(tools := _tools_of(recordings)) > 1:
@@ -194,7 +194,7 @@ def _fit_tools(
     tools, recording = np.unique(rows.recording, return_inverse=True)
     diameters_mm = diameters_mm[tools]
     for of_recording in (recording == number for number in range(len(tools))):
-        if torque_nm[of_recording].min() < -LOADED_SHARE * torque_nm[of_recording].max():
+        if torque_nm[of_recording].min() < -LOADED_FRACTION * torque_nm[of_recording].max():
             return None
         torque_nm[of_recording] -= np.quantile(torque_nm[of_recording], _RELEASED)
 

@@ -5,7 +5,7 @@ from collections import deque
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.estimation.fingertip_validator import LARGEST_JUMPING_SHARE, FingertipSet, mask_unmeasured
+from shearloop.estimation.fingertip_validator import LARGEST_JUMPING_FRACTION, FingertipSet, mask_unmeasured
 from shearloop.estimation.grip_memory import Motion
 from shearloop.estimation.values import TactileFrame
 
@@ -13,7 +13,7 @@ from shearloop.estimation.values import TactileFrame
 _LARGEST_GAP_S = 1.4
 # The median of this many steps is the period, if the configured one is not shorter. A step longer than the first share
 # of the period has one frame missing, a step longer than the second has more.
-_STEPS, _MISSING_SHARE, _LARGEST_GAP_SHARE = 9, 1.5, 2.5
+_STEPS, _MISSING_FRACTION, _LARGEST_GAP_FRACTION = 9, 1.5, 2.5
 
 
 class FrameTimer:
@@ -35,7 +35,7 @@ class FrameTimer:
         if 0 < step_s <= _LARGEST_GAP_S:
             self._steps_s.append(step_s)
         self.gap = ""
-        if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_SHARE * period_s):
+        if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_FRACTION * period_s):
             if np.isfinite(step_s):
                 happened = (
                     f"no frame came for {step_s:.1f} s (a loose cable or a busy computer)"
@@ -44,7 +44,7 @@ class FrameTimer:
                 )
                 self.gap = f"{happened}, and the gel's motion in between is not known"
             return None
-        return int(step_s > _MISSING_SHARE * period_s)
+        return int(step_s > _MISSING_FRACTION * period_s)
 
 
 class ChannelChecks:
@@ -101,7 +101,7 @@ class ChannelChecks:
         confirmed = False
         if self._disturbed is not None:
             shares = self._fingertips.jumping_shares(channels, self._disturbed, self._fingertips.alive)
-            confirmed = bool((shares <= LARGEST_JUMPING_SHARE).all())
+            confirmed = bool((shares <= LARGEST_JUMPING_FRACTION).all())
         if confirmed:
             self._disturbed, self.before = None, channels
         else:

@@ -32,8 +32,8 @@ FIRST_SPREAD, _PRIOR_GRIPS = 0.2, 1
 # The same for a tool that was not calibrated, against the law over the diameter: a factor of 4 either way.
 TOOL_SPREAD = 0.7
 # The minimum spread of a recording's twists: a few equal ones are chance.
-_LEAST_WITHIN = 0.05
-_LEAST_NOISE, _LEAST_ZERO, _LEAST_CHANGE = 1e-3, 1e-6, 1e-3
+_MIN_WITHIN = 0.05
+_MIN_NOISE, _MIN_ZERO, _MIN_CHANGE = 1e-3, 1e-6, 1e-3
 # The gain drifts while the gel settles, so successive twists deviate alike from the later ones, by this share of the
 # variance; more twists do not average it away.
 _ALIKE = 0.8
@@ -43,9 +43,9 @@ _BY_CHANCE = 2.0
 # Furthest diameter beyond the calibrated ones, as a ratio.
 _REACH = 1.5
 # A correction that leaves more than this fraction of the spread carries no information.
-_MOST_LEFT = 0.95
+_MAX_LEFT = 0.95
 # Damping of the first step, the maximum of steps, and the square of a step, in standard errors, that changes nothing.
-_FIRST_DAMPING, _MOST_STEPS, _SETTLED = 1e-3, 200, 1e-12
+_FIRST_DAMPING, _MAX_STEPS, _SETTLED = 1e-3, 200, 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class GainSpread:
     """
 
     between: float = 0.0
-    within: float = _LEAST_WITHIN
+    within: float = _MIN_WITHIN
     noise_nm: float = 0.0
     recordings: int = _PRIOR_RECORDINGS
     zero: float = 0.0
@@ -88,7 +88,7 @@ class GainSpread:
         found = [_GripGains.of(predicted[rows], truth[rows], is_first[rows]) for rows in rows_of_grips]
         errors_nm = [error_nm for grip in found for error_nm in grip.errors_nm]
         noise_nm = float(np.sqrt(np.mean(np.concatenate(errors_nm) ** 2))) if errors_nm else 0.0
-        least_noise_nm = _LEAST_NOISE * float(np.abs(truth).max(initial=0.0))
+        least_noise_nm = _MIN_NOISE * float(np.abs(truth).max(initial=0.0))
         # A tool's own gain is not a difference between twists, so each grip counts from its own mean.
         compared = [grip for grip in found if grip.later]
         freedom = sum(len(grip.later) - 1 for grip in compared)
@@ -101,7 +101,7 @@ class GainSpread:
         spreads = _UNREPEATED_SPREADS if 0 < n_twists < _REPEATING_TWISTS else PRIOR_SPREADS
         prior = cls(
             spreads[fingertips],
-            max(within, _LEAST_WITHIN),
+            max(within, _MIN_WITHIN),
             max(noise_nm, least_noise_nm),
             first=first,
             first_spread=_pooled(first_prior, _PRIOR_RECORDINGS, [(deviation - first) ** 2 for deviation in firsts]),
@@ -237,7 +237,7 @@ class GainSpread:
         weight = math.sqrt(len(twists) / max(len(unloaded), 1)) / self.noise_nm
         m = parts.shape[1]
         load_nm = float(np.sqrt((truth[loaded] ** 2).mean()))
-        of_offset_nm = max(self.zero, _LEAST_ZERO) * load_nm
+        of_offset_nm = max(self.zero, _MIN_ZERO) * load_nm
         return _Equations(
             of_parts=whiten @ (deviation * of_parts),
             of_offset=whiten @ np.array([torque.sum() for torque in along]),
@@ -305,7 +305,7 @@ class _Deviation:
     @property
     def beyond_chance(self) -> float:
         """The standard deviation of the gain from grip to grip that these twists show beyond chance."""
-        return max(math.sqrt(max(self.log_gain**2 - _BY_CHANCE * self.variance, 0.0)), _LEAST_CHANGE)
+        return max(math.sqrt(max(self.log_gain**2 - _BY_CHANCE * self.variance, 0.0)), _MIN_CHANGE)
 
     @property
     def unchanged(self) -> float:
@@ -354,7 +354,7 @@ class _Equations:
         """Raise CalibrationError where twists leave the sum of the loaded parts (n, m) as uncertain as the prior."""
         x = self.solve()
         before = _relative_error(np.diag(self.prior**2), loaded, x)
-        if _relative_error(self.covariance(x), loaded, x) > _MOST_LEFT * before:
+        if _relative_error(self.covariance(x), loaded, x) > _MAX_LEFT * before:
             raise CalibrationError(
                 "these twists leave the gain as uncertain as it was: twists of the calibration differ too much, or "
                 "these are too small; twist further, and several times"
@@ -400,7 +400,7 @@ class GainCorrection:
     @property
     def is_unchanged(self) -> bool:
         """Whether the factors stay at 1, because the twists' deviation may be chance."""
-        return bool(np.abs(np.log(self.factors)).max() < _LEAST_CHANGE)
+        return bool(np.abs(np.log(self.factors)).max() < _MIN_CHANGE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -467,7 +467,7 @@ def _least_squares(
     """
     x, damping = start, _FIRST_DAMPING
     left = residuals(x)
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         slope = slopes(x)
         information, gradient = slope.T @ slope, slope.T @ left
         step = -np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)

@@ -13,7 +13,7 @@ from shearloop.words import counted
 # Frames (half a minute) in the mean difference of a grip: twists come and go within it.
 _HELD_FRAMES = 60
 # Most frames in a row that are interpolated, and most of those remembered, as a share.
-_LARGEST_BRIDGED, _LARGEST_BRIDGED_SHARE = 3, 0.25
+_LARGEST_BRIDGED, _LARGEST_BRIDGED_FRACTION = 3, 0.25
 
 
 class Motion:
@@ -97,7 +97,7 @@ class GripMemory:
         self._bridged.append(False)
         if len(self.positions) < self._motion.n_needed:
             return self.waits()
-        if sum(self._bridged) > max(_LARGEST_BRIDGED, _LARGEST_BRIDGED_SHARE * (len(self.positions) - 1)):
+        if sum(self._bridged) > max(_LARGEST_BRIDGED, _LARGEST_BRIDGED_FRACTION * (len(self.positions) - 1)):
             return "too many of the last frames were disturbed or are missing"
         self.held_frames = min(self.held_frames + 1, _HELD_FRAMES)
         self.mean_difference = self.mean_difference + (difference - self.mean_difference) / self.held_frames

@@ -16,18 +16,18 @@ from shearloop.estimation.fingertip_validator import STEP_FRAMES, channel_noise,
 from shearloop.estimation.values import FrameSeries
 
 # Torques above this share of the largest one count as a load.
-_LOADED_SHARE = 0.1
+_LOADED_FRACTION = 0.1
 # A large step exceeds the steps of twisting under load by this factor.
 _LARGE_STEP = 1.4
 # Frames below this share of the way from idle to loaded, in this running median, are idle. Gripped and not twisted they
 # are at 0.57 and more, in recovery from a touch or a release at 0.41 and less.
-_IDLE_SHARE, _MEDIAN_FRAMES = 0.45, 5
+_IDLE_FRACTION, _MEDIAN_FRAMES = 0.45, 5
 # Fewer loaded frames have no second differences to show the noise.
-_LEAST_LOADED = 3
+_MIN_LOADED = 3
 # Fewer frames after a step are still its transient.
-_LEAST_RELEASED = 10
+_MIN_RELEASED = 10
 # The minimum of idle frames of a release: the shortest pause in which the fingers open and close.
-_LEAST_OPEN = 5
+_MIN_OPEN = 5
 
 
 class Grip(NamedTuple):
@@ -61,12 +61,12 @@ def find_grips(series: FrameSeries) -> list[Grip]:
         others = f", and left out: {'; '.join(series.left_out)}" if series.left_out else ""
         raise CalibrationError(f"no torque is known for these frames{others}; record the load cell with them")
     torque = np.abs(np.nan_to_num(known))
-    is_loaded = torque > _LOADED_SHARE * torque.max(initial=np.finfo(np.float64).tiny)
+    is_loaded = torque > _LOADED_FRACTION * torque.max(initial=np.finfo(np.float64).tiny)
     loaded = np.flatnonzero(is_loaded)
     if len(loaded) == 0:
         raise CalibrationError("the torque is 0 at all of these frames; record twists that the load cell measures")
     n_loaded = int(loaded[-1] - loaded[0]) + 1
-    if n_loaded < _LEAST_LOADED:
+    if n_loaded < _MIN_LOADED:
         raise CalibrationError(
             f"from the first torque to the last there are {n_loaded} frames, too few to detect a grip; "
             "record several twists"
@@ -74,7 +74,7 @@ def find_grips(series: FrameSeries) -> list[Grip]:
     edges = [0, *_find_openings(series.channels, is_loaded), len(known)]
     parts = [slice(start, stop) for start, stop in itertools.pairwise(edges)]
     # A recording may end as its last grip begins.
-    held = [part for part in parts if np.ptp(np.flatnonzero(is_loaded[part])) >= _LEAST_LOADED - 1]
+    held = [part for part in parts if np.ptp(np.flatnonzero(is_loaded[part])) >= _MIN_LOADED - 1]
     is_known = np.isfinite(known)
     return [_segment_one(series.channels, is_loaded, is_known, part) for part in held or [slice(0, len(known))]]
 
@@ -100,7 +100,7 @@ def _segment_one(channels: FloatArray, is_loaded: BoolArray, is_known: BoolArray
     idle_end = int(before[0]) - 1 if len(before) else _idle_end_without_step(channels, span)
     let_go = 0
     for layer in range(channels.shape[1]):
-        like_idle = _way_to_loaded(channels[:, layer], slice(0, idle_end), span) < _IDLE_SHARE
+        like_idle = _way_to_loaded(channels[:, layer], slice(0, idle_end), span) < _IDLE_FRACTION
         earlier, later = np.flatnonzero(like_idle[: loaded[0]]), np.flatnonzero(like_idle[loaded[-1] :])
         let_go = max(let_go, int(np.flatnonzero(~like_idle)[-1]) + _MEDIAN_FRAMES // 2)
         if len(earlier):
@@ -109,7 +109,7 @@ def _segment_one(channels: FloatArray, is_loaded: BoolArray, is_known: BoolArray
             end = min(end, int(loaded[-1] + later[0]) - _MEDIAN_FRAMES // 2)
     end = min(end, int(np.flatnonzero(is_known[part])[-1]) + 1)
     released = int(after[-1]) + 1 if len(after) else let_go
-    if n - released < _LEAST_RELEASED:
+    if n - released < _MIN_RELEASED:
         released = n
     at = part.start
     return Grip(slice(at, at + idle_end), slice(at + begin, at + end), slice(at + released, at + n))
@@ -124,9 +124,9 @@ def _find_openings(channels: FloatArray, is_loaded: BoolArray) -> list[int]:
     """
     loaded = np.flatnonzero(is_loaded)
     span = slice(int(loaded[0]), int(loaded[-1]) + 1)
-    first = slice(0, min(_LEAST_RELEASED, span.start // 2))
+    first = slice(0, min(_MIN_RELEASED, span.start // 2))
     ways = np.array([_way_to_loaded(channels[:, layer], first, span) for layer in range(channels.shape[1])])
-    is_idle: BoolArray = np.all(ways < _IDLE_SHARE, axis=0)
+    is_idle: BoolArray = np.all(ways < _IDLE_FRACTION, axis=0)
     way, half = ways.mean(axis=0), STEP_FRAMES // 2
     # By how much each frame's surroundings move along the way.
     padded = np.pad(way, half, mode="edge")
@@ -138,11 +138,11 @@ def _find_openings(channels: FloatArray, is_loaded: BoolArray) -> list[int]:
     sudden = _LARGE_STEP * float(np.quantile(held, 0.99))
     return [
         # The next grip is compared with its own idle frames, so it gets enough of them.
-        max(start, min((start + stop) // 2, stop - _LEAST_RELEASED))
+        max(start, min((start + stop) // 2, stop - _MIN_RELEASED))
         for start, stop in _runs(is_idle)
         if span.start < start
         and stop < span.stop
-        and stop - start >= _LEAST_OPEN
+        and stop - start >= _MIN_OPEN
         and min(moved[start], moved[stop]) > sudden
         and not is_loaded[start:stop].any()
         and not (is_loaded[start - 1] and is_loaded[stop])
@@ -160,9 +160,9 @@ def _idle_end_without_step(frames: FloatArray, loaded: slice) -> int:
 
     0 where frames between the twists are like the first ones too: then the recording began gripped.
     """
-    first = slice(0, min(_LEAST_RELEASED, loaded.start // 2))
+    first = slice(0, min(_MIN_RELEASED, loaded.start // 2))
     ways = [_way_to_loaded(frames[:, layer], first, loaded) for layer in range(frames.shape[1])]
-    like = np.all([way < _IDLE_SHARE for way in ways], axis=0)
+    like = np.all([way < _IDLE_FRACTION for way in ways], axis=0)
     if like[: loaded.start].all() or like[loaded].any():
         return 0
     return max(int(np.argmin(like)) - _MEDIAN_FRAMES // 2, 0)

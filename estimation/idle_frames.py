@@ -9,7 +9,7 @@ from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.fingertip_validator import FingertipSet
 
 # A baseline of fewer frames accepts only grips of at least half the calibrated strength.
-_LEAST_IDLE, _OUTRIGHT = 5, 0.5
+_MIN_IDLE, _OUTRIGHT = 5, 0.5
 
 
 class IdleFrames:
@@ -28,7 +28,7 @@ class IdleFrames:
         self._followed = False
         self._wanted = wanted
         self._tare_frames: list[FloatArray] = []
-        self._least = min(_LEAST_IDLE, wanted or _LEAST_IDLE)
+        self._least = min(_MIN_IDLE, wanted or _MIN_IDLE)
 
     @property
     def begun(self) -> bool:

@@ -9,19 +9,19 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.gain import GainSpread
 from shearloop.estimation.interval_regressor import IntervalRegressor, Regressor, reported_values
-from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, ValueRange, student_inflation
+from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals, ValueRange, student_inflation
 from shearloop.estimation.left_out import LeftOut, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.ridge import STRENGTHS, CensoredRidge, Predictor
-from shearloop.estimation.twists import LOADED_SHARE, find_twists, first_twists, loaded_log_gain, log_gain
+from shearloop.estimation.twists import LOADED_FRACTION, find_twists, first_twists, loaded_log_gain, log_gain
 from shearloop.words import counted
 
 # The future differs from the past more than one part of a recording from the next.
 INFLATION = 1.05
-LEAST_FRAMES = 8
+MIN_FRAMES = 8
 # This share of the loads must lie within their intervals.
-_LEAST_COVERED = 0.75
+_MIN_COVERED = 0.75
 # Twists in each half of a grip that shows how the gain drifts: fewer do not determine a fit of the motion.
-_LEAST_IN_HALF = 3
+_MIN_IN_HALF = 3
 
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
@@ -29,7 +29,7 @@ Refit: TypeAlias = Callable[[IntArray], Regressor]
 
 def check_values(values: FloatArray) -> None:
     """Raise CalibrationError for (n,) values that are few, or all alike."""
-    if len(values) < LEAST_FRAMES or np.ptp(values) == 0:
+    if len(values) < MIN_FRAMES or np.ptp(values) == 0:
         raise CalibrationError(
             f"{counted(len(values), 'frame')} with values between {np.min(values, initial=np.inf):.3g} and "
             f"{np.max(values, initial=-np.inf):.3g} cannot determine a calibration; record more, at different loads"
@@ -75,7 +75,7 @@ def fit_interval_regressor(
     of_loads = _inflation_of_twists(values, twists) if twists else None
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
-    least = LEAST_HALF_WIDTH * float(np.ptp(values))
+    least = MIN_HALF_WIDTH * float(np.ptp(values))
     intervals, widening = Intervals.fit(predicted, residuals, edges, inflation, least, of_loads), 1.0
     # Before widening for unknown times: a load that is not seen is not seen at any time.
     half = np.array([intervals.half_width(prediction) for prediction in predicted])
@@ -113,7 +113,7 @@ def _inflation_of_twists(values: FloatArray, twists: LeftOut) -> float:
 def _gains_of_grips(features: FloatArray, values: FloatArray, grips: IntArray, refit: Refit) -> list[float]:
     """Return the logarithm of the gain of each grip that the others can predict."""
     gains: list[float] = []
-    least = LOADED_SHARE * float(np.abs(values).max())
+    least = LOADED_FRACTION * float(np.abs(values).max())
     for kept, out in left_out_groups(grips):
         if len(kept) and np.ptp(values[kept]) > 0 and np.abs(values[out]).max() > least:
             part = refit(kept)
@@ -143,7 +143,7 @@ def _halves(rows: IntArray, twists: Sequence[IntArray]) -> Iterator[tuple[IntArr
     """Yield the loaded rows and all rows of each half of a grip's twists; an odd number is cut both ways."""
     n = len(twists)
     for middle in sorted({n // 2, (n + 1) // 2}):
-        if min(middle, n - middle) < _LEAST_IN_HALF:
+        if min(middle, n - middle) < _MIN_IN_HALF:
             continue
         first_of_second = (twists[middle - 1][-1] + twists[middle][0] + 1) // 2
         yield np.concatenate(twists[:middle]), rows[rows < first_of_second]
@@ -172,8 +172,8 @@ def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:
     Most frames of a stream are free of load. Their small residuals say nothing of a load that an estimator misses, so
     loads are a stratum of their own, by their truth (label-conditional, Vovk 2012).
     """
-    loaded = np.abs(truth) > LOADED_SHARE * float(np.abs(truth).max())
-    return bool(loaded.any() and not loaded.all() and inside[loaded].mean() < _LEAST_COVERED)
+    loaded = np.abs(truth) > LOADED_FRACTION * float(np.abs(truth).max())
+    return bool(loaded.any() and not loaded.all() and inside[loaded].mean() < _MIN_COVERED)
 
 
 def best_strength(

@@ -17,7 +17,7 @@ from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.gain import GainCorrection, GainSpread
 from shearloop.estimation.intervals import Intervals, ValueRange
 from shearloop.estimation.ridge import CensoredRidge, Predictor, Ridge
-from shearloop.estimation.twists import LOADED_SHARE, find_twists
+from shearloop.estimation.twists import LOADED_FRACTION, find_twists
 from shearloop.estimation.values import INLINE
 
 Regressor: TypeAlias = Ridge | CensoredRidge
@@ -88,7 +88,7 @@ class IntervalRegressor:
         CalibrationError without a load that is large enough to show the gain.
         """
         point = self.point
-        least_nm = LOADED_SHARE * max(abs(self.range.low), abs(self.range.high))
+        least_nm = LOADED_FRACTION * max(abs(self.range.low), abs(self.range.high))
         twists = [twist for twist in find_twists(torque_nm) if np.abs(torque_nm[twist]).max() >= least_nm]
         if not twists:
             raise CalibrationError(

@@ -15,10 +15,10 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
 
-LEAST_IN_STRATUM = 20
-_LEAST_RESIDUALS = 5
+MIN_IN_STRATUM = 20
+_MIN_RESIDUALS = 5
 # Narrowest interval as a share of the calibrated range: load cells are noisy too.
-LEAST_HALF_WIDTH = 1e-3
+MIN_HALF_WIDTH = 1e-3
 # Values further beyond the calibrated range, in spans of it, are refused as extrapolation.
 _LARGEST_BEYOND = 0.35
 
@@ -45,7 +45,7 @@ class Intervals:
         The uppermost stratum has an inflation of its own where it is given: loads are fewer.
         Raises CalibrationError for too few residuals.
         """
-        if len(residuals) < _LEAST_RESIDUALS:
+        if len(residuals) < _MIN_RESIDUALS:
             raise CalibrationError(
                 f"too few frames left out of the fit to determine the error: {len(residuals)}; record more repeats"
             )
@@ -54,7 +54,7 @@ class Intervals:
             low = kept[-1] if kept else -np.inf
             inside = np.count_nonzero((predicted > low) & (predicted <= edge))
             above = np.count_nonzero(predicted > edge)
-            if inside >= LEAST_IN_STRATUM and above >= LEAST_IN_STRATUM:
+            if inside >= MIN_IN_STRATUM and above >= MIN_IN_STRATUM:
                 kept.append(float(edge))
         stratum = np.searchsorted(kept, predicted)
         widths = [_conformal_quantile(np.abs(residuals[stratum == i])) for i in range(len(kept) + 1)]
@@ -74,7 +74,7 @@ def student_inflation(n: int) -> float:
 def _conformal_quantile(absolute: FloatArray) -> float:
     """Return the conformal quantile; of few residuals the Gaussian one, because their largest says too little."""
     n = len(absolute)
-    if n < 2 * LEAST_IN_STRATUM:
+    if n < 2 * MIN_IN_STRATUM:
         return TWO_SIDED_95 * float(np.sqrt((absolute**2).mean()))
     return float(np.quantile(absolute, min(LEVEL * (n + 1) / n, 1.0), method="higher"))
 

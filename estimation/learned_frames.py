@@ -11,7 +11,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 
 # Digests that a calibration keeps: 512 KB, the frames of two fingertips for five hours. Of more frames the least
 # digests stay, which are a sample by chance, so that a recording that is used again is still found.
-MOST_DIGESTS = 1 << 16
+MAX_DIGESTS = 1 << 16
 _DIGEST_BYTES = 8
 
 
@@ -33,12 +33,12 @@ class LearnedFrames:
     def with_frames(self, frames: Iterable[FloatArray]) -> Self:
         """Return these frames and the frames of further series of channels."""
         every = [self.digests, *(frame_digests(channels).ravel() for channels in frames)]
-        return type(self)(np.unique(np.concatenate(every))[:MOST_DIGESTS], self.complete)
+        return type(self)(np.unique(np.concatenate(every))[:MAX_DIGESTS], self.complete)
 
     @property
     def is_sample(self) -> bool:
         """Whether more frames were learned from than are kept: then fewer are found than were used."""
-        return len(self.digests) == MOST_DIGESTS
+        return len(self.digests) == MAX_DIGESTS
 
     def include(self, channels: FloatArray) -> BoolArray:
         """Return which of n frames (n, m, c) are among these, by the signals of one fingertip or more."""

@@ -11,7 +11,7 @@ from shearloop.bank.arrays import IntArray
 LeftOut: TypeAlias = Sequence[tuple[IntArray, IntArray]]
 
 N_BLOCKS = 5
-FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
+FIRST_ORIGIN, N_ORIGINS, MIN_BEFORE_ORIGIN = 0.6, 20, 12
 
 
 def left_out_groups(numbers: IntArray) -> list[tuple[IntArray, IntArray]]:
@@ -30,7 +30,7 @@ def later_origins(n: int) -> list[tuple[IntArray, IntArray]]:
     The list is empty where the first part has too few rows to represent this calibration.
     """
     first = round(FIRST_ORIGIN * n)
-    if first < LEAST_BEFORE_ORIGIN:
+    if first < MIN_BEFORE_ORIGIN:
         return []
     return [(np.arange(cut), np.arange(cut, n)) for cut in range(first, n - 1, max(1, n // N_ORIGINS))]
 

@@ -33,7 +33,7 @@ _STRENGTH = 1e-3
 _LARGEST_MOVE = 4.0
 # The peak must explain this share, and this factor more than any shift this far away. A minute with a single twist
 # (`glitch_20241202_173837`) has a chance peak of 0.06 at five seconds.
-_LEAST_EXPLAINED, _PROMINENCE, _APART_S = 0.1, 1.5, 1.1
+_MIN_EXPLAINED, _PROMINENCE, _APART_S = 0.1, 1.5, 1.1
 # With fewer gripped frames than the first nothing is refused. From the second on a peak this high gives a warning: of
 # 1128 stretches of 50 to 59 frames of recordings with correct times one has such a peak elsewhere.
 _SURE_FRAMES, _WARN_FRAMES, _WARN_EXPLAINED = 10 * _N_DIRECTIONS, 50, 0.45
@@ -54,7 +54,7 @@ _BUFFERED_S = 3.0
 # A larger standard error leaves the times open within its 95 % interval; recorded twists have 0.02 to 0.06 s.
 _LARGE_ERROR_S = 0.1
 # Readings per stretch for the load cell's noise, and the least number of stretches.
-_NOISE_READINGS, _LEAST_QUIET = 64, 4
+_NOISE_READINGS, _MIN_QUIET = 64, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +209,7 @@ def is_filtered(torque_nm: FloatArray) -> bool | None:
     stretches = stretches - stretches.mean(axis=1, keepdims=True)
     power = (stretches**2).mean(axis=1)
     quietest = np.argsort(power)[np.count_nonzero(power == 0) :][: np.count_nonzero(power) // 4]
-    if len(quietest) < _LEAST_QUIET:
+    if len(quietest) < _MIN_QUIET:
         return None
     quiet = stretches[quietest]
     next_one, one_after = (
@@ -227,7 +227,7 @@ def _delay_of_side(series: FrameSeries, part: slice, layer: int) -> LoadDelay | 
     explained = _explained(total.sum(axis=0), rest.sum(axis=0))
     best = int(np.argmax(explained))
     others = explained[np.abs(_SHIFTS_S - _SHIFTS_S[best]) > _APART_S]
-    if not explained[best] >= max(_LEAST_EXPLAINED, _PROMINENCE * float(others.max())):
+    if not explained[best] >= max(_MIN_EXPLAINED, _PROMINENCE * float(others.max())):
         return None
     near = np.abs(_SHIFTS_S - _SHIFTS_S[best]) <= _APART_S / 2
     shifts_s = _SHIFTS_S[near]

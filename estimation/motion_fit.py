@@ -25,12 +25,12 @@ from shearloop.estimation.twists import find_twists
 # Ends of the steps of the memory in frames back: 18 frames are 10 s, and the gel creeps for some seconds.
 MEMORY_EDGES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 16, 19)
 # Directions per fingertip, steps of the memory (12 and 18 frames), and penalties to choose from.
-MOST_DIRECTIONS = 3
+MAX_DIRECTIONS = 3
 _DIRECTIONS, _STEPS, _PENALTIES = (1, 2, 3), (10, 12), (1e-5, 1e-4)
 # Where the gel holds its position, that position shows a long twist, and the shortest memory serves.
 _STEPS_WITH_POSITION = (8,)
 # Minimum number of twists that are left out one by one, and maximum number of parts; more twists are grouped.
-_LEAST_TWISTS, _MOST_PARTS = 3, 10
+_MIN_TWISTS, _MAX_PARTS = 3, 10
 # Below this fraction of loaded frames, the frames left out hold few twists.
 _RARE_LOAD, _FRAMES_OF_FEW_TWISTS = 0.5, 2
 # Fits (n, d) features to (n,) values with a penalty.
@@ -59,7 +59,7 @@ _NEARLY_AS_GOOD, _SURE_SLOPES = (1.0, 1.25, 1.5), (0.0, 0.15, math.inf)
 class Layout:
     """What the columns of the features of motion are: steps of the memory × sides × directions, then positions.
 
-    The directions are MOST_DIRECTIONS of each window, one window after the other.
+    The directions are MAX_DIRECTIONS of each window, one window after the other.
     """
 
     n_steps: int
@@ -69,14 +69,14 @@ class Layout:
     @property
     def n_windows(self) -> int:
         """The number of windows that directions come from."""
-        return max(self.n_directions // MOST_DIRECTIONS, 1)
+        return max(self.n_directions // MAX_DIRECTIONS, 1)
 
     def columns(self, n_steps: int, n_directions: int, window: int = 0, *, position: bool) -> BoolArray:
         """Return which columns (d,) belong to the nearest steps and a window's first directions.
 
         With `position` the positions along these directions belong to them too.
         """
-        first = window * MOST_DIRECTIONS
+        first = window * MAX_DIRECTIONS
         number = np.arange(self.n_directions)
         used = (number >= first) & (number < first + n_directions)
         moved = np.broadcast_to(used, (self.n_steps, self.n_sides, self.n_directions)).copy()
@@ -121,7 +121,7 @@ class MotionFit:
     @property
     def first_direction(self) -> int:
         """The number of the first direction of the candidates' window."""
-        return self.candidates[0].window * MOST_DIRECTIONS
+        return self.candidates[0].window * MAX_DIRECTIONS
 
     @property
     def columns(self) -> BoolArray:
@@ -169,10 +169,10 @@ def twists_left_out(torque_nm: FloatArray) -> LeftOut:
     leave nothing to learn from. The list is empty for a load that hardly ever ends.
     """
     n, twists = len(torque_nm), find_twists(torque_nm)
-    if len(twists) >= _LEAST_TWISTS:
+    if len(twists) >= _MIN_TWISTS:
         ends = [(before[-1] + after[0] + 1) // 2 for before, after in itertools.pairwise(twists)]
         number = np.searchsorted(ends, np.arange(n), side="right")
-        return left_out_groups(number * min(len(twists), _MOST_PARTS) // len(twists))
+        return left_out_groups(number * min(len(twists), _MAX_PARTS) // len(twists))
     if sum(map(len, twists)) > _RARE_LOAD * n:
         return []
     return left_out_groups(np.arange(n) // _FRAMES_OF_FEW_TWISTS)
@@ -194,7 +194,7 @@ def choose_motion(
     twists = find_twists(torque_nm)
     loaded = np.concatenate(twists)
     # A single twist does not show which fit another one needs: one direction is the safest.
-    can_choose = len(twists) >= _LEAST_TWISTS or len(loaded) > _RARE_LOAD * len(torque_nm)
+    can_choose = len(twists) >= _MIN_TWISTS or len(loaded) > _RARE_LOAD * len(torque_nm)
     directions = _DIRECTIONS if can_choose else (1,)
     steps = _STEPS_WITH_POSITION if position else _STEPS
     windows = range(layout.n_windows if can_choose else 1)
@@ -280,5 +280,5 @@ def _shrinkage(predicted: FloatArray, truth: FloatArray, sure: float) -> float:
 def main_directions(parts: Sequence[FloatArray], noise: FloatArray, frames: int) -> FloatArray:
     """Return the main directions (p, c), in units of noise (c,), of the motion over `frames` in each part (n, c)."""
     moved = np.vstack([(part[frames:] - part[:-frames]) / noise for part in parts])
-    rows = np.linalg.svd(moved, full_matrices=False)[2][:MOST_DIRECTIONS] / noise
+    rows = np.linalg.svd(moved, full_matrices=False)[2][:MAX_DIRECTIONS] / noise
     return np.asarray(rows * np.sign(rows.sum(axis=1, keepdims=True)))

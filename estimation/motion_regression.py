@@ -20,7 +20,7 @@ from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.grip_memory import Motion
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
-from shearloop.estimation.twists import LOADED_SHARE
+from shearloop.estimation.twists import LOADED_FRACTION
 
 if TYPE_CHECKING:
     from shearloop.estimation.motion_fit import MotionFit
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 _DIRECTION_FRAMES, _NESTED_DIRECTION_FRAMES = (8,), (8, 6, 12)
 # An estimate needs this many frames of the grip before its own, 6.5 s. An older part of the memory counts as the oldest
 # of them, so that the memory costs no twist.
-_LEAST_LAGS = 12
+_MIN_LAGS = 12
 # A longer memory in a file would fill the session's own.
-_MOST_LAGS = 1000
+_MAX_LAGS = 1000
 # Positions drift between recordings, motion does not. So the position must lower motion's squared error on frames left
 # out to the second share where motion leaves more than the first of the torque's variance, else to the third. On
 # recorded fingertips, which were twisted one way, the share is 0.54 to 18, on emulated ones 0.01 to 0.4.
@@ -81,7 +81,7 @@ class TemporalFeatures(Motion):
     @property
     def n_needed(self) -> int:
         """How many positions of a grip an estimate needs."""
-        return min(self.n_lags, _LEAST_LAGS) + 1
+        return min(self.n_lags, _MIN_LAGS) + 1
 
     def reduced(self, to: "MotionFit") -> Self:
         """Return the features that a fit uses."""
@@ -129,7 +129,7 @@ def _reads_position(alone: "MotionFit", with_position: "MotionFit", torque_nm: F
     share = _POSITION_GAINS if leaves_much else _POSITION_GAINS_MUCH
     if with_position.squared_error < share * alone.squared_error:
         return True
-    loaded_nm = LOADED_SHARE * float(np.abs(torque_nm).max())
+    loaded_nm = LOADED_FRACTION * float(np.abs(torque_nm).max())
     both_ways = bool(torque_nm.min() < -loaded_nm and torque_nm.max() > loaded_nm)
     return both_ways and with_position.squared_error < _POSITION_MAY_LEAVE * variance
 
@@ -174,14 +174,8 @@ class MotionRegression(Estimator):
         if quantity == "diameter":
             return m * c
         edges = self.temporal.edges
-        if (
-            edges.ndim != 1
-            or len(edges) < 2
-            or edges[0] < 1
-            or (np.diff(edges) < 1).any()
-            or edges[-1] > _MOST_LAGS + 1
-        ):
-            raise ValueError(f"the memory ends at {edges.tolist()} frames, expected up to {_MOST_LAGS} that rise")
+        if edges.ndim != 1 or len(edges) < 2 or edges[0] < 1 or (np.diff(edges) < 1).any() or edges[-1] > _MAX_LAGS + 1:
+            raise ValueError(f"the memory ends at {edges.tolist()} frames, expected up to {_MAX_LAGS} that rise")
         return m * int(directions.shape[1]) * (len(edges) - 1 + self.temporal.uses_position)
 
     def position_noise_mm(self, regressor: IntervalRegressor) -> float:

@@ -14,12 +14,12 @@ from shearloop.bank.matching import signal_above_noise
 from shearloop.estimation.bank_match import BankMatcher, BankSearch
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.defaults import BASELINE_FRAMES, MAX_GAP_S
-from shearloop.estimation.fingertip_validator import LEAST_NOISE_V
+from shearloop.estimation.fingertip_validator import MIN_NOISE_V
 from shearloop.estimation.session import FINGERS_MOVED, Session
 from shearloop.estimation.values import ProcessedFrame, TactileFrame
 
 # Frames with more unusable channels than this are refused.
-_UNUSABLE_SHARE = 0.10
+_UNUSABLE_FRACTION = 0.10
 # Degrees of freedom of the mean variance of all channels in each channel's own.
 _POOLED_FREEDOM = 30
 
@@ -70,7 +70,7 @@ class PaperSession(Session):
         if self._before is not None:
             usable &= ~self._unknown
         unusable = int(np.count_nonzero(~usable))
-        if unusable > _UNUSABLE_SHARE * usable.size:
+        if unusable > _UNUSABLE_FRACTION * usable.size:
             return ProcessedFrame.refused(
                 usable,
                 f"{unusable} of {usable.size} channels are saturated or dead; "
@@ -131,4 +131,4 @@ class UntouchedFrames:
         freedom = self.wanted - 1
         own = (np.array(self.frames) - self.idle_frame).var(axis=0, ddof=1)
         variance = (freedom * own + _POOLED_FREEDOM * own.mean()) / (freedom + _POOLED_FREEDOM)
-        return np.asarray(np.sqrt(np.maximum(variance, LEAST_NOISE_V**2)))
+        return np.asarray(np.sqrt(np.maximum(variance, MIN_NOISE_V**2)))

@@ -12,10 +12,10 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray
 
 # Readings below this share of the largest torque mean that the lever does not touch.
-CENSORED_SHARE = 0.02
+CENSORED_FRACTION = 0.02
 # Their bound lies this share of it below zero. Of 0 to 0.3 this has the least error on recorded twists left out.
-_MARGIN_SHARE = 0.05
-_LEAST_SIGMA_SHARE, _HINGE_ROUNDS = 0.01, 50
+_MARGIN_FRACTION = 0.05
+_MIN_SIGMA_FRACTION, _HINGE_ROUNDS = 0.01, 50
 # Penalties to choose from, in units of the features' sum of squares.
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
 
@@ -81,8 +81,8 @@ class CensoredRidge(Ridge):
         largest = float(values[np.argmax(np.abs(values))])
         sign = 1.0 if largest > 0 else -1.0
         y = sign * values
-        touching = y >= CENSORED_SHARE * y.max()
-        bound = -_MARGIN_SHARE * float(y.max())
+        touching = y >= CENSORED_FRACTION * y.max()
+        bound = -_MARGIN_FRACTION * float(y.max())
         y, centred = np.where(touching, y, bound), features - features.mean(axis=0)
         penalty = strength * float((centred**2).sum()) * np.eye(features.shape[1])
         counting: BoolArray = np.ones(len(y), dtype=np.bool_)
@@ -95,7 +95,7 @@ class CensoredRidge(Ridge):
             if (counting == before).all():
                 break
         error = float(np.sqrt(((y - predicted)[touching] ** 2).mean()))
-        return cls(mean, weights, offset, strength, max(error, _LEAST_SIGMA_SHARE * float(y.max())), sign)
+        return cls(mean, weights, offset, strength, max(error, _MIN_SIGMA_FRACTION * float(y.max())), sign)
 
     def scaled(self, factor: float) -> Self:
         """Return the ridge of values larger by a factor."""

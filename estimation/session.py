@@ -19,7 +19,7 @@ from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading, match_reasons
 from shearloop.estimation.fingertip_validator import (
-    LARGEST_JUMPING_SHARE,
+    LARGEST_JUMPING_FRACTION,
     FingertipSet,
     FingertipValidator,
     GripDetector,
@@ -243,7 +243,7 @@ class Session:
             checks.skip()
             self._memory.skip(missing)
             return ProcessedFrame.refused(usable, *filter(None, reasons))
-        if (jumping_shares > LARGEST_JUMPING_SHARE).any():
+        if (jumping_shares > LARGEST_JUMPING_FRACTION).any():
             self._bridge(channels, missing)
             return ProcessedFrame.refused(usable, self._fingertips.disturbance(jumping_shares))
         is_first = checks.before is None

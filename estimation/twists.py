@@ -7,13 +7,13 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 
 # A frame is loaded above this fraction of the largest torque.
-LOADED_SHARE = 0.1
+LOADED_FRACTION = 0.1
 
 
 def find_twists(torque_nm: FloatArray, largest_nm: float | None = None) -> list[IntArray]:
     """Return the rows of each stretch of loaded frames in (n,) torques; the largest torque is given or found."""
     largest_nm = float(np.abs(torque_nm).max(initial=0.0)) if largest_nm is None else largest_nm
-    rows = np.flatnonzero(np.abs(torque_nm) > LOADED_SHARE * largest_nm)
+    rows = np.flatnonzero(np.abs(torque_nm) > LOADED_FRACTION * largest_nm)
     return [twist for twist in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(twist)]
 
 
@@ -28,7 +28,7 @@ def first_twists(torque_nm: FloatArray, grips: IntArray) -> BoolArray:
 
 def loaded_log_gain(predicted: FloatArray, truth: FloatArray) -> float | None:
     """Return the logarithm of the factor on (n,) predictions that fits the truth of the loaded frames best."""
-    rows = np.abs(truth) > LOADED_SHARE * float(np.abs(truth).max())
+    rows = np.abs(truth) > LOADED_FRACTION * float(np.abs(truth).max())
     return log_gain(predicted[rows], truth[rows])
 
 

@@ -14,7 +14,7 @@ from shearloop.tools.estimate_tracks import EstimateTrack, values_of
 LONGEST_GAP_S = 5.0
 # Time constants that are tried; with fewer readings the noise decides.
 _TIMES_S = np.geomspace(2.0, 200.0, 60)
-_FEWEST = 20
+_MIN_READINGS = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,7 @@ def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> Fitt
     Raises UserError for fewer than twenty readings, for torques that do not fall behind the readings, and for twists
     that were held too briefly.
     """
-    if sum(grip.t_s.size for grip in grips) < _FEWEST:
+    if sum(grip.t_s.size for grip in grips) < _MIN_READINGS:
         count = sum(grip.t_s.size for grip in grips)
         raise UserError(f"creep: too few readings for a fit: {count}; hold a twist for a minute")
     shear, torque = (np.concatenate([getattr(grip, name) for grip in grips]) for name in ("shear_nm", "torque_nm"))

@@ -10,7 +10,7 @@ from shearloop.bank.arrays import BoolArray, IntArray
 from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT_NOTE, SIDES
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
-from shearloop.estimation.calibration import LARGEST_TOOL_SHARE
+from shearloop.estimation.calibration import LARGEST_TOOL_FRACTION
 from shearloop.estimation.learned_frames import frame_digests
 from shearloop.tools.recordings.frames import Recording, read_recording
 from shearloop.words import counted
@@ -22,7 +22,7 @@ _LARGEST_APART = 0.75
 # Share of the time with another grip that does not count as another tool: the fingers met something or gripped again.
 _MOMENTARY = 0.05
 # Share of a recording's frames that another may hold too: emulated rigs of one seed begin with the same idle frames.
-_MOST_SHARED = 0.5
+_MAX_SHARED = 0.5
 
 
 def read_series(
@@ -155,7 +155,7 @@ def _held_mm(recording: Recording, t_ns: IntArray) -> list[Measured]:
 
 
 def _is_another(diameter_mm: float, tool: Measured) -> bool:
-    return abs(diameter_mm - tool.value) > LARGEST_TOOL_SHARE * tool.value + tool.half_width
+    return abs(diameter_mm - tool.value) > LARGEST_TOOL_FRACTION * tool.value + tool.half_width
 
 
 def check_paths_differ(paths: Sequence[Path]) -> None:
@@ -178,7 +178,7 @@ def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:
         digests = frame_digests(recording.channels)
         for other, of_other in known:
             shared = int(np.isin(digests, of_other).any(axis=1).sum())
-            if shared > _MOST_SHARED * min(len(digests), len(of_other)):
+            if shared > _MAX_SHARED * min(len(digests), len(of_other)):
                 raise UserError(
                     f"{shared} of {counted(len(digests), 'frame')} of {name} are in {other} too; give one of the two: "
                     "a frame that counts twice makes intervals too narrow"

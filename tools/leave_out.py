@@ -31,7 +31,7 @@ MEAN_TWIST = "a stopwatch with the mean twist"
 NO_ESTIMATE = "No loaded frame has an estimate: see why with `shearloop evaluate CAL REC`."
 ON_ANOTHER = "Judge it on another recording: `shearloop evaluate CAL REC`."
 # Below this coverage of the 95 % intervals, the advice is more data.
-_LEAST_COVERAGE = 0.9
+_MIN_COVERAGE = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,7 +237,7 @@ def advice_on(
 def advice_of_coverage(tracks: Sequence[EstimateTrack], kind: str) -> str:
     """Return the advice where the sensor helps: by how many truths lie within the intervals."""
     coverage = figures_by_load(tracks)["loaded"]["coverage_95"]
-    if coverage is not None and coverage < _LEAST_COVERAGE:
+    if coverage is not None and coverage < _MIN_COVERAGE:
         return f"The intervals hold too few truths: record more {kind}."
     return "Nothing stands out: judge it on a recording of another day."
 

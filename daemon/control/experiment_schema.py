@@ -14,9 +14,9 @@ from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
 from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_PER_S
 from shearloop.mistakes import shown
 
-MOST_ANGLES = 1000
+MAX_ANGLES = 1000
 # Bounds on what an experiment costs: its plan is made in the loop that moves the robot.
-MOST_STEPS, MOST_ANGLES_IN_ALL = 500, 4000
+MAX_STEPS, MAX_ANGLES_IN_ALL = 500, 4000
 # Larger numbers have no differences.
 _LARGEST_WRITTEN = 1e9
 
@@ -34,8 +34,8 @@ def _angles(given: object) -> object:
         raise ValueError(f"{shown(given)} is not START:STOP:STEPS, for example 1.45:1.65:10") from None
     if not abs(start) + abs(stop) < _LARGEST_WRITTEN:
         raise ValueError(f"{shown(given)} must start and stop at an angle in rad")
-    if len(parts) != 3 or not 2 <= steps <= MOST_ANGLES:
-        raise ValueError(f"{shown(given)} must have three parts, the last a number of steps from 2 to {MOST_ANGLES}")
+    if len(parts) != 3 or not 2 <= steps <= MAX_ANGLES:
+        raise ValueError(f"{shown(given)} must have three parts, the last a number of steps from 2 to {MAX_ANGLES}")
     return tuple(np.linspace(start, stop, steps).tolist())
 
 
@@ -258,14 +258,14 @@ class ExperimentFile(ConfigModel):
 
     @model_validator(mode="after")
     def _bounded(self) -> "ExperimentFile":
-        if len(self.steps) > MOST_STEPS:
+        if len(self.steps) > MAX_STEPS:
             raise ValueError(
-                f"it has {len(self.steps)} steps, and an experiment has at most {MOST_STEPS}: make two of it"
+                f"it has {len(self.steps)} steps, and an experiment has at most {MAX_STEPS}: make two of it"
             )
         angles = sum(len(step.angles_rad) for step in self.steps if isinstance(step, TwistStep))
-        if angles > MOST_ANGLES_IN_ALL:
+        if angles > MAX_ANGLES_IN_ALL:
             raise ValueError(
-                f"its `twist` steps have {angles} angles in all, and an experiment has at most {MOST_ANGLES_IN_ALL}: "
+                f"its `twist` steps have {angles} angles in all, and an experiment has at most {MAX_ANGLES_IN_ALL}: "
                 "repeat fewer of them with `repeats`, or make two of it"
             )
         return self

@@ -34,7 +34,7 @@ OPENING = opening(LARGEST_STROKE_MM, 100.0)
 # The fingers' own stop may lie this far before the widest target.
 OPEN_WITHIN_MM = 10.0
 # A release that opens the fingers by less may not let go: about three of the gripper's positions.
-LEAST_OPENING_MM = 2.0
+MIN_OPENING_MM = 2.0
 # Fingertips that touch are closer together than this number of standard deviations of a measured width.
 TOUCHING_STDS = 3.0
 # A release or halt is retried for longer than a reconnection takes.
@@ -96,7 +96,7 @@ class GripperTask:
         state = await self.gripper.read()
         if isinstance(target, Opening):
             if state.object is not ObjectStatus.AT_TARGET or self._unfelt(state):
-                return target.width_mm if target.width_mm > state.width_mm + LEAST_OPENING_MM else LARGEST_STROKE_MM
+                return target.width_mm if target.width_mm > state.width_mm + MIN_OPENING_MM else LARGEST_STROKE_MM
             if state.width_mm >= target.width_mm:
                 self._take(state)
                 return None

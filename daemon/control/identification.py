@@ -15,18 +15,18 @@ from shearloop.errors import UserError
 # The grid of the torque's lag behind its stamp.
 _LAG_GRID_S = np.arange(-0.4, 1.0001, 0.02)
 _ACTUATION_GRID_S = np.arange(0.0, 0.3001, 0.002)
-_FEWEST = 12
-_FEWEST_CYCLES = 2
+_MIN_TORQUES = 12
+_MIN_CYCLES = 2
 # After the last swing, the stiffness may be this uncertain.
-_WORST_STIFFNESS_SHARE = 0.1
+_WORST_STIFFNESS_FRACTION = 0.1
 _NO_TURN_RAD = 1e-4
 # The share of the angle's range that counts as rest, and the torque at rest that may be lost over the record.
-_REST_SHARE = 0.2
-_SLIP_SHARE = 0.3
+_REST_FRACTION = 0.2
+_SLIP_FRACTION = 0.3
 # The residual beyond the noise, relative to the spring's part (relaxation gives about 0.1).
-_MISFIT_SHARE = 0.3
+_MISFIT_FRACTION = 0.3
 # The expected drift over the record, relative to the spring's part: relaxation.
-_DRIFT_SHARE = 0.04
+_DRIFT_FRACTION = 0.04
 _ARRIVED_RAD = 2e-3
 
 
@@ -110,7 +110,7 @@ class _Fit:
         return np.asarray(self.squares / degrees * np.linalg.pinv(self.equations.T @ self.equations), np.float64)
 
 
-def identify(record: Record, window_s: float, stiffness_share: float = _WORST_STIFFNESS_SHARE) -> ToolModel:
+def identify(record: Record, window_s: float, stiffness_share: float = _WORST_STIFFNESS_FRACTION) -> ToolModel:
     """Return the tool model of a record of torques, each a mean over `window_s`.
 
     For every lag of a grid, the torques are fitted by least squares to the mean angles of their windows, with an offset
@@ -119,9 +119,9 @@ def identify(record: Record, window_s: float, stiffness_share: float = _WORST_ST
     `stiffness_share`, the tool slipped, or the torque does not follow a spring.
     """
     used = np.isfinite(record.torque_nm) & (record.t_mid_s - 0.5 * window_s > record.angle_t_s[0])
-    if used.sum() < _FEWEST:
+    if used.sum() < _MIN_TORQUES:
         raise NotYetKnownError(
-            f"identify: {used.sum()} valid torques are too few to learn the stiffness from, {_FEWEST} are needed; "
+            f"identify: {used.sum()} valid torques are too few to learn the stiffness from, {_MIN_TORQUES} are needed; "
             f"record for longer, and check why torques are missing"
         )
     t_mid_s, torque_nm = record.t_mid_s[used], record.torque_nm[used]
@@ -156,7 +156,7 @@ def _fit(angle_rad: FloatArray, t_mid_s: FloatArray, torque_nm: FloatArray) -> _
     free = np.linalg.lstsq(design, torque_nm, rcond=None)[0]
     std = float(np.linalg.norm(torque_nm - design @ free)) / math.sqrt(degrees)
     # The expected size of the drift as one more equation: else noise passes for drift, and spoils the last torque.
-    drift_nm = max(_DRIFT_SHARE * abs(float(free[0])) * float(np.ptp(angle_rad)), 1e-9)
+    drift_nm = max(_DRIFT_FRACTION * abs(float(free[0])) * float(np.ptp(angle_rad)), 1e-9)
     bounded = np.vstack([design, [0.0, 0.0, std / drift_nm]])
     coefficients = np.linalg.lstsq(bounded, np.append(torque_nm, 0.0), rcond=None)[0]
     return _Fit(coefficients, bounded, torque_nm - design @ coefficients)
@@ -191,7 +191,7 @@ def _refuse_bad(fit: _Fit, torque_nm: FloatArray, noise_nm: float, stiffness_sha
             f"or wrist angle is wrong"
         )
     lost, lost_std = _lost_at_rest(fit, torque_nm, noise_nm)
-    if lost > max(_SLIP_SHARE * abs(stiffness) * turned, 3.5 * lost_std):
+    if lost > max(_SLIP_FRACTION * abs(stiffness) * turned, 3.5 * lost_std):
         raise IdentifyError(
             f"identify: back at its first angle the torque is {lost:.3g} N·m lower than before: the tool slipped in "
             f"the grip (grip harder, or turn less than {turned:.2g} rad), or the torque itself errs by as much (drive "
@@ -204,7 +204,7 @@ def _refuse_bad(fit: _Fit, torque_nm: FloatArray, noise_nm: float, stiffness_sha
         )
     misfit = math.sqrt(max(float(np.mean(fit.residuals**2)) - noise_nm**2, 0.0))
     explained = stiffness * float(np.std(fit.angle_rad))
-    if misfit > _MISFIT_SHARE * explained:
+    if misfit > _MISFIT_FRACTION * explained:
         raise IdentifyError(
             f"identify: a spring of {stiffness:.3g} N·m/rad leaves {misfit:.2g} N·m of the torque unexplained and "
             f"explains {explained:.2g}; check for slip, play or a saturated torque sensor"
@@ -213,7 +213,7 @@ def _refuse_bad(fit: _Fit, torque_nm: FloatArray, noise_nm: float, stiffness_sha
 
 def _lost_at_rest(fit: _Fit, torque_nm: FloatArray, noise_nm: float) -> tuple[float, float]:
     """Return the loss of torque at the first angle, from before the first motion to after the last, and its std."""
-    away = np.flatnonzero(np.abs(fit.angle_rad - fit.angle_rad[0]) > _REST_SHARE * np.ptp(fit.angle_rad))
+    away = np.flatnonzero(np.abs(fit.angle_rad - fit.angle_rad[0]) > _REST_FRACTION * np.ptp(fit.angle_rad))
     before, after = torque_nm[: away[0]], torque_nm[away[-1] + 1 :]
     if before.size < 2 or after.size < 2:
         return 0.0, 0.0
@@ -350,10 +350,10 @@ class StiffnessExcitation:
     def _end_leg(self) -> None:
         self._leg, self._arrived_s = self._leg + 1, None
         cycles, rests = divmod(self._leg - 1, 2)
-        if self._leg % 2 == 0 or cycles < _FEWEST_CYCLES or rests:
+        if self._leg % 2 == 0 or cycles < _MIN_CYCLES or rests:
             return
         last = cycles >= self._settings.most_cycles
-        share = _WORST_STIFFNESS_SHARE if last else self._settings.stiffness_share
+        share = _WORST_STIFFNESS_FRACTION if last else self._settings.stiffness_share
         try:
             self.result = identify(self.record(), self._source.window_s, share)
         except NotYetKnownError as error:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from shearloop.daemon.torques import TorqueSample
 
 # Torques between two ticks; more come only while the loop stands still.
-MOST_UNJUDGED = 256
+MAX_UNJUDGED = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class LatestInputs:
     torques: dict[str, TorqueSample] = field(default_factory=dict)
     history: dict[str, tuple[list[int], list[float]]] = field(default_factory=dict)
     # Valid torques since the latest tick, which may be several of one source.
-    unjudged: deque[TorqueSample] = field(default_factory=lambda: deque(maxlen=MOST_UNJUDGED))
+    unjudged: deque[TorqueSample] = field(default_factory=lambda: deque(maxlen=MAX_UNJUDGED))
     arm: ArmStatus | None = None
     gripper: GripperStatus | None = None
     lost: dict[str, str] = field(default_factory=dict)

@@ -35,10 +35,10 @@ _SETTLED = 1e-9
 _LONGEST_RESPONSE = 200_000
 _FREQUENCIES = 4000
 # Above this gain the loop follows single measurements rather than their mean.
-MOST_GAIN = 0.5
-LEAST_GAIN = 1e-3
+MAX_GAIN = 0.5
+MIN_GAIN = 1e-3
 # An automatic gain without the required margins is lowered to this fraction, at most this number of times.
-LOWERED_TO, MOST_LOWERINGS = 0.8, 3
+LOWERED_TO, MAX_LOWERINGS = 0.8, 3
 # The delay margin that a controller must have, in measurement periods.
 DELAY_MARGIN_PERIODS = 1.0
 
@@ -242,10 +242,10 @@ def noise_share(kp: float, ki: float) -> float:
 
 
 def gain_for_noise(noise_nm: float, allowed_nm: float) -> float:
-    """Return the largest kp, up to MOST_GAIN, that keeps the noise of the torque within `allowed_nm`."""
-    kps = np.geomspace(LEAST_GAIN, MOST_GAIN, 200)
+    """Return the largest kp, up to MAX_GAIN, that keeps the noise of the torque within `allowed_nm`."""
+    kps = np.geomspace(MIN_GAIN, MAX_GAIN, 200)
     fitting = [float(kp) for kp in kps if noise_share(float(kp), integral_gain(float(kp))) * noise_nm <= allowed_nm]
-    return max(fitting, default=LEAST_GAIN)
+    return max(fitting, default=MIN_GAIN)
 
 
 def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
@@ -268,25 +268,25 @@ def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
 
 
 def passing_gain(model: LoopModel, config: LoopConfig) -> float | None:
-    """Return a kp just below the first without the required margins, at most MOST_GAIN, or None."""
+    """Return a kp just below the first without the required margins, at most MAX_GAIN, or None."""
 
     def passes(kp: float) -> bool:
         return _passes(margins(with_gain(model, kp)), config, model.sample_period_s)
 
-    limit = _limit(passes, np.geomspace(LEAST_GAIN, MOST_GAIN, 25))
+    limit = _limit(passes, np.geomspace(MIN_GAIN, MAX_GAIN, 25))
     # Rounded to three digits, it passes as well.
-    return min(0.99 * limit, MOST_GAIN) if limit > LEAST_GAIN else None
+    return min(0.99 * limit, MAX_GAIN) if limit > MIN_GAIN else None
 
 
 def with_margins(settings: ControllerSettings, found: ToolModel, config: LoopConfig) -> ControllerSettings:
     """Return the settings with a gain that is lowered until it has the required margins, never raised.
 
-    After MOST_LOWERINGS without them the settings are returned as they are: the loop waits for the result.
+    After MAX_LOWERINGS without them the settings are returned as they are: the loop waits for the result.
     """
     model = loop_model(settings, found)
     if _sees_its_own_correction(model):
         return settings
-    for number in range(MOST_LOWERINGS + 1):
+    for number in range(MAX_LOWERINGS + 1):
         lowered = with_gain(model, settings.kp * LOWERED_TO**number)
         if _passes(margins(lowered), config, found.sample_period_s):
             return replace(settings, kp=lowered.kp, ki=lowered.ki)

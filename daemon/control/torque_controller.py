@@ -40,16 +40,16 @@ from shearloop.errors import UserError
 # The ramp does not catch up when the loop was late for longer than this.
 LONGEST_STEP_NS = 50_000_000
 # A rest ends at the deadband, a motion at this share of it: the hysteresis keeps noise from toggling the two.
-_SETTLED_SHARE = 0.1
+_SETTLED_FRACTION = 0.1
 # CUSUM test for jumps, in standard deviations: the slack per innovation, the threshold of the sum, and the bound of an
 # innovation, which keeps one wild value below the threshold.
 _JUMP_SLACK, _JUMP_SUM, _JUMP_BOUND = 1.2, 5.0, 5.0
 # The offset restarts from at most this many measurements after a jump.
-_MOST_SINCE_JUMP = 5
+_MAX_SINCE_JUMP = 5
 # Stands for no measurement at all.
 _UNKNOWN = 1e-6
 # A drift is extrapolated over at most this many dropped measurements.
-_MOST_MISSED = 4
+_MAX_MISSED = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +158,7 @@ class JumpDetector:
         for number, deviation in enumerate((bounded, -bounded)):
             self._sums[number] = max(self._sums[number] + deviation - _JUMP_SLACK, 0.0)
             since_nm = [*self._offsets_nm[number], offset_nm] if self._sums[number] else []
-            self._offsets_nm[number] = since_nm[-_MOST_SINCE_JUMP:]
+            self._offsets_nm[number] = since_nm[-_MAX_SINCE_JUMP:]
         if max(self._sums) <= _JUMP_SUM:
             return []
         jumped = self._offsets_nm[self._sums.index(max(self._sums))]
@@ -224,7 +224,7 @@ class TorqueFilter:
         angle = self.angles.mean(middle_ns - half_ns, middle_ns + half_ns)
         if angle is None:
             return False
-        missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / settings.sample_period_s) - 1, _MOST_MISSED)
+        missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / settings.sample_period_s) - 1, _MAX_MISSED)
         if self.fresh_ns is not None and missed > 0:
             self.offset_nm += self.drift_nm * missed
         self._correct(torque_nm - self.expected_nm(angle), angle, integrates=integrates)
@@ -379,7 +379,7 @@ class TorqueController:
         before_nm = self.torque_nm if self.ramp_nm is None else self.ramp_nm
         self.ramp_nm, slope_nm_per_s = self._advance_ramp(before_nm, set_point_nm, elapsed_s)
         missing_nm = self.ramp_nm - self.torque_nm
-        bound_nm = settings.deadband_nm * (_SETTLED_SHARE if self._moving else 1.0)
+        bound_nm = settings.deadband_nm * (_SETTLED_FRACTION if self._moving else 1.0)
         self._moving = slope_nm_per_s != 0.0 or abs(missing_nm) > bound_nm
         wanted_rad_per_s = 0.0
         if self._moving:

@@ -27,13 +27,13 @@ from shearloop.daemon.torques import TorqueSample, TorqueSource
 Compute: TypeAlias = Callable[[Callable[[], JudgedGain]], "Future[JudgedGain]"]
 
 # Torques that wait for the next wrist angle.
-MOST_PENDING = 64
+MAX_PENDING = 64
 # The largest drift of the torque at a fixed angle that counts as creep.
 CREEP_LIMIT_NM_PER_S = 0.005
 # Either way from the wrist angle of the closed loop's start.
 TRAVEL_LIMIT_RAD = 3.2
 # Innovations are clipped to three times the noise, and never below this.
-LEAST_INNOVATION_LIMIT_NM = 0.01
+MIN_INNOVATION_LIMIT_NM = 0.01
 
 
 def at_once(job: Callable[[], JudgedGain]) -> "Future[JudgedGain]":
@@ -60,7 +60,7 @@ class WristController:
         self._limit = WristLimit.of(config)
         self._stands_still = False
         # Torques wait for the next angle.
-        self._pending: deque[TorqueSample] = deque(maxlen=MOST_PENDING)
+        self._pending: deque[TorqueSample] = deque(maxlen=MAX_PENDING)
         self.excitation: StiffnessExcitation | None = None
         # Speeds sent in the last `actuation_s`: time, speed, duration.
         self._under_way: deque[tuple[int, float, float]] = deque()
@@ -197,7 +197,7 @@ def controller_settings(
         ramp_nm_per_s=setpoint.ramp_nm_per_s,
         noise_nm=found.noise_nm,
         deadband_nm=config.deadband_nm,
-        innovation_limit_nm=max(3.0 * found.noise_nm, LEAST_INNOVATION_LIMIT_NM),
+        innovation_limit_nm=max(3.0 * found.noise_nm, MIN_INNOVATION_LIMIT_NM),
         creep_limit_nm_per_s=CREEP_LIMIT_NM_PER_S,
         offset_limit_nm=config.max_offset_drift_nm,
         torque_limit_nm=torque_limit_nm,

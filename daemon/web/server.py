@@ -83,7 +83,7 @@ MAX_PAGES = 16
 MAX_CONNECTIONS, ACCEPTED_AT_ONCE = 128, 16
 MAX_BODY_BYTES = 4096
 # Of the number of a stop.
-_MOST_DIGITS = 9
+_MAX_DIGITS = 9
 # The largest message is a heatmap of 200 × 200 float32.
 MAX_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 1000
@@ -375,7 +375,7 @@ class _Page:
         arguments: dict[str, bool | int | str] = {word: text for word, text in request.query.items() if text}
         if "stop" in arguments:
             number = request.query["stop"]
-            if not (number.isascii() and number.isdecimal() and len(number) <= _MOST_DIGITS):
+            if not (number.isascii() and number.isdecimal() and len(number) <= _MAX_DIGITS):
                 return self._refuse(400, f"`stop` is {number[:40]!r}, and has to be a whole number")
             arguments["stop"] = int(number)
         # The first press asks the question, the second press confirms it.

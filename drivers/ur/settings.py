@@ -34,7 +34,7 @@ _SHORTEST_RECOVERY_S = 10.0
 # A controller takes a command in its next cycle, which takes 8 ms on a CB3, 2 ms on an e-Series.
 _SHORTEST_REACTION_S = 0.002
 # The speeds of an arm at rest reach 0.003 rad/s by noise. With a lower threshold an arm is never at rest.
-_LEAST_REST_RAD_PER_S = 0.002
+_MIN_REST_RAD_PER_S = 0.002
 # The largest age of a state with which a robot on another computer may move.
 _LONGEST_STATE_S = 1.0
 # The longest time from the last decision until the wrist stands (docs/safety.md).
@@ -55,7 +55,7 @@ Generation = Literal["e-series", "cb3"]
 
 
 # A tool centre point within these counts as on the axis of wrist 3.
-MOST_ASIDE_M, MOST_TILT_RAD = 0.01, 0.05
+MAX_ASIDE_M, MAX_TILT_RAD = 0.01, 0.05
 # A torque of the wrench is the mean of at least this number of states.
 WRENCH_STATES: Final = 16
 
@@ -300,9 +300,9 @@ def _beside_the_axis(tcp_offset: Six) -> str:
     """Return how a tool centre point leaves the axis of wrist 3, or an empty string."""
     aside_m = math.hypot(*tcp_offset[:2])
     tilt_rad = math.acos(min(1.0, max(-1.0, tool_axis(tcp_offset)[2])))
-    if aside_m > MOST_ASIDE_M:
+    if aside_m > MAX_ASIDE_M:
         return f"lies {1e3 * aside_m:.0f} mm beside the axis of wrist 3"
-    if tilt_rad > MOST_TILT_RAD:
+    if tilt_rad > MAX_TILT_RAD:
         return f"is tilted by {tilt_rad:.2f} rad against the axis of wrist 3"
     return ""
 
@@ -336,7 +336,7 @@ class UrSettings(_Checked):
     """Time for one attempt to make the robot ready."""
     reaction_s: Annotated[float, Field(ge=_SHORTEST_REACTION_S, le=0.5)] = 0.04
     """Delay until a commanded speed takes effect; distances to the joint limits include it."""
-    rest_rad_per_s: Annotated[float, Field(ge=_LEAST_REST_RAD_PER_S, le=0.05)] = REST_RAD_PER_S
+    rest_rad_per_s: Annotated[float, Field(ge=_MIN_REST_RAD_PER_S, le=0.05)] = REST_RAD_PER_S
     """A joint slower than this is at rest."""
 
     def __post_init__(self) -> None:

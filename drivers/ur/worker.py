@@ -34,7 +34,7 @@ EXIT_DONE, EXIT_FAILED = 0, 3
 # On exit, the time to brake a motion; the robot's watchdog ends what remains.
 BRAKE_S = 1.0
 # The bound on unsent replies. States that a slow daemon does not read are dropped.
-MOST_UNSENT = 1 << 16
+MAX_UNSENT = 1 << 16
 
 
 class Pipe:
@@ -73,7 +73,7 @@ class Pipe:
         """Send a message that must arrive."""
         self.unsent += messages.encode(message, number)
         self._flush()
-        if len(self.unsent) > MOST_UNSENT:
+        if len(self.unsent) > MAX_UNSENT:
             self.open = False
 
     def send_latest(self, message: messages.Message) -> None:

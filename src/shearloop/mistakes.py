@@ -26,7 +26,7 @@ _LONGEST_VALUE = 60
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
 _POINT = "; the decimal sign is a point: 0.1, not 0,1"
 # The largest number of mistakes that are shown for one file.
-_MOST_MISTAKES = 100
+_MAX_MISTAKES = 100
 
 # Making an adapter takes longer than reading a file.
 _adapter_of: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
@@ -91,7 +91,7 @@ def mistake_lines(
     schema = _schema_of(model)
     found: dict[str, int] = {}
     every = error.errors(include_url=False)
-    first, more = every[:_MOST_MISTAKES], every[_MOST_MISTAKES:]
+    first, more = every[:_MAX_MISTAKES], every[_MAX_MISTAKES:]
     for details in first:
         location = details["loc"]
         # A list counts only its valid entries, so that mistakes within it make it too short as well.

@@ -22,7 +22,7 @@ _SUFFIXES = (".yaml", ".yml")
 # Of Linux.
 _LONGEST_NAME, _LONGEST_PATH = 255, 4096
 # Bounds on what a file may cost: its bytes, and its values with every alias written out.
-MOST_BYTES, _MOST_VALUES = 1 << 17, 20_000
+MAX_BYTES, _MAX_VALUES = 1 << 17, 20_000
 
 
 class _Loader(yaml.SafeLoader):
@@ -50,8 +50,8 @@ class _Loader(yaml.SafeLoader):
             pairs = node.value if isinstance(node, yaml.MappingNode) else [node.value]
             inside = [] if isinstance(node, yaml.ScalarNode) else [each for pair in pairs for each in pair]
             self._sizes[node] = 1 + sum(self._sizes[each] for each in inside)
-        if self._sizes[node] > _MOST_VALUES:
-            raise self._refusal(f"more than {_MOST_VALUES} values, with every alias written out", event)
+        if self._sizes[node] > _MAX_VALUES:
+            raise self._refusal(f"more than {_MAX_VALUES} values, with every alias written out", event)
         return node
 
     @staticmethod
@@ -105,7 +105,7 @@ class Document:
         what: str = "configuration",
         cure: str = "",
         *,
-        most_bytes: int = MOST_BYTES,
+        most_bytes: int = MAX_BYTES,
     ) -> Self:
         """Read a file that is neither missing nor empty; `cure` ends the message of a missing one."""
         if "\0" in str(path) or len(path.name) > _LONGEST_NAME or len(str(path)) > _LONGEST_PATH:
@@ -236,8 +236,8 @@ def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", 
 
 def parse_yaml(text: bytes) -> Any:
     """Return the content of a YAML text; raises yaml.YAMLError, ValueError or RecursionError."""
-    if len(text) > MOST_BYTES:
-        raise ValueError(f"its header is larger than {MOST_BYTES >> 10} kB")
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"its header is larger than {MAX_BYTES >> 10} kB")
     return yaml.load(text.decode(), _Loader)  # noqa: S506 - it is a SafeLoader
 
 

@@ -147,11 +147,11 @@ FAULTS = (
 
 
 # An estimator breaks silently where more frames than this are false-valid; one in twenty is the promise.
-BROKEN_SHARE = 0.2
+BROKEN_FRACTION = 0.2
 # Judged frames of a stream: enough for a twist and a half.
-_MOST_FRAMES = 180
+_MAX_FRAMES = 180
 _DRAWS = 3
-_LOADED_SHARE = 0.1
+_LOADED_FRACTION = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +183,7 @@ class FaultCurve:
 def fault_curve(fault: str, unit: str, estimator: str, levels: Iterable[FaultLevel]) -> FaultCurve:
     """Return a curve with its breaking point."""
     found = tuple(levels)
-    broken = [level.level for level in found if level.false_valid > BROKEN_SHARE]
+    broken = [level.level for level in found if level.false_valid > BROKEN_FRACTION]
     # Levels go from mild to grave, or through 0 for a fault with two directions.
     if any(level.level < 0 for level in found):
         broken.sort(key=abs)
@@ -232,7 +232,7 @@ def balanced(truth_nm: FloatArray) -> FloatArray:
 
     Most of a stream is free of load: an estimator that always says zero would look stable.
     """
-    loaded = np.abs(truth_nm) > _LOADED_SHARE * np.nanmax(np.abs(truth_nm))
+    loaded = np.abs(truth_nm) > _LOADED_FRACTION * np.nanmax(np.abs(truth_nm))
     free = np.flatnonzero(np.isfinite(truth_nm) & ~loaded)
     kept = free[np.linspace(0, len(free) - 1, min(len(free), int(loaded.sum()))).astype(int)] if len(free) else free
     return np.where(loaded | np.isin(np.arange(len(truth_nm)), kept), truth_nm, np.nan)
@@ -274,7 +274,7 @@ def misaligned(
 
 def shortened(series: FrameSeries) -> FrameSeries:
     """Return the first frames, as many as are judged."""
-    return series.between(0, min(len(series.t_s), _MOST_FRAMES))
+    return series.between(0, min(len(series.t_s), _MAX_FRAMES))
 
 
 def scene_for(split: Split, bank: Bank) -> FaultScene:
@@ -324,7 +324,7 @@ def sweeps_figure(title: str, curves: Sequence[FaultCurve], panels: int = 3) -> 
             label_panel(panel, unit, heading)
         row[0].set_title(fault, fontsize=10.5, loc="left", fontweight="bold")
         row[0].axhline(0, color="#999999", linewidth=0.8)
-        row[2].axhline(BROKEN_SHARE, color="#999999", linewidth=1.2, linestyle=(0, (1, 2)))
+        row[2].axhline(BROKEN_FRACTION, color="#999999", linewidth=1.2, linestyle=(0, (1, 2)))
         for panel in row[1:3]:
             panel.set_ylim(-0.04, 1.04)
         for curve in curves:
@@ -332,8 +332,8 @@ def sweeps_figure(title: str, curves: Sequence[FaultCurve], panels: int = 3) -> 
                 _draw_curve(row, curve, names.index(curve.estimator), len(names))
     made.legend(*rows[0, 2].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=len(names))
     made.suptitle(
-        f"{title}\n× breaks silently: more than {BROKEN_SHARE:.0%} of the frames are called valid and miss their 95 % "
-        "interval",
+        f"{title}\n× breaks silently: more than {BROKEN_FRACTION:.0%} of the frames are called valid and miss "
+        "their 95 % interval",
         fontsize=12,
     )  # fmt: skip
     return made

@@ -19,7 +19,7 @@ from shearloop.tools.drawing import SHADES, figure, save, slug
 from shearloop.tools.parallel import Executor
 
 _MESH_SIZE_CM = 0.07
-_LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
+_MIN_SHOWN, _MAX_TICKS = 1e-3, 12
 
 
 def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
@@ -69,9 +69,9 @@ def write(title: str, design: Design, out: Path) -> list[Path]:
 def _draw_choice(axes: Axes, choice: DesignChoice) -> None:
     settings, added = ([getattr(step, name) for step in choice.steps] for name in ("setting", "added"))
     # A logarithmic axis cannot show the zero of an exact choice.
-    shown = np.maximum(added, _LEAST_SHOWN)
+    shown = np.maximum(added, _MIN_SHOWN)
     axes.plot(settings, shown, "-o", color=SHADES[1], markersize=5)
-    scale = "linear" if len(settings) > _MOST_TICKS else "log"
+    scale = "linear" if len(settings) > _MAX_TICKS else "log"
     axes.set(xscale=scale, yscale="log", xlabel=f"{choice.name}, {choice.unit}", ylabel="added error / noise")
     axes.axhline(ALLOWED, color="black", linestyle="--", linewidth=1)
     # Errors fall to the right, so the corner above the line is free there.
@@ -80,12 +80,12 @@ def _draw_choice(axes: Axes, choice: DesignChoice) -> None:
         textcoords="offset points", fontsize=8, ha="right",
     )  # fmt: skip
     chosen = choice.chosen
-    ring = max(chosen.added, _LEAST_SHOWN)
+    ring = max(chosen.added, _MIN_SHOWN)
     axes.plot(chosen.setting, ring, "o", markersize=15, markerfacecolor="none", color="black")
     if settings[0] > settings[-1]:
         axes.invert_xaxis()
     if scale == "log":
-        ticks = settings[:: max(1, len(settings) // _MOST_TICKS)]
+        ticks = settings[:: max(1, len(settings) // _MAX_TICKS)]
         axes.set_xticks(ticks, [f"{value:g}" for value in ticks], fontsize=8, rotation=60)
         axes.minorticks_off()
     axes.set_ylim(0.5 * min(shown), 3.0 * max(*shown, ALLOWED))

@@ -38,7 +38,7 @@ AGE_S, ACTUATION_TICKS = 0.06, 2
 AGES_S = (0.02, 0.06, 0.1, 0.15, 0.2)
 RADIUS_MM, SET_POINTS_N = 15.0, (1.0, 0.6, 1.0)
 # The judged share of each hold, at its end.
-SETTLED_SHARE = 0.6
+SETTLED_FRACTION = 0.6
 # Noise of one resistance, as in the emulated DAQ: 1.6 mN of shear force over both gauges.
 RELATIVE_NOISE = 0.0016 * 0.088 / 2**0.5
 CALIBRATION = Path(str(resources.files("shearloop"))) / "config" / "calibrations" / "skin_demo.yaml"
@@ -184,7 +184,7 @@ def judge(case: SkinLoopCase, calibration: SkinCalibration) -> tuple[SkinHold, S
     bound_n = 2.0 * loop.skin.membrane.belt.friction * case.normal_n
     set_points, truth_n = np.round(loop.trace.set_point_n, 6), np.array(loop.trace.truth_n)
     changes = np.flatnonzero(np.diff(np.nan_to_num(set_points, nan=-1.0))) + 1
-    settled = round(SETTLED_SHARE * case.hold_s / TICK_S)
+    settled = round(SETTLED_FRACTION * case.hold_s / TICK_S)
     ends = pairwise([*changes.tolist(), len(truth_n)])
     found = [truth_n[end - settled : end] for begin, end in ends if np.isfinite(set_points[begin])]
     if phase != ExperimentPhase.DONE.value or len(found) != len(SET_POINTS_N):

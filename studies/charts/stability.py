@@ -22,7 +22,7 @@ from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.studies.charts import skin_loop
 from shearloop.studies.charts.chart_data import Split, SyntheticSlices, fitted, played_bank, splits, torque_of
 from shearloop.studies.charts.fault_sweeps import (
-    BROKEN_SHARE,
+    BROKEN_FRACTION,
     FaultCurve,
     FaultLevel,
     estimate_frames,
@@ -88,7 +88,7 @@ def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Execut
     written = save(continuity_figure(split.title, found), content, out, f"continuity-{name}")
     beyond = extrapolate(split, SLICE_NAMES, bank, mesh, executor)
     content = {
-        "broken_share": BROKEN_SHARE,
+        "broken_share": BROKEN_FRACTION,
         "title": split.title,
         "extrapolations": [
             asdict(extrapolation) | {"times_good": extrapolation.times_good} for extrapolation in beyond
@@ -98,7 +98,7 @@ def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Execut
 
 
 def _written(name: str, title: str, curves: Sequence[FaultCurve], out: Path) -> list[Path]:
-    content = {"broken_share": BROKEN_SHARE, "title": title, "curves": [asdict(curve) for curve in curves]}
+    content = {"broken_share": BROKEN_FRACTION, "title": title, "curves": [asdict(curve) for curve in curves]}
     return save(sweeps_figure(f"Estimators under faults: {title}", curves), content, out, name)
 
 
@@ -149,7 +149,7 @@ def walks(split: Split, bank: Bank, calibrations: Sequence[AnyCalibration]) -> l
 
 
 # Shares of the slices to calibrate on, from the smallest torques or from the largest.
-CALIBRATED_SHARES = (0.8, 0.65, 0.5, 0.4, 0.3)
+CALIBRATED_FRACTIONS = (0.8, 0.65, 0.5, 0.4, 0.3)
 SMALLER = "calibrated on the smaller torques alone"
 LARGER = "calibrated on the larger torques alone"
 UNITS = {SMALLER: "largest torque calibrated on, N·m", LARGER: "smallest torque calibrated on, N·m"}
@@ -182,7 +182,7 @@ def calibration_parts(torque_nm: FloatArray) -> dict[str, list[CalibrationPart]]
     """
     found = {}
     for which, beyond in ((SMALLER, np.greater), (LARGER, np.less)):
-        quantiles = np.array(CALIBRATED_SHARES) if which == SMALLER else 1.0 - np.array(CALIBRATED_SHARES)
+        quantiles = np.array(CALIBRATED_FRACTIONS) if which == SMALLER else 1.0 - np.array(CALIBRATED_FRACTIONS)
         limits = np.quantile(torque_nm, quantiles, method="nearest").tolist()
         parts = [(limit, beyond(torque_nm, limit)) for limit in dict.fromkeys(limits)]
         found[which] = [(limit, judged) for limit, judged in parts if judged.any()]

@@ -61,9 +61,9 @@ def read_inputs(recordings: Path) -> Inputs:
     if not torque_folder.is_dir() and not diameter_folder.is_dir():
         raise UserError(f"{recordings} has neither a folder {TORQUE_FOLDER} nor a folder {DIAMETER_FOLDER}")
     torque = read_torque_slices(torque_folder) if torque_folder.is_dir() else None
-    if torque is not None and len(torque.torque_nm) < FEWEST_SLICES:
+    if torque is not None and len(torque.torque_nm) < MIN_SLICES:
         found = counted(len(torque.torque_nm), "slice")
-        raise UserError(f"{torque_folder} has {found}; a correlation needs at least {FEWEST_SLICES}")
+        raise UserError(f"{torque_folder} has {found}; a correlation needs at least {MIN_SLICES}")
     raw, paths = None, [torque_folder / name for name in (RAW_FRAME, RAW_HOMOGENEOUS)]
     if all(path.exists() for path in paths):
         frame, homogeneous = (PAPER_TABLE.channels_of_line(read_line(path)) for path in paths)
@@ -71,16 +71,16 @@ def read_inputs(recordings: Path) -> Inputs:
     return Inputs(torque, read_diameter_slices(diameter_folder) if diameter_folder.is_dir() else None, raw)
 
 
-FEWEST_SLICES = 3
+MIN_SLICES = 3
 # The paper sorts its torques into ten groups.
 _GROUPS = 10
 # Without repeats, the held-out parts are stretches of time.
 _STRETCHES = 5
 _BATCH = 8
 # A fall by more than this share of the whole range begins a new series.
-_RESTART_SHARE = 0.5
+_RESTART_FRACTION = 0.5
 # This share of a series' steps must rise: noise may swap neighbouring levels.
-_RISING_SHARE = 0.8
+_RISING_FRACTION = 0.8
 # The paper does not give the settings of its envelope. These show how the ranking depends on them.
 ENVELOPES = tuple(
     EnvelopeSettings(distance, averaged) for distance in (30, 40, 50, 60, 70) for averaged in (1, 3, 5, 7, 9)
@@ -276,7 +276,7 @@ def _times_first(rankings: list[dict[str, float]]) -> dict[str, int]:
 
 def correlation(x: FloatArray, y: FloatArray) -> float | None:
     """Return Pearson's r of (n,) x and y, None for fewer than three points or constant values."""
-    if len(x) < FEWEST_SLICES or np.ptp(x) == 0 or np.ptp(y) == 0:
+    if len(x) < MIN_SLICES or np.ptp(x) == 0 or np.ptp(y) == 0:
         return None
     return float(np.corrcoef(x, y)[0, 1])
 
@@ -291,7 +291,7 @@ def _groups(torque: FloatArray) -> tuple[IntArray, str, IntArray, str]:
         level, repeat = series
         repeats = f"by place in {int(repeat.max()) + 1} repeated series"
         return level, repeats, repeat, "one repeat of the series left out at a time"
-    n_levels = min(_GROUPS, max(FEWEST_SLICES, len(torque) // 3), len(np.unique(torque)))
+    n_levels = min(_GROUPS, max(MIN_SLICES, len(torque) // 3), len(np.unique(torque)))
     n_parts = min(_STRETCHES, len(torque))
     return (
         kmeans_groups(torque, n_levels),
@@ -325,11 +325,11 @@ def place_in_series(values: FloatArray) -> tuple[IntArray, IntArray] | None:
     levels or more. The longest series have all levels, and their means define the levels. A shorter series keeps its
     order; its values go to the levels with the least sum of squared differences.
     """
-    falls = np.diff(values) < -_RESTART_SHARE * np.ptp(values)
+    falls = np.diff(values) < -_RESTART_FRACTION * np.ptp(values)
     repeat = np.concatenate([[0], np.cumsum(falls)]).astype(np.int64)
     length = np.bincount(repeat)
     steps = np.diff(values)[~falls]
-    if len(length) < 2 or length.max() < 3 or np.mean(steps > 0) < _RISING_SHARE:
+    if len(length) < 2 or length.max() < 3 or np.mean(steps > 0) < _RISING_FRACTION:
         return None
     complete = [values[repeat == number] for number in np.flatnonzero(length == length.max())]
     means = np.mean(complete, axis=0)

@@ -20,7 +20,7 @@ from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import Slices, find_streams, import_mat
 
 # "Using 272 of the 896 channels achieves 80% accuracy", relative to all channels.
-PAPER_CHANNELS, PAPER_SHARE = 272, 0.8
+PAPER_CHANNELS, PAPER_FRACTION = 272, 0.8
 # Every number up to here, then evenly spaced logarithms.
 _EVERY_COUNT, _N_COUNTS = 64, 30
 _SIDE = "right"
@@ -170,8 +170,8 @@ def _draw_regressions(axes: Axes, regressions: Sequence[ChannelRegression]) -> N
                 color=_SHADES[2],
                 label=f"R², {regression.ranking}",
             )
-    axes.axhline(PAPER_SHARE, color="black", linewidth=0.8, linestyle=":")
-    axes.plot(PAPER_CHANNELS, PAPER_SHARE, "D", color="black", label=f"paper: {PAPER_CHANNELS} channels, 80 %")
+    axes.axhline(PAPER_FRACTION, color="black", linewidth=0.8, linestyle=":")
+    axes.plot(PAPER_CHANNELS, PAPER_FRACTION, "D", color="black", label=f"paper: {PAPER_CHANNELS} channels, 80 %")
     axes.set(
         xscale="log",
         ylim=(0, 1.15),

@@ -21,7 +21,13 @@ from shearloop.bank.mesh import Mesh
 from shearloop.bank.models import MODELS
 from shearloop.studies.charts.bank_figures import evenly_spread, models_figure, signal_figure
 from shearloop.studies.reproduce.analysis import DiameterResult, Matches, ModelScores, TorqueResult
-from shearloop.studies.reproduce.dataset import PAPER_CHANNELS, PAPER_SHARE, ChannelRegression, Twists, dataset_figure
+from shearloop.studies.reproduce.dataset import (
+    PAPER_CHANNELS,
+    PAPER_FRACTION,
+    ChannelRegression,
+    Twists,
+    dataset_figure,
+)
 from shearloop.tools.drawing import figure, lay_out
 from shearloop.words import counted
 
@@ -79,7 +85,7 @@ def json_text(found: Reproduction) -> str:
         "model_scores": models.chosen if models else dict.fromkeys(MODELS),
         "torque_rmse_nm_cross_validated": torque and torque.rmse_nm,
         "torque_regression_r_share": regression and regression.r_share_at(PAPER_CHANNELS),
-        "torque_regression_channels_for_80_percent_of_r2": regression and regression.counts_reaching(PAPER_SHARE),
+        "torque_regression_channels_for_80_percent_of_r2": regression and regression.counts_reaching(PAPER_FRACTION),
         "bank_valid_cells": int(found.banks["wide"].valid.sum()),
         "paper_region_agreement": found.region_agreement(),
     }
@@ -99,9 +105,9 @@ def table(found: Reproduction) -> str:
         ]
     for regression in found.regressions[:1]:
         share = _number(regression.r_share_at(PAPER_CHANNELS))
-        needed = _count_range(regression.counts_reaching(PAPER_SHARE))
+        needed = _count_range(regression.counts_reaching(PAPER_FRACTION))
         rows += [
-            (f"linear regression: r of {PAPER_CHANNELS} channels over r of all", f"{PAPER_SHARE:.4f}", share),
+            (f"linear regression: r of {PAPER_CHANNELS} channels over r of all", f"{PAPER_FRACTION:.4f}", share),
             ("linear regression: channels for 80 % of R²", str(PAPER_CHANNELS), needed),
         ]
     if diameter := found.diameter:
@@ -157,7 +163,7 @@ def explanations(found: Reproduction) -> list[str]:
 
 
 def _regression_explanation(regressions: Sequence[ChannelRegression]) -> str:
-    by_all, by_fitted = (_count_range(regression.counts_reaching(PAPER_SHARE)) for regression in regressions)
+    by_all, by_fitted = (_count_range(regression.counts_reaching(PAPER_FRACTION)) for regression in regressions)
     return (
         "Linear regression: least squares on the best channels, each part of the recording left out and predicted. "
         "R² first has 80 % of all channels' at the smaller number and keeps it from the larger one: "

@@ -27,7 +27,7 @@ _CURVES: dict[Quantity, tuple[tuple[int, ...], int, bool]] = {
     "diameter": ((1,), 1, False),
 }
 # With a block left out, enough remain for the torque's curve.
-_LEAST_SLICES, _LEAST_FOR_CURVE = 10, 15
+_MIN_SLICES, _MIN_FOR_CURVE = 10, 15
 
 
 class SliceCurve(Estimator):
@@ -59,7 +59,7 @@ def prepared(name: EstimatorName, physics: Physics, table: ChannelTable) -> Esti
 
 def least_slices(estimator: Estimator) -> int:
     """Return how many slices with a torque an estimator needs."""
-    return _LEAST_FOR_CURVE if isinstance(estimator, SliceCurve) else _LEAST_SLICES
+    return _MIN_FOR_CURVE if isinstance(estimator, SliceCurve) else _MIN_SLICES
 
 
 def uses_amplitude(estimator: Estimator) -> bool:

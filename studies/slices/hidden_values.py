@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.estimation.interval_fit import LEAST_FRAMES
+from shearloop.estimation.interval_fit import MIN_FRAMES
 from shearloop.estimation.intervals import ValueRange
 from shearloop.estimation.ridge import Ridge
 from shearloop.studies.slices.curve import CurveMean
@@ -17,7 +17,7 @@ from shearloop.studies.slices.curve import CurveMean
 # than half of the way beyond.
 _AT_END, _LARGEST_SHORTFALL = 0.2, 0.5
 # Left-out values count as at least this far beyond the rest, in spans: noise would dominate a shorter distance.
-_LEAST_DISTANCE = 0.05
+_MIN_DISTANCE = 0.05
 # Values up to this many spans beyond the range can look familiar. Slices of 0.14 N·m do after a calibration below
 # 0.06, 1.6 spans beyond, and no slice lies further (`extrapolation-torque-slices` of docs/charts.md).
 _UNSEEN = 2.0
@@ -79,12 +79,12 @@ def _range_end(
         return float(np.median(sign * by.predict(features[rows])))
 
     end, outermost = float(outward.min()), median(point, order[: max(n_out // 2, 1)])
-    if len(kept) < LEAST_FRAMES or np.ptp(values[kept]) == 0:
+    if len(kept) < MIN_FRAMES or np.ptp(values[kept]) == 0:
         # Untestable: no prediction as far out as the outermost ones now is known to be right.
         return sign * max(end, outermost)
     inside, true = float(outward[kept].min()), float(np.median(outward[out]))
     if not median(refit_line(kept), out) - true > _LARGEST_SHORTFALL * (inside - true) > 0:
         return -sign * math.inf
     span = float(np.ptp(values))
-    shortfall = (median(refit(kept), out) - inside) / max(inside - true, _LEAST_DISTANCE * span)
+    shortfall = (median(refit(kept), out) - inside) / max(inside - true, _MIN_DISTANCE * span)
     return sign * max(end, end + shortfall * _LIKELY_UNSEEN * span, outermost)

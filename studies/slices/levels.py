@@ -3,7 +3,7 @@
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.estimation.left_out import LEAST_BEFORE_ORIGIN, later_origins
+from shearloop.estimation.left_out import MIN_BEFORE_ORIGIN, later_origins
 
 # Values within this fraction of their range have one level: a little more than half the distance between ten levels.
 NEAR_LEVEL = 0.06
@@ -22,7 +22,7 @@ def later_levels(values: FloatArray) -> list[tuple[IntArray, IntArray]]:
         parts: dict[bytes, tuple[IntArray, list[int]]] = {}
         for row in later.tolist():
             rest = earlier[np.abs(values[earlier] - values[row]) > near]
-            kept = rest if len(rest) >= LEAST_BEFORE_ORIGIN else earlier
+            kept = rest if len(rest) >= MIN_BEFORE_ORIGIN else earlier
             _, rows = parts.setdefault(kept.tobytes(), (kept, []))
             rows.append(row)
         found += [(kept, np.array(rows)) for kept, rows in parts.values()]

@@ -15,24 +15,24 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import LEVEL
-from shearloop.estimation.fingertip_validator import LARGEST_UNUSABLE_SHARE
+from shearloop.estimation.fingertip_validator import LARGEST_UNUSABLE_FRACTION
 from shearloop.estimation.left_out import later_origins, left_out_blocks
 
 # Margins beyond the largest Q and T² of blocks left out. Later recorded slices stay within 1.37 and 1.5 times of them
 # after two repeats, and within once after four.
 _Q_MARGIN, _T2_MARGIN = 1.45, 1.65
-_LEAST_OUTLYING, _OUTLYING_SPREADS = 0.05, 5.0
-_LEAST_DIFFERENCES = 8
-_MOST_DIRECTIONS = 4
+_MIN_OUTLYING, _OUTLYING_SPREADS = 0.05, 5.0
+_MIN_DIFFERENCES = 8
+_MAX_DIRECTIONS = 4
 # T² uses value and main drift. Single calibration frames extend far along the shorter directions.
 _T2_DIRECTIONS = 2
 # A frame with less than half of its fingertip's own response counts as one with half.
-_MOST_MISSING = 0.5
+_MAX_MISSING = 0.5
 # Directions of slices that the reciprocity check ignores, and its margin beyond the largest residual of blocks left
 # out: later slices stay within 1.39 times of it after two repeats, and within 0.8 times after four.
 _RECIPROCITY_DIRECTIONS, _RECIPROCITY_MARGIN = 12, 1.5
 # Less than this share of a slice is rounding: a board's converter alone makes thousands of times as much.
-_LEAST_NOISE = 1e-6
+_MIN_NOISE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,8 +96,8 @@ class NoveltyDetector:
     def fit(cls, differences: FloatArray, table: ChannelTable) -> Self:
         """Fit to (n, c) differences in time order; the limits come from blocks of time left out in turn."""
         n, every = len(differences), np.ones(table.n_channels, dtype=np.bool_)
-        if n < _LEAST_DIFFERENCES:
-            raise CalibrationError(f"too few slices to calibrate on: {n}; record {_LEAST_DIFFERENCES}")
+        if n < _MIN_DIFFERENCES:
+            raise CalibrationError(f"too few slices to calibrate on: {n}; record {_MIN_DIFFERENCES}")
         _check_slices(differences)
         q_and_outlying, t2, responses = [], [], []
         for rest, block in left_out_blocks(n):
@@ -113,7 +113,7 @@ class NoveltyDetector:
             whole,
             least_norm=least,
             largest_q=_Q_MARGIN * float(largest_q),
-            largest_outlying=max(_Q_MARGIN * float(outlying), _LEAST_OUTLYING),
+            largest_outlying=max(_Q_MARGIN * float(outlying), _MIN_OUTLYING),
             largest_t2=_T2_MARGIN * largest_t2,
             reciprocity=ReciprocityCheck.fit(differences, table),
             typical_response=float(np.quantile(responses, LEVEL)),
@@ -122,8 +122,8 @@ class NoveltyDetector:
     @classmethod
     def _model(cls, differences: FloatArray) -> Self:
         mean, spread, s, vt = _principal_components(differences)
-        rank = min(_MOST_DIRECTIONS, len(differences) // 4)
-        if np.sqrt((s[rank:] ** 2).sum()) <= _LEAST_NOISE * s[0]:
+        rank = min(_MAX_DIRECTIONS, len(differences) // 4)
+        if np.sqrt((s[rank:] ** 2).sum()) <= _MIN_NOISE * s[0]:
             raise CalibrationError(
                 "the slices have no noise: they are multiples or sums of a few; record slices as they come"
             )
@@ -161,7 +161,7 @@ class NoveltyDetector:
 
     def reasons(self, difference: FloatArray, usable: BoolArray) -> tuple[str, ...]:
         """Return the reason against a (c,) difference, by its usable channels, if there is one."""
-        if 1.0 - usable.mean() > LARGEST_UNUSABLE_SHARE:
+        if 1.0 - usable.mean() > LARGEST_UNUSABLE_FRACTION:
             return (f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; check the ribbon cable",)
         size = float(np.sqrt((difference[usable] ** 2).mean()))
         if size < self.least_norm:
@@ -195,7 +195,7 @@ class NoveltyDetector:
         if self.typical_response <= 0:
             return 0.0
         left = self.response_share(difference, usable) / self.typical_response
-        return min(max(1.0 - left, 0.0), _MOST_MISSING)
+        return min(max(1.0 - left, 0.0), _MAX_MISSING)
 
 
 def _principal_components(rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -218,12 +218,12 @@ def _check_slices(differences: FloatArray) -> None:
     """Raise CalibrationError for (n, c) differences that are alike, or with too many constant channels."""
     n = len(differences)
     with np.errstate(over="ignore"):
-        rounding_v = _LEAST_NOISE * np.sqrt((differences**2).mean())
+        rounding_v = _MIN_NOISE * np.sqrt((differences**2).mean())
     for rows in fitted_parts(n):
         still = np.ptp(differences[rows], axis=0) <= rounding_v
         if still.all():
             raise CalibrationError(f"{len(rows)} of the {n} slices are all alike; record slices as they come")
-        if still.mean() > LARGEST_UNUSABLE_SHARE:
+        if still.mean() > LARGEST_UNUSABLE_FRACTION:
             raise CalibrationError(
                 f"in {len(rows)} of the {n} slices {100 * still.mean():.0f} % of the channels never change: they are "
                 "dead or saturated; check the ribbon cable and the gel's contact with the electrodes, and record again"

@@ -13,7 +13,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.estimation.interval_fit import INFLATION, best_strength, check_values
-from shearloop.estimation.intervals import LEAST_HALF_WIDTH, Intervals, student_inflation
+from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals, student_inflation
 from shearloop.estimation.left_out import LeftOut, left_out_blocks
 from shearloop.estimation.values import INLINE
 from shearloop.studies.slices.curve import CurveMean
@@ -95,7 +95,7 @@ def fit_slice_regressor(
     predicted = np.concatenate([part.predict(features[later]) for part, (_, later) in zip(parts, blocks, strict=True)])
     rows = np.concatenate([later for _, later in blocks])
     point, centre = fit(features, values, strength), features.mean(axis=0)
-    least = LEAST_HALF_WIDTH * float(np.ptp(values))
+    least = MIN_HALF_WIDTH * float(np.ptp(values))
     intervals = Intervals.fit(predicted, predicted - values[rows], (), _inflation(point, rows, left_out), least)
     if fit_line is None:
         return SliceRegressor(point, intervals, SliceRange(float(values.min()), float(values.max())), centre)

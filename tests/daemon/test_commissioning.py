@@ -12,7 +12,7 @@ from shearloop.daemon.commissioning import (
     CAPPED_M_PER_S,
     CAPPED_NM,
     CAPPED_RAD_PER_S,
-    MOST_AGE_DAYS,
+    MAX_AGE_DAYS,
     NOTHING_SUPPLIED,
     Line,
     Report,
@@ -131,10 +131,10 @@ def with_a_stage_of(report: Report, date: datetime) -> Report:
         (lambda report: changed(report, script_sha256="0"), NOW, "the script for the robot"),
         (lambda report: changed(report, ur_rtde="1.0"), NOW, "the version of ur-rtde"),
         (lambda report: report.model_copy(update={"stages": ()}), NOW, "no stage"),
-        (lambda report: report, NOW + timedelta(days=MOST_AGE_DAYS, hours=1), "older than"),
+        (lambda report: report, NOW + timedelta(days=MAX_AGE_DAYS, hours=1), "older than"),
         (lambda report: report, NOW - timedelta(days=2), "in the future"),
         (lambda report: with_a_stage_of(report, NOW + timedelta(days=2)), NOW, "in the future"),
-        (lambda report: with_a_stage_of(report, NOW - timedelta(days=MOST_AGE_DAYS + 1)), NOW, "older than"),
+        (lambda report: with_a_stage_of(report, NOW - timedelta(days=MAX_AGE_DAYS + 1)), NOW, "older than"),
     ],
 )
 def test_a_report_that_does_not_count_raises_and_supplies_nothing(tmp_path, change, now, why):

@@ -16,7 +16,7 @@ from shearloop.cli import command, main
 from shearloop.daemon import experiment_files
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.control.experiment_schema import MOST_ANGLES_IN_ALL, MOST_STEPS
+from shearloop.daemon.control.experiment_schema import MAX_ANGLES_IN_ALL, MAX_STEPS
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.experiment_files import ExperimentFiles, read_experiment
 from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
@@ -167,13 +167,13 @@ async def test_a_reply_has_no_content_of_a_file(text, folder, log):
 
 
 async def test_the_event_loop_goes_on_while_a_large_file_is_read(folder):
-    steps = [{"do": "wait", "wait_s": number % 7 + 0.5} for number in range(MOST_STEPS)]
+    steps = [{"do": "wait", "wait_s": number % 7 + 0.5} for number in range(MAX_STEPS)]
     files, beats = ExperimentFiles((folder,)), 0
     reading = asyncio.create_task(files.read(write(folder / "large.yaml", {**VALID, "steps": steps})))
     while not reading.done():
         await asyncio.sleep(0)
         beats += 1
-    assert len(reading.result().file.steps) == MOST_STEPS
+    assert len(reading.result().file.steps) == MAX_STEPS
     assert beats > 10
 
 
@@ -348,9 +348,9 @@ async def test_as_many_requests_wait_for_a_file_as_leave_room_for_others(folder,
 @pytest.mark.parametrize(
     ("steps", "said"),
     [
-        ([{"do": "wait", "wait_s": 1}] * (MOST_STEPS + 1), f"at most {MOST_STEPS}"),
-        ([{"do": "twist", "angles_rad": "0:1:1000"}] * 5, f"5000 angles in all, .* at most {MOST_ANGLES_IN_ALL}"),
-        ([{"do": "twist", "angles_rad": [0.1] * (MOST_ANGLES_IN_ALL + 1)}], f"at most {MOST_ANGLES_IN_ALL}"),
+        ([{"do": "wait", "wait_s": 1}] * (MAX_STEPS + 1), f"at most {MAX_STEPS}"),
+        ([{"do": "twist", "angles_rad": "0:1:1000"}] * 5, f"5000 angles in all, .* at most {MAX_ANGLES_IN_ALL}"),
+        ([{"do": "twist", "angles_rad": [0.1] * (MAX_ANGLES_IN_ALL + 1)}], f"at most {MAX_ANGLES_IN_ALL}"),
     ],
 )
 def test_an_experiment_whose_plan_would_take_long_is_refused(steps, said, folder):

@@ -9,7 +9,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.fingertip_validator import (
     _JUMP_NOISES,
     _JUMP_V,
-    LEAST_NOISE_V,
+    MIN_NOISE_V,
     FingertipSet,
     FingertipValidator,
     GripParts,
@@ -44,7 +44,7 @@ def test_noise_is_what_is_fast():
     still = np.ones((20, 896))
     still[:, 5:] += np.random.default_rng(0).normal(0, 1e-5, (20, 891))
     assert np.isinf(channel_noise(still)[:5]).all()
-    np.testing.assert_allclose(channel_noise(still)[5:], LEAST_NOISE_V)
+    np.testing.assert_allclose(channel_noise(still)[5:], MIN_NOISE_V)
 
 
 @pytest.mark.parametrize("gain", [0.85, 1.0, 1.2])

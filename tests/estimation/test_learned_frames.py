@@ -75,7 +75,7 @@ def test_a_file_without_the_digests_loads_and_says_that_it_cannot_tell(motion_ca
 
 
 def test_digests_are_bounded_and_find_a_copy_all_the_same(monkeypatch):
-    monkeypatch.setattr("shearloop.estimation.learned_frames.MOST_DIGESTS", 50)
+    monkeypatch.setattr("shearloop.estimation.learned_frames.MAX_DIGESTS", 50)
     frames = np.random.default_rng(0).normal(size=(300, 2, 8))
     learned = LearnedFrames.of([frames[:100]]).with_frames([frames[100:200], frames[:100]])
     assert len(learned.digests) == 50

@@ -5,8 +5,8 @@ import pytest
 
 from shearloop.estimation import TRUSTED, fit
 from shearloop.estimation.motion_fit import (
+    MAX_DIRECTIONS,
     MEMORY_EDGES,
-    MOST_DIRECTIONS,
     Layout,
     choose_motion,
     mean_ridge,
@@ -74,7 +74,7 @@ def test_what_shrinks_is_divided_out():
 
 
 def test_a_nested_choice_takes_the_window_whose_directions_follow_the_torque():
-    windows = Layout(len(MEMORY_EDGES) - 1, 2, 3 * MOST_DIRECTIONS)
+    windows = Layout(len(MEMORY_EDGES) - 1, 2, 3 * MAX_DIRECTIONS)
     rng = np.random.default_rng(4)
     torque_nm = np.tile(TWIST, 8)
     features = rng.normal(0, 0.05, (len(torque_nm), len(windows.columns(12, 3, position=True))))
@@ -82,7 +82,7 @@ def test_a_nested_choice_takes_the_window_whose_directions_follow_the_torque():
     left_out = twists_left_out(torque_nm)
     chosen = choose_motion(features, torque_nm, windows, CensoredRidge.fit, left_out, position=False)
     assert {one.window for one in chosen.candidates} == {2}
-    assert chosen.first_direction == 2 * MOST_DIRECTIONS
+    assert chosen.first_direction == 2 * MAX_DIRECTIONS
     predicted = chosen.fit(features, torque_nm).predict(features)
     assert np.abs(np.maximum(predicted, 0.0) - torque_nm).max() < 0.01
     used = features[:, chosen.columns]

@@ -31,7 +31,7 @@ LOAD_SAMPLES: Final = 40
 # Of an emulated tool.
 _TOOL_MM: Final = 20.0
 # A torque that is known to 2 % has to be this many standard deviations high.
-_LEAST_NM: Final = 0.02
+_MIN_NM: Final = 0.02
 # Three times the noise of an e-Series' wrench in one sample: the moment is found to 20 ms.
 _PRESS_NM: Final = 0.2
 # Before and after a press each device has to show a level.
@@ -186,7 +186,7 @@ def _weigh(context: Context, load: Arrivals[LoadSample], rate_hz: float) -> list
     rest = load.take(LOAD_SAMPLES, SILENT_S)
     known_nm = operator.number(
         "Load the lever with a known torque and let it rest; its size in N·m (mass × 9.81 × arm)",
-        *(_LEAST_NM, 5.0),
+        *(_MIN_NM, 5.0),
         Played("the torque that you type is put on it for you, for instance 0.1", ("weigh {}",)),
     )
     loaded = load.take(LOAD_SAMPLES, SILENT_S)

@@ -18,7 +18,7 @@ from shearloop.tools.commission.report import Measured, judged, percentile_99
 STAGE: Final = "2 gripper"
 WIDTH_MM: Final = 1.0
 # Any two widths lie on a line.
-LEAST_WIDTHS: Final = 3
+MIN_WIDTHS: Final = 3
 # The driver gives up then: a reset, its pause, and twice the stroke.
 LONGEST_ACTIVATION_S: Final = (RESET_DEADLINE_NS + PAUSE_NS + ACTIVATION_DEADLINE_NS) / 1e9
 # Emulated objects, as fractions of the stroke.
@@ -107,8 +107,8 @@ def _close_and_open(context: Context, gripper: Gripper, what: str) -> GripperSta
 def judge_widths(gauges: Sequence[tuple[float, float]], config: GripperConfig) -> tuple[Line, Supplied]:
     """Return the line on a table of widths through gauges, and the table."""
     limit, promise = f"± {WIDTH_MM:g} mm", "diameters are right"
-    if len({width_mm for _, width_mm in gauges}) < LEAST_WIDTHS:
-        few = f"fewer than {LEAST_WIDTHS} different widths, which no other width confirms: run the stage again"
+    if len({width_mm for _, width_mm in gauges}) < MIN_WIDTHS:
+        few = f"fewer than {MIN_WIDTHS} different widths, which no other width confirms: run the stage again"
         return judged("widths", few, limit, promise, passed=False, count=len(gauges)), Supplied()
     try:
         errors_mm = [_error_mm(gauge, gauges, config.model) for gauge in gauges]

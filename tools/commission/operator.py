@@ -15,7 +15,7 @@ GO_ON: Final = "continue"
 # Answers that end the commissioning at once, an empty line among them.
 _NO: Final = ("", "no")
 # Wrong answers until the commissioning ends.
-_MOST_TRIES: Final = 3
+_MAX_TRIES: Final = 3
 
 
 class DeclinedError(UserError):
@@ -63,7 +63,7 @@ class Operator:
 
     def number(self, question: str, low: float, high: float, played: Played | None = None) -> float:
         """Return a number within a range; raises UserError after some other answers."""
-        for _ in range(_MOST_TRIES):
+        for _ in range(_MAX_TRIES):
             answer = self.ask(f"{question} ({low:g} to {high:g}):", played)
             with contextlib.suppress(ValueError):
                 if low <= (value := float(answer)) <= high:
@@ -74,7 +74,7 @@ class Operator:
 
     def choose(self, question: str, choices: Sequence[str], played: Played | None = None) -> str:
         """Return the chosen word; raises UserError after some other answers."""
-        for _ in range(_MOST_TRIES):
+        for _ in range(_MAX_TRIES):
             answer = self.ask(f"{question} {' or '.join(choices)}?", played).lower()
             if answer in choices:
                 return answer
@@ -106,7 +106,7 @@ class Operator:
 
     def _confirm(self, question: str, word: str, declined: str) -> None:
         """Return once the word was typed. A word that is misspelt is asked for again; raises DeclinedError."""
-        for _ in range(_MOST_TRIES):
+        for _ in range(_MAX_TRIES):
             answer = self.ask(question)
             if answer == word:
                 return

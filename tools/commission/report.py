@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 
-from shearloop.daemon.commissioning import MOST_AGE_DAYS, NOTHING_SUPPLIED, Line, Report, Supplied, Verdict, load_report
+from shearloop.daemon.commissioning import MAX_AGE_DAYS, NOTHING_SUPPLIED, Line, Report, Supplied, Verdict, load_report
 from shearloop.daemon.rig_identity import RigIdentity
 from shearloop.errors import UserError
 from shearloop.yaml_files import save_yaml
@@ -54,7 +54,7 @@ def page_of(report: Report, unmeasured: Sequence[str] = ()) -> str:
         "<p>A record of measurements, not a safety function: only the pendant's safety configuration is rated.</p>",
         f"<p>Robot {escape(rig.robot_serial_number or 'without a serial number')}, PolyScope {escape(rig.polyscope)}, "
         f"ur-rtde {escape(rig.ur_rtde)}. SHA-256: devices {rig.configuration_sha256[:16]}, robot's settings "
-        f"{rig.robot_settings_sha256[:16]}, script {rig.script_sha256[:16]}. It counts for {MOST_AGE_DAYS} days after "
+        f"{rig.robot_settings_sha256[:16]}, script {rig.script_sha256[:16]}. It counts for {MAX_AGE_DAYS} days after "
         "its oldest stage.</p>",
     ]
     for stage in report.stages:

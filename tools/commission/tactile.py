@@ -18,7 +18,7 @@ from shearloop.tools.commission.listening import SILENT_S
 # Estimates that are averaged.
 ESTIMATES: Final = 3
 # Frames without an estimate: after a grip an estimator needs some frames of it.
-_MOST_FRAMES: Final = 60
+_MAX_FRAMES: Final = 60
 
 
 class TactileSensor:
@@ -50,7 +50,7 @@ class TactileSensor:
         self._session.tare()
         self._from_ns = dict.fromkeys(self._boards, now_ns + round(0.5e9 * self._period_s))
         reason = ""
-        for _ in range(_MOST_FRAMES):
+        for _ in range(_MAX_FRAMES):
             for estimate in self._next():
                 reason = "; ".join(estimate.reasons)
             if not self._session.taring:
@@ -62,7 +62,7 @@ class TactileSensor:
         # The first frame may have begun before now.
         self._next()
         torques_nm: list[float] = []
-        for _ in range(_MOST_FRAMES):
+        for _ in range(_MAX_FRAMES):
             torques_nm += [estimate.torque_nm for estimate in self._next() if estimate.torque_nm is not None]
             if len(torques_nm) >= ESTIMATES:
                 return statistics.fmean(torques_nm)

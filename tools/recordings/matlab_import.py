@@ -49,11 +49,11 @@ _LONGEST_ELAPSED_S = 31 * 86_400.0
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
 _SHORTEST_FRAME_S = 0.05
 # Lines that were stamped late are fewer than this fraction.
-_MOST_LATE = 0.1
+_MAX_LATE = 0.1
 # A cable damages fewer values than this fraction: the two recorded cases are one load value in a hundred.
-_MOST_DAMAGED = 0.1
+_MAX_DAMAGED = 0.1
 # Damaged values occur singly. This number in a row is a twist, in another unit.
-_MOST_IN_A_ROW = 4
+_MAX_IN_A_ROW = 4
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 # Among this many frames on either side, at least one should have been read without delay.
@@ -61,16 +61,16 @@ _NEIGHBOURS = 12
 # Four frames. A board gives ten values a second, a loop of the paper's two.
 _LOAD_PAUSE_S = 2.0
 # After a missing frame the stamps are higher by this fraction of a period. A late frame does not count.
-_LEAST_MISSING = 0.8
+_MIN_MISSING = 0.8
 # Fewer frames after a gap, at the end, may all be late.
-_LEAST_AFTER = 4
+_MIN_AFTER = 4
 # The load cell's board sends a line every 91.6 ms.
 LOAD_PERIOD_S = 0.0916
 _CYLINDER = re.compile(r"(\d+(?:\.\d+)?)mm[_.]")
 # Stamps of frames and load that differ less than this, row by row, come from one loop.
 _ONE_LOOP_S = 0.02
 # A loop waited for its load values where this many end within this time of the line below all of them.
-_LEAST_PACED, _PACED_S = 3, 0.03
+_MIN_PACED, _PACED_S = 3, 0.03
 # The paper's loop began to read this long after the load cell's board began to send. Recordings show 2.4 to 2.8 s by
 # their stamps, ± 0.27 s each, and 2.7 s by the gel's motion: one program, one delay. A loop with stamps
 # that differ by more than the second number comes from another program.
@@ -172,7 +172,7 @@ def _check_times(path: Path, times: FloatArray, time_format: str, shortest_s: fl
     if _fits(times, time_format, shortest_s):
         steps_s = steps * TIME_FORMATS[time_format].unit_s
         fallen = int((steps_s < 0).sum())
-        if fallen > max(1, _MOST_LATE * len(steps_s)):
+        if fallen > max(1, _MAX_LATE * len(steps_s)):
             first = int(np.argmax(steps_s < 0)) + 2
             raise UserError(
                 f"{path}: {fallen} rows are before the row above them, row {first} first: sort the rows by their times"
@@ -377,7 +377,7 @@ def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | Non
 def _check_volts(path: Path, lines: FloatArray) -> None:
     """Raise UserError where more values of lines (n, 1024) in volts are impossible than a cable damages."""
     beyond = np.count_nonzero((lines < 0) | (lines > ADC_REFERENCE_V))
-    if beyond > _MOST_DAMAGED * lines.size:
+    if beyond > _MAX_DAMAGED * lines.size:
         raise UserError(
             f"{path}: {beyond / lines.size:.0%} of the values are not within 0 to {ADC_REFERENCE_V:g} V, the range of "
             "the board's converter; write them in volts"
@@ -389,7 +389,7 @@ def _check_torques(path: Path, torques: FloatArray) -> None:
     is_beyond = np.abs(torques) > LARGEST_TORQUE_NM
     beyond = int(np.count_nonzero(is_beyond))
     in_a_row = max((len(list(run)) for large, run in itertools.groupby(is_beyond) if large), default=0)
-    if beyond > max(2, _MOST_DAMAGED * len(torques)) or in_a_row > _MOST_IN_A_ROW:
+    if beyond > max(2, _MAX_DAMAGED * len(torques)) or in_a_row > _MAX_IN_A_ROW:
         raise UserError(
             f"{path}: {beyond} of {counted(len(torques), 'load value')} are beyond {LARGEST_TORQUE_NM:g} N·m, so they "
             "have another unit; write them in N·m"
@@ -426,12 +426,12 @@ def pauses(arrivals_ns: Sequence[int]) -> list[int]:
     # Over a longer span late readings matter less, and over a shorter one fewer spans hold a pause.
     span = min(2 * _NEIGHBOURS, n // 8)
     period_ns = float(np.median(t_ns[span:] - t_ns[:-span])) / span
-    height, least_ns = t_ns - t_ns[0] - period_ns * np.arange(n), _LEAST_MISSING * period_ns
+    height, least_ns = t_ns - t_ns[0] - period_ns * np.arange(n), _MIN_MISSING * period_ns
     found: list[int] = []
     parts = [(0, n)]
     while parts:
         first, end = parts.pop()
-        latest = min(end - 1, n - _LEAST_AFTER)
+        latest = min(end - 1, n - _MIN_AFTER)
         risen = [at for at in range(first + 1, latest + 1) if _rise(height[first:end], at - first) >= least_ns]
         if risen:
             # The neighbours of a pause rise too. It is where the stamps are the furthest apart.
@@ -486,10 +486,10 @@ def _loop_clock(stamps_s: FloatArray) -> tuple[float, float] | None:
     then the load was sent at the next stamp. Frames were sent between the two stamps, in the middle on average.
     None where the stamps do not show this.
     """
-    if len(stamps_s) <= _LEAST_PACED:
+    if len(stamps_s) <= _MIN_PACED:
         return None
     latest_s = stamps_s[1:] - stamps_s[0] - LOAD_PERIOD_S * np.arange(len(stamps_s) - 1)
-    if np.count_nonzero(latest_s <= latest_s.min() + _PACED_S) < _LEAST_PACED:
+    if np.count_nonzero(latest_s <= latest_s.min() + _PACED_S) < _MIN_PACED:
         return None
     return float(latest_s.min()), float(np.median(np.diff(stamps_s))) / 2
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.margins import (
-    MOST_GAIN,
+    MAX_GAIN,
     LoopModel,
     characteristic_polynomial,
     gain_for_noise,
@@ -191,7 +191,7 @@ def test_the_gain_is_the_largest_that_the_noise_allows():
     kp = gain_for_noise(0.012, 0.002)
     assert noise_share(kp, integral_gain(kp)) * 0.012 <= 0.002
     assert noise_share(1.05 * kp, integral_gain(1.05 * kp)) * 0.012 > 0.002
-    assert gain_for_noise(1e-6, 0.002) == MOST_GAIN
+    assert gain_for_noise(1e-6, 0.002) == MAX_GAIN
 
 
 def test_a_sound_controller_is_not_refused():

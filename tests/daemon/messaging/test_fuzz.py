@@ -26,7 +26,7 @@ from tests.fixtures.robots import write_filled_in
 FRAMES = REQUESTS = 50_000
 DEADLINE_S = 120
 # What the daemon may keep of it all: caches, free lists, its sockets' buffers.
-MOST_GROWTH_MB = 16.0
+MAX_GROWTH_MB = 16.0
 COMMANDS = ("tare", "start", "pause", "resume", "stop", "status", "unlock")
 
 
@@ -119,7 +119,7 @@ async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, tmp_p
         assert daemon.rig.control_loop.experiment is None
         assert not daemon.supervisor.dead
         assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
-        assert resident_memory_mb() - before_mb < MOST_GROWTH_MB
+        assert resident_memory_mb() - before_mb < MAX_GROWTH_MB
         assert len(asyncio.all_tasks()) <= tasks + command_server.MAX_CONCURRENT
         status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
         assert status == {True: 1}, "stop is heard in the middle of it all"

@@ -24,7 +24,7 @@ from tests.running import LinkEvents
 
 STEP_S = 0.01
 # Between two looks of the driver at its clock.
-MOST_STEPS = 20
+MAX_STEPS = 20
 CALIBRATION = WidthCalibration(open_counts=3.0, open_mm=140.0, closed_counts=230.0, std_mm=0.4)
 WAYS = pytest.mark.parametrize("way", ["socket", "modbus"])
 
@@ -34,13 +34,13 @@ class Rig:
     model: Gripper
     server: Server
     t_s: float = 0.0
-    steps_left: int = MOST_STEPS
+    steps_left: int = MAX_STEPS
     stopped: bool = False
     driver: RobotiqGripper = field(init=False)
     link: LinkEvents = field(default_factory=LinkEvents)
 
     def monotonic_ns(self) -> int:
-        self.steps_left = MOST_STEPS
+        self.steps_left = MAX_STEPS
         return round(self.t_s * 1e9)
 
     def silence(self, silent: bool) -> None:

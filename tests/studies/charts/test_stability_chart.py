@@ -114,7 +114,7 @@ def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged(t
 
 def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(slices, bank, monkeypatch, capsys):
     # A twentieth is too few for an estimator.
-    monkeypatch.setattr(stability, "CALIBRATED_SHARES", (0.5, 0.05))
+    monkeypatch.setattr(stability, "CALIBRATED_FRACTIONS", (0.5, 0.05))
     some = slices.whole.between(0, 40)
     # A slice of unknown torque is in neither part.
     torque_nm = some.torque_nm.copy()

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
@@ -95,10 +95,12 @@ class GripperTask:
         """
         state = await self.gripper.read()
         if isinstance(target, Opening):
-            if state.object is not ObjectStatus.AT_TARGET or self._unfelt(state):
+            closed = self._unfelt(state) and state.opened is False
+            if state.object is not ObjectStatus.AT_TARGET or closed:
                 return target.width_mm if target.width_mm > state.width_mm + MIN_OPENING_MM else LARGEST_STROKE_MM
             if state.width_mm >= target.width_mm:
-                self._take(state)
+                self.gripper.take_as_open()
+                self._take(replace(state, opened=True))
                 return None
             return target.width_mm
         may_hold = state.object is not ObjectStatus.AT_TARGET or self._unfelt(state)
@@ -194,7 +196,7 @@ class GripperTask:
         return not self.measures_diameters or state.width_mm > TOUCHING_STDS * state.width_std_mm
 
     def _unfelt(self, state: GripperState) -> bool:
-        """Return whether the fingers have closed to their target: they may hold an object of just that width.
+        """Return whether the fingers stand at their target, and did not open to it: an object as wide is not felt.
 
         The detection of objects "is precise only to the order of a few mm" (manual of the 2F-140, object detection).
         """

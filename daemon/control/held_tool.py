@@ -179,7 +179,7 @@ class HeldTool:
         elif gripper.uncertain:
             doubt = "stand where a stop, an activation or a lack of power has left them"
         elif gripper.unfelt:
-            doubt = "have closed to their target, where a tool of that width is not felt"
+            doubt = "stand at their target, where a tool of that width is not felt"
         else:
             return None
         width = f"{gripper.width_mm:.1f} mm apart"

@@ -33,10 +33,10 @@ class GripperStatus:
     """State of the gripper, as far as the loop needs it.
 
     `uncertain`: the gripper cannot say whether it holds an object, because it is inactive, lost its power, or was
-    stopped on its way. `unfelt`: the fingers have closed to their target, and an object as wide as that would not be
-    felt. `requested_counts`: the position of the last request of any program. `others_requests`: the
-    number of requests of other programs. `inactive`: it activates before its next motion, which opens and closes
-    the fingers once. `too_hot`: it refuses a grip, and activates before it opens.
+    stopped on its way. `unfelt`: the fingers stand at a target that they did not open to, where an object as wide would
+    not be felt. `requested_counts`: the position of the last request of any program. `others_requests`: the number of
+    requests of other programs. `inactive`: it activates before its next motion, which opens and closes the fingers
+    once. `too_hot`: it refuses a grip, and activates before it opens.
     """
 
     t_ns: int

@@ -37,6 +37,8 @@ RESET_DEADLINE_NS = 3_000_000_000
 ACTIVATION_DEADLINE_NS = 15_000_000_000
 # The full stroke at the slowest speed takes 4.7 s.
 MOTION_DEADLINE_NS = 10_000_000_000
+# The position of standing fingers may waver by this.
+STANDING_COUNTS = 2
 _NO_COMMUNICATION = 9
 
 
@@ -63,9 +65,9 @@ class RobotiqGripper:
     # The latest readout since the last request, and its beginning.
     _latest: tuple[messages.Readout, int] | None = field(default=None, init=False)
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False)
-    # The latest position over this connection, and whether the latest change of it has opened the fingers.
+    # The latest position over this connection at which they stood, and whether they have opened to it.
     _position: int | None = field(default=None, init=False)
-    _opened: bool = field(default=False, init=False)
+    _opened: bool | None = field(default=None, init=False)
 
     @property
     def model(self) -> GripperModel:
@@ -83,7 +85,7 @@ class RobotiqGripper:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
         await self._exchange(self.client.connect)
         self.connected, self._loss = True, None
-        self._position, self._opened = None, False
+        self._position, self._opened = None, None
         self._requests.on_connection()
         return await self.read()
 
@@ -271,9 +273,14 @@ class RobotiqGripper:
 
     def _follow(self, position: int) -> None:
         """Note which way the fingers have moved; more counts are closer together."""
-        if self._position is not None and position != self._position:
-            self._opened = position < self._position
-        self._position = position
+        if self._position is None:
+            self._position = position
+        elif abs(position - self._position) > STANDING_COUNTS:
+            self._position, self._opened = position, position < self._position
+
+    def take_as_open(self) -> None:
+        """Take the fingers as opened where they stand: a release to this width has nothing to do."""
+        self._opened = True
 
     async def _recent(self) -> tuple[messages.Readout, int]:
         """Return the latest readout where `states` keeps it fresh, else a new one: each delays the next state."""

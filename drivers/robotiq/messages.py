@@ -142,8 +142,8 @@ class GripperState:
 
     width_mm ± width_std_mm is the width between the fingertips. `object` is MOVING until the gripper has taken up the
     last command. `requested_counts` is the position of the last request of any program. `others_requests` is the
-    number of requests of other programs since the process began. `opened`: the fingers' latest motion, of those that
-    were seen over this connection, has opened them.
+    number of requests of other programs since the process began. `opened`: whether the fingers' latest motion has
+    opened them; None where none was seen over this connection.
     """
 
     t_ns: int
@@ -156,7 +156,7 @@ class GripperState:
     fault: GripperFault
     requested_counts: int | None = None
     others_requests: int = 0
-    opened: bool = False
+    opened: bool | None = None
 
     @property
     def moves(self) -> bool:

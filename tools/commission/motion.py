@@ -74,7 +74,7 @@ def measure(context: Context) -> Measured:
     count, speed = context.counts.turns, min(SPEED_RAD_PER_S, context.settings.limits.wrist_speed_rad_per_s.inner)
     context.operator.allow(
         f"wrist 3 turns {count} times between {middle_rad - FIRST_TURN_RAD:.3f} and "
-        f"{middle_rad + FIRST_TURN_RAD:.3f} rad at {speed:g} rad/s; first take everything out of the gripper"
+        f"{middle_rad + FIRST_TURN_RAD:.3f} rad at {speed:g} rad/s, with an empty gripper"
     )
     turns = []
     mover.move("turn", rad_per_s=-speed, to_rad=middle_rad - FIRST_TURN_RAD)

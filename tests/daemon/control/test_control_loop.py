@@ -351,7 +351,7 @@ def test_a_grip_that_is_lost_says_what_the_fingers_do(sense, does):
     ("sense", "what"),
     [
         ({"uncertain": True}, "stand where a stop, an activation or a lack of power has left them"),
-        ({"unfelt": True}, "have closed to their target, where a tool of that width is not felt"),
+        ({"unfelt": True}, "stand at their target, where a tool of that width is not felt"),
         ({"moving": True}, "are moving"),
     ],
 )
@@ -393,7 +393,7 @@ def test_a_grip_that_may_meet_nothing_allows_turns_after_it():
     started(rig, {**GRIP, "expect_object": False}, TWIST_NOW, torque_source="load_cell")
     rig.run(20)
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
-    assert "have closed to their target" in (rig.control_loop.tool.may_still_hold or "")
+    assert "stand at their target" in (rig.control_loop.tool.may_still_hold or "")
 
 
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])

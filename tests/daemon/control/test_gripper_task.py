@@ -162,6 +162,24 @@ async def test_a_tool_as_wide_as_the_target_may_be_held_although_it_is_not_felt(
 
 
 @WAYS
+async def test_a_release_to_where_the_fingers_stand_moves_nothing_after_a_new_connection(way, tmp_path):
+    """An earlier program has opened them so far, perhaps because there is no room for more."""
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        felt = Felt()
+        task = task_of(rig, felt)
+        await task.release()
+        await task.grip(opening(60.0, 100.0))
+        await task.grip(GRIP.model_copy(update={"width_mm": 60.0, "expect_object": False}))
+        await rig.driver.close()
+        task.control_loop.on_gripper(task.status_of(await rig.driver.connect()))
+        assert felt[-1].unfelt, "nothing shows that they did not close on a tool of this width"
+        stood_mm = rig.model.width_mm
+        await task.grip(opening(stood_mm - 0.1, 100.0))
+        assert rig.model.width_mm == stood_mm
+        assert not felt[-1].may_hold
+
+
+@WAYS
 @pytest.mark.parametrize("measured", [True, False])
 async def test_fingertips_that_touch_hold_nothing_where_that_is_measured(way, tmp_path, measured):
     """Soft fingertips meet before the fingers' end, which the gripper takes for an object."""

@@ -362,6 +362,7 @@ def test_a_dead_daemon_is_shown_within_two_seconds(browsed):
               }).observe(document.querySelector('#link'), { subtree: true, childList: true, characterData: true });
             }"""
         )
+        browsed.until_complete()
         browsed.daemon.kill()
         browsed.until("#link-state", "✗ DAEMON SILENT")
         shown_after_s.append(page.evaluate("window.shownDead"))
@@ -413,6 +414,7 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
 
 def test_a_lost_viewer_is_shown_and_reconnects(browsed):
     page = browsed.open(token=True)
+    browsed.until_complete()
     browsed.viewer.kill()
     browsed.until("#link-state", "✗ VIEWER LOST")
     browsed.until_old(6)

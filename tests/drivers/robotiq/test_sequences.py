@@ -203,3 +203,13 @@ async def test_motion_without_an_end_is_reported(connect, readout, failure):
     client.readouts = [readout]
     with pytest.raises(messages.GripperFaultError, match=failure):
         await gripper.finish(sent)
+
+
+async def test_a_position_that_wavers_does_not_count_as_an_opening(connect):
+    """Closed to its target, the fingers may hold a tool of that width."""
+    closed = [replace(ACTIVE, pos=pos) for pos in (3, 90, 150, 149, 151, 150, 149)]
+    driver = connect(Client(*closed))
+    states = [await driver.connect(), *[await driver.read() for _ in closed[1:]]]
+    assert [state.opened for state in states] == [None, *[False] * 6]
+    driver.client.readouts = [replace(ACTIVE, pos=100)]
+    assert (await driver.read()).opened

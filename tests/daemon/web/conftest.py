@@ -167,17 +167,15 @@ class Browsed:
         except PlaywrightTimeoutError:
             assert self.page.evaluate(texts, dict(shown)) == shown
 
-    def until_complete(self) -> None:
-        """Wait until every message is shown: a panel whose message comes late could not become old."""
-        self.page.wait_for_function(
-            """() => !document.querySelector('#shear').hidden &&
-              ['torque-now', 'diameter', 'speed-sent', 'phase-name'].every(
-                (id) => document.getElementById(id).textContent !== '–')"""
-        )
-
     def until_old(self, count: int) -> None:
         """Wait until so many panels are marked as old."""
         self.page.wait_for_function("n => document.querySelectorAll('.panel.old').length === n", arg=count)
+
+    def until_all_old(self) -> None:
+        """Wait until every panel is marked as old, but for what has happened. How many depends on the tests before."""
+        self.page.wait_for_function(
+            "() => document.querySelectorAll('.panel:not([hidden]):not(.old):not(#happened)').length === 0"
+        )
 
 
 @pytest.fixture

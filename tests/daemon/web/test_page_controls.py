@@ -362,12 +362,11 @@ def test_a_dead_daemon_is_shown_within_two_seconds(browsed):
               }).observe(document.querySelector('#link'), { subtree: true, childList: true, characterData: true });
             }"""
         )
-        browsed.until_complete()
         browsed.daemon.kill()
         browsed.until("#link-state", "✗ DAEMON SILENT")
         shown_after_s.append(page.evaluate("window.shownDead"))
         # Nothing old is passed off as new.
-        browsed.until_old(6)
+        browsed.until_all_old()
         browsed.until_shown({"#phase-name": "–"})
         browsed.daemon.start()
         browsed.until("#link-state", "● live")
@@ -392,7 +391,7 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     page.wait_for_timeout(2500)  # longer than a silent daemon stays unnoticed
     assert browsed.text("#link-state") == "✓ DONE"
     # It looks as ended as it is: nothing that is shown is of now.
-    browsed.until_old(6)
+    browsed.until_all_old()
     assert page.evaluate("document.body.dataset.alarm") == "ended"
     assert page.title().startswith("ENDED · ")
     struck = "(id) => getComputedStyle(document.getElementById(id)).textDecorationLine"
@@ -414,10 +413,9 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
 
 def test_a_lost_viewer_is_shown_and_reconnects(browsed):
     page = browsed.open(token=True)
-    browsed.until_complete()
     browsed.viewer.kill()
     browsed.until("#link-state", "✗ VIEWER LOST")
-    browsed.until_old(6)
+    browsed.until_all_old()
     page.click("#stop")
     browsed.until("#answer", "STOP NOT CONFIRMED: the viewer on the rig's computer does not answer.")
     assert "Use the emergency stop" in browsed.text("#answer")

@@ -275,7 +275,13 @@ class RigMemory:
             self._wrench_changes = False
 
     async def save(self, state: Remembered) -> None:
-        """Write a state, unless the file has it already; a failure is logged once, and the write is tried again."""
+        """Write a state, unless the file has it already; a failure is logged once, and the write is tried again.
+
+        It goes on when its caller is cancelled, as by a stop: the next write must not meet it.
+        """
+        await asyncio.shield(asyncio.ensure_future(self._save(state)))
+
+    async def _save(self, state: Remembered) -> None:
         async with self._writing:
             if state == self._written and not self.error:
                 return

@@ -176,10 +176,10 @@ class ActionExecutor:
             raise NotBegunError(f"the fingers were not closed: {reason}")
 
     async def _tare(self, action: TareStep) -> None:
-        if reason := await self.write_state():
-            raise ActionError(f"no zero was taken: {reason}")
         loop, longest_s = asyncio.get_running_loop(), action.timeout_s or LONGEST_TARE_S
         until_s = loop.time() + longest_s - GIVES_UP_BEFORE_S
+        if reason := await self.write_state():
+            raise ActionError(f"no zero was taken: {reason}")
         await self.sender.wait_for_rest()
         raise_if_refused(await self.robot.send(ZeroForceTorque()))
         await tare_all(self.sensors.values(), until_s - loop.time())

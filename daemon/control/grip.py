@@ -38,24 +38,25 @@ class Grip:
         if self.width_mm is not None and abs(gripper.width_mm - self.width_mm) > SAME_WIDTH_MM:
             return f"its fingers are {gripper.width_mm:.1f} mm apart, and were {self.width_mm:.1f} mm apart then"
         # An activation or a loss of power changes the request too, and an object can stay. So it counts only with
-        # a held object.
+        # an object that is held, or is not felt at this target.
         asked, before = gripper.requested_counts, self.requested_counts
-        if gripper.holding and None not in (asked, before) and asked != before:
+        if (gripper.holding or gripper.unfelt) and None not in (asked, before) and asked != before:
             return f"it was asked for the position {asked} since then, and that grip had {before}"
         return ""
 
     def pressed(self, gripper: GripperStatus) -> "Grip":
         """Return this grip with the width of the tighter fingers, which press a soft tool together."""
-        if self.width_mm is None or not (gripper.moving or gripper.uncertain or gripper.holding):
+        if self.width_mm is None or not gripper.may_hold:
             return self
         return replace(self, width_mm=min(self.width_mm, gripper.width_mm))
 
     def followed(self, gripper: GripperStatus) -> "Grip":
         """Return this grip with the width and the position of the gripper's present state."""
         grip = self
-        if gripper.holding and (self.width_mm is None or abs(gripper.width_mm - self.width_mm) > FOLLOWED_MM):
+        may_hold = gripper.holding or gripper.unfelt
+        if may_hold and (self.width_mm is None or abs(gripper.width_mm - self.width_mm) > FOLLOWED_MM):
             grip = replace(grip, width_mm=gripper.width_mm)
-        if gripper.holding or gripper.moving:
+        if may_hold or gripper.moving:
             grip = replace(grip, requested_counts=gripper.requested_counts)
         return grip
 

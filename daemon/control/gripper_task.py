@@ -95,9 +95,11 @@ class GripperTask:
         """
         state = await self.gripper.read()
         if isinstance(target, Opening):
-            closed = self._unfelt(state) and state.opened is False
-            if state.object is not ObjectStatus.AT_TARGET or closed:
-                return target.width_mm if target.width_mm > state.width_mm + MIN_OPENING_MM else LARGEST_STROKE_MM
+            lets_go = target.width_mm > state.width_mm + MIN_OPENING_MM
+            # Of a tool as wide as their target the fingers feel nothing, so a known grip counts as one.
+            gripped = state.opened is False or self.control_loop.tool.was_gripped
+            if state.object is not ObjectStatus.AT_TARGET or (self._unfelt(state) and gripped):
+                return target.width_mm if lets_go else LARGEST_STROKE_MM
             if state.width_mm >= target.width_mm:
                 self.gripper.take_as_open()
                 self._take(replace(state, opened=True))
@@ -132,7 +134,7 @@ class GripperTask:
     async def unlock(self, *, confirmed: bool = False) -> None:
         """Activate again after a fault, which opens the fingers; raises DriverError.
 
-        Where they hold something, or may, it has to be `confirmed` by the operator, else this raises ActionError.
+        Where they hold something, or may, it has to be `confirmed` by the operator, else this raises NotBegunError.
         """
         # Read now: the latest state may be older than the fault.
         state = await self.gripper.read()
@@ -142,7 +144,7 @@ class GripperTask:
         self.control_loop.on_gripper(status)
         if not confirmed and status.may_hold:
             what = f"its fingers are {status.width_mm:.1f} mm apart, and hold something or may hold it"
-            raise ActionError(f"{activation_sentence(what)}; confirm it with `shearloop command unlock --yes`")
+            raise NotBegunError(f"{activation_sentence(what)}; confirm it with `shearloop command unlock --yes`")
         with self._motion.commanded(self.clock.now_ns()):
             await self.gripper.activate(operator_confirmed=True)
 

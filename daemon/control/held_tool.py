@@ -120,7 +120,7 @@ class HeldTool:
         if gripper is None or self.activates:
             return False
         was_held = self.grip.width_mm is not None
-        return gripper.holding or (was_held and (gripper.uncertain or gripper.moving))
+        return gripper.holding or (was_held and gripper.may_hold)
 
     def on_grip_ended(self, action: GripStep) -> None:
         """Take the end of a `grip` step; fingers that closed tighter keep the grip and its angle."""
@@ -134,6 +134,12 @@ class HeldTool:
         self._tightens = False
         # An unexpected object is watched as well.
         self.expected = action.expect_object or holding
+
+    @property
+    def was_gripped(self) -> bool:
+        """Whether a grip is known, or was before the present `grip` or `release` step."""
+        before = self._before_closing
+        return (self.grip if before is None else before.grip).force_n is not None
 
     def on_grip_refused(self) -> None:
         """Restore the grip after the present `grip` step was refused before the fingers moved."""

@@ -11,7 +11,7 @@ from shearloop.daemon.control.fingers import Fingers
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Unlock
-from shearloop.errors import ActionError
+from shearloop.errors import ActionError, NotBegunError
 
 UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
 
@@ -67,6 +67,7 @@ class OperatorAction:
         try:
             await gripper.unlock(confirmed=confirmed)
         except (ActionError, DriverError) as error:
+            self.fingers.may_be_moving = not isinstance(error, NotBegunError)
             raise ActionError(f"the robot is unlocked and may move again, and the gripper is not: {error}") from error
         self.fingers.may_be_moving = False
 

@@ -269,7 +269,8 @@ def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None)
     """Yield what a step's limits and the robot's change."""
     if isinstance(step, steps.GripStep) and file.tool_mm is not None and step.width_mm > file.tool_mm - FELT_MM:
         most_mm = max(0.0, file.tool_mm - FELT_MM)
-        yield f"the gripper may not feel the tool of {file.tool_mm:g} mm: make `width_mm` at most {most_mm:g}"
+        cure = f": make `width_mm` at most {most_mm:g}" if step.width_mm > most_mm else ""
+        yield f"the gripper may not feel the tool of {file.tool_mm:g} mm{cure}"
     if isinstance(step, steps.TwistingStep):
         limits = file.limits_of(step)
         if step.limits is not None:

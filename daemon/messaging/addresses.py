@@ -20,7 +20,7 @@ ASKED, ELSEWHERE = "address", "elsewhere"
 # A running daemon answers within milliseconds.
 COMMAND_TIMEOUT_S = 2.0
 # The robot may have to power up, release its brakes and start its program, and the gripper to activate.
-UNLOCK_TIMEOUT_S = 60.0
+UNLOCK_TIMEOUT_S = 150.0
 # Commands that take longer than an answer: `start` reads a file, which a network drive may delay, and enables motion.
 SLOW = ("start", "unlock", "release")
 
@@ -97,19 +97,16 @@ def stop_name(address: str) -> bytes:
 
 
 def is_reached(bound: str, asked: str) -> bool:
-    """Return whether a client of this machine that asks for an address reaches the server that is bound to another one.
+    """Return whether a client of this machine that asks for an address means the server that is bound to another one.
 
-    Only the hosts are compared: another loopback address with the same port is another daemon's.
+    Both have the same port. Another loopback address is another daemon's; any other address of this machine is meant.
     """
     if not bound.startswith("tcp://"):
         return True
     own, host = urlsplit(bound).hostname, urlsplit(asked).hostname
-    if own in ("*", host):
-        return True
     try:
-        ip = ipaddress.ip_address(own or "")
-        if ip.is_unspecified:
-            return True
-        return ip.is_loopback if host == "localhost" else ip == ipaddress.ip_address(host or "")
+        ip, asked_ip = ipaddress.ip_address(own or ""), ipaddress.ip_address(host or "")
     except ValueError:
-        return False
+        # A name, such as `localhost`, or all interfaces (`*`).
+        return True
+    return ip == asked_ip or not (ip.is_loopback and asked_ip.is_loopback)

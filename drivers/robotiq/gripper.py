@@ -65,7 +65,7 @@ class RobotiqGripper:
     # The latest readout since the last request, and its beginning.
     _latest: tuple[messages.Readout, int] | None = field(default=None, init=False)
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False)
-    # The latest position over this connection at which they stood, and whether they have opened to it.
+    # The furthest position of the latest motion over this connection, and whether it has opened the fingers.
     _position: int | None = field(default=None, init=False)
     _opened: bool | None = field(default=None, init=False)
 
@@ -275,7 +275,9 @@ class RobotiqGripper:
         """Note which way the fingers have moved; more counts are closer together."""
         if self._position is None:
             self._position = position
-        elif abs(position - self._position) > STANDING_COUNTS:
+        # In the present direction each count is followed; the other way, more than standing fingers waver by.
+        goes_on = position < self._position if self._opened else position > self._position
+        if (self._opened is not None and goes_on) or abs(position - self._position) > STANDING_COUNTS:
             self._position, self._opened = position, position < self._position
 
     def take_as_open(self) -> None:
@@ -308,6 +310,9 @@ class RobotiqGripper:
         self._latest, t_ns = None, time.monotonic_ns()
         if isinstance(request, messages.GripperMove):
             self._requests.on_move(request, t_ns)
+            if self._position is not None and request.position > self._position:
+                # A short closing may not be told from a wavering position.
+                self._opened = False
         else:
             self._requests.on_action(t_ns)
 

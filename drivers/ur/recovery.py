@@ -49,8 +49,8 @@ class Recovery:
         self._arm = arm
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
         self._timeout_s = timeout_s
-        # The deadline begins again with each step of powering up.
-        self._robot_mode: int | None = None
+        # The deadline begins again with each step of powering up, once.
+        self._modes_seen: set[int] = set()
         self._load_by_ns = now_ns + int(LOAD_WITHIN_S * 1e9)
         self._asked_ns: dict[str, int] = {}
         self._cleared = False
@@ -81,8 +81,8 @@ class Recovery:
         Raises:
             RobotLostError: the control program cannot be sent, or does not start.
         """
-        if sample.robot_mode != self._robot_mode:
-            self._robot_mode = sample.robot_mode
+        if sample.robot_mode not in self._modes_seen:
+            self._modes_seen.add(sample.robot_mode)
             self._deadline_ns = now_ns + int(self._timeout_s * 1e9)
         if self.refusal is None and now_ns > self._deadline_ns:
             self.refusal = (

@@ -59,7 +59,7 @@ def twisted_again_rad(rig: Rig) -> float:
     return rig.wrist_rad - again_rad
 
 
-@pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
+@pytest.mark.parametrize("sense", [{"uncertain": True}, {"unfelt": True}, {"moving": True}])
 @pytest.mark.parametrize("width_mm", [30.0, 27.0])
 def test_a_tighter_grip_that_was_stopped_keeps_the_angle_of_the_grip(width_mm, sense):
     """The halt leaves the gripper in doubt. Fingers that close tighter press a soft tool together."""
@@ -70,7 +70,7 @@ def test_a_tighter_grip_that_was_stopped_keeps_the_angle_of_the_grip(width_mm, s
     started(rig, {**GRIP, "force_n": 100.0}, TWIST_AGAIN, **TWISTED)
     while not rig.pending:
         rig.step()
-    rig.hand = replace(rig.hand, moving=True, uncertain=False)
+    rig.hand = replace(rig.hand, moving=True, uncertain=False, unfelt=False)
     while rig.pending:
         rig.step()
     rig.hand = replace(rig.hand, moving=False)

@@ -26,9 +26,13 @@ GRIP = GripStep(do="grip", width_mm=0.0, force_n=40.0)
 
 
 class Felt(list[GripperStatus]):
-    """A control loop that keeps the states of the gripper."""
+    """A control loop that keeps the states of the gripper; `tool.was_gripped`: a grip is known."""
 
     on_gripper = list.append
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tool = SimpleNamespace(was_gripped=False)
 
 
 def task_of(rig: Rig, felt: Felt | None = None, *, measures_diameters: bool = True) -> GripperTask:
@@ -159,6 +163,22 @@ async def test_a_tool_as_wide_as_the_target_may_be_held_although_it_is_not_felt(
         await task.grip(to_target)
         await task.grip(opening(target_mm + 20.0, 100.0))
         assert not felt[-1].may_hold
+
+
+@WAYS
+@pytest.mark.parametrize("beyond_mm", [-5.0, 1.0])
+async def test_a_release_of_a_known_grip_opens_fully_after_a_new_connection(way, tmp_path, beyond_mm):
+    """The tool is as wide as the grip's target, so that the gripper does not feel it."""
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        felt = Felt()
+        felt.tool.was_gripped = True
+        task = task_of(rig, felt)
+        await task.release()
+        await task.grip(GRIP.model_copy(update={"width_mm": 60.0, "expect_object": False}))
+        await rig.driver.close()
+        await rig.driver.connect()
+        await task.grip(opening(rig.model.width_mm + beyond_mm, 100.0))
+        assert rig.model.width_mm > 130.0
 
 
 @WAYS

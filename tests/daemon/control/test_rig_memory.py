@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import threading
 from collections.abc import Iterator, MutableMapping
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -11,11 +12,13 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
+from shearloop.daemon import rig_memory
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.control_output import End
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import FOLLOWED_MM, SAME_WIDTH_MM, Grip
+from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memory
@@ -26,6 +29,7 @@ from shearloop.drivers.ur.command_handler import BEING_MADE_READY
 from shearloop.drivers.ur.motion import NOT_OURS
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS, HandlerBench
+from tests.fixtures.daemons import DEADLINE_S
 
 
 @pytest.fixture
@@ -538,3 +542,39 @@ async def test_a_daemon_that_is_killed_while_a_program_starts_leaves_no_zero_of_
         robot.handle_message(0, state)
         await memory.save_present()
         assert read_memories(FILES).wrench_tared is tared
+
+
+def test_an_unfelt_grip_is_another_one_after_another_request():
+    """A grip that felt nothing has no width to compare."""
+    grip = Grip(0.3, 60.0).followed(
+        GripperStatus(0, 30.0, holding=False, moving=False, unfelt=True, requested_counts=140)
+    )
+    assert (grip.width_mm, grip.requested_counts) == (30.0, 140)
+    same = GripperStatus(1, 30.0, holding=False, moving=False, unfelt=True, requested_counts=140)
+    assert grip.why_another(same) == ""
+    assert "it was asked for the position 60 since then" in grip.why_another(replace(same, requested_counts=60))
+    assert "its fingers are 80.0 mm apart" in grip.why_another(replace(same, width_mm=80.0, requested_counts=60))
+
+
+async def test_a_write_that_is_cut_off_is_no_other_programs_for_the_next_one(monkeypatch):
+    """A stop in the middle of the write of a new grip."""
+    begun, may_end = threading.Event(), threading.Event()
+    write = rig_memory.write_memories
+
+    def slowly(*arguments: Any) -> None:
+        begun.set()
+        may_end.wait(DEADLINE_S)
+        write(*arguments)
+
+    memory = RigMemory(FILES, new_loop())
+    monkeypatch.setattr(rig_memory, "write_memories", slowly)
+    first = asyncio.create_task(memory.save(Remembered(running="one")))
+    await asyncio.to_thread(begun.wait, DEADLINE_S)
+    first.cancel()
+    await asyncio.gather(first, return_exceptions=True)
+    second = asyncio.create_task(memory.save(Remembered()))
+    await asyncio.sleep(0)
+    may_end.set()
+    await second
+    assert memory.error == ""
+    assert read_memory(FILES.states[0]) == Remembered()

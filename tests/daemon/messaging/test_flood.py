@@ -125,6 +125,9 @@ async def test_the_stop_socket_answers_in_a_flood_of_datagrams():
         ("tcp://127.0.0.22:{port}", "tcp://127.0.0.99:{port}", False),
         ("tcp://127.0.0.22:{port}", "tcp://127.0.0.1:{port}", False),
         ("tcp://0.0.0.0:{port}", "tcp://127.0.0.99:{port}", True),
+        # No other daemon of this computer can be meant.
+        ("tcp://192.168.1.5:{port}", "tcp://127.0.0.1:{port}", True),
+        ("tcp://eth0:{port}", "tcp://192.168.1.5:{port}", True),
         ("tcp://127.0.0.1:{port}", "tcp://localhost:{port}", True),
         ("tcp://[::1]:{port}", "tcp://[0:0:0:0:0:0:0:1]:{port}", True),
     ],

@@ -213,3 +213,29 @@ async def test_a_position_that_wavers_does_not_count_as_an_opening(connect):
     assert [state.opened for state in states] == [None, *[False] * 6]
     driver.client.readouts = [replace(ACTIVE, pos=100)]
     assert (await driver.read()).opened
+
+
+@pytest.mark.parametrize(
+    ("positions", "opened"),
+    [((200, 150, 102, 100, 103), False), ((100, 148, 150, 150, 146), True), ((3, 90, 88, 89), False)],
+    ids=["a closing by three counts", "an opening by four", "a wavering one"],
+)
+async def test_the_direction_of_the_latest_motion_is_known_to_some_counts(connect, positions, opened):
+    driver = connect(Client(*(replace(ACTIVE, pos=pos) for pos in positions)))
+    state = await driver.connect()
+    for _ in positions[1:]:
+        state = await driver.read()
+    assert state.opened is opened
+
+
+async def test_a_closing_of_our_own_counts_from_its_request_on(connect):
+    driver = connect(Client(replace(ACTIVE, pos=100), *[replace(ACTIVE, pos=50, pre=52)] * 3))
+    await driver.connect()
+    assert (await driver.read()).opened
+    await driver.move(driver_command(driver, 52))
+    assert not (await driver.read()).opened
+
+
+def driver_command(driver: RobotiqGripper, position: int) -> messages.GripperCommand:
+    """Return a command to a position in counts."""
+    return messages.GripperCommand(driver.calibration.width_mm(position), 60.0, 20.0)

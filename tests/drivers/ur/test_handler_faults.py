@@ -1,5 +1,7 @@
 """Stops, faults, a robot that does not follow, and recovery."""
 
+from itertools import cycle
+
 import pytest
 
 from shearloop.drivers.ur.messages import Disconnect, Enable, RobotLostError, Stop, Unlock, WristSpeed
@@ -334,6 +336,22 @@ def test_unlocking_with_old_samples_times_out():
     bench.arm.calls.clear()
     bench.run(100)
     assert bench.arm.calls == [], "nothing is unlocked so long after the operator's word"
+
+
+def test_an_arm_that_goes_to_and_fro_between_two_modes_is_given_up():
+    """Each further `power on` would go on without end."""
+    bench = turning()
+    bench.arm.be(robot_mode=3)
+    bench.run(10)
+    since_ns, modes = bench.now_ns, cycle((3, 4))
+
+    def power_on(*_: str) -> str:
+        bench.arm.be(robot_mode=next(modes))
+        return ""
+
+    bench.arm.ask_dashboard = power_on
+    assert "did not get ready" in bench.ask(Unlock()).refusal
+    assert bench.now_ns - since_ns < 3 * SETTINGS.recover_timeout_s * 1e9
 
 
 def test_worker_whose_uploads_start_nothing_is_replaced():

@@ -49,7 +49,7 @@ _PAPER_HEIGHT_CM = 3.6
 _SIMULATED_CM = 0.1
 _PLACES = np.linspace(0.1, 0.9, 9)
 _MIN_FRAMES = 8
-# A smaller share of a frame is rounding: the board's converter alone makes thousands of times as much noise.
+# A smaller fraction of a frame is rounding: the board's converter alone makes thousands of times as much noise.
 _MIN_NOISE = 1e-6
 
 
@@ -84,7 +84,7 @@ def centred_settings(model: str, centre: float) -> list[Setting]:
 
 
 def searched_settings(model: str, height: float, places: FloatArray = _PLACES) -> list[Setting]:
-    """Return settings at places, shares of the height in cm, all over a fingertip, to search for the best one."""
+    """Return settings at places, fractions of the height in cm, all over a fingertip, to search for the best one."""
     up, size = (_PAPER_HEIGHT_CM * places).tolist(), height / _PAPER_HEIGHT_CM
     places, widths = {
         "step": (up, [1.0]),
@@ -175,7 +175,7 @@ class MeasuredFrames:
 
     @property
     def relative_noise(self) -> float:
-        """The noise as a share of the differences, both as RMS."""
+        """The noise as a fraction of the differences, both as RMS."""
         return float(self.noise_v / np.sqrt((self.differences**2).mean()))
 
 
@@ -218,8 +218,8 @@ class DesignChoice:
 class ModelFit:
     """A model against the data: error of held-out channels relative to the frame, and its standard error.
 
-    Held out are injections that k, σ and amplitude were not fitted to. `penalised` is the error with the share of pure
-    noise that the model's parameters would explain; the amplitude is one of them.
+    Held out are injections that k, σ and amplitude were not fitted to. `penalised` is the error with the fraction of
+    pure noise that the model's parameters would explain; the amplitude is one of them.
     """
 
     model: str
@@ -288,7 +288,7 @@ def design_bank(fingertip: Fingertip, measured: MeasuredFrames) -> Design:
 
 
 def simulated_frames(design: Design, fingertip: Fingertip, n: int = 49, seed: int = 0) -> MeasuredFrames:
-    """Return n frames that a designed-for grip gives on another fingertip, with the same share of noise.
+    """Return n frames that a designed-for grip gives on another fingertip, with the same fraction of noise.
 
     Torque and σ change along the design's range, in the proportions of the paper's fingertip. Amplitudes are the
     model's voltages and torques have no unit: a design depends on neither.

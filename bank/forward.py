@@ -24,7 +24,7 @@ from shearloop.bank.mesh import Mesh, Terms, rows_of_edges
 _LITTLE_FILL: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 # The node of zero potential; only differences of potentials leave this module.
 _GROUND = 0
-# The largest sum of a row as a share of its diagonal: rounding in differences of voltages is of that size, and the
+# The largest sum of a row as a fraction of its diagonal: rounding in differences of voltages is of that size, and the
 # smallest signal in a bank is 5e-5 of the voltages.
 MAX_LEAK = 1e-11
 

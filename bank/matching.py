@@ -23,7 +23,7 @@ from shearloop.words import counted
 TIE = 1e-12
 # Cells this near to the maximum, in k or in σ, belong to its peak and are no runner-up.
 RUNNER_UP_RADIUS = 5
-# Share of pure noise frames that pass as a signal: at 1.85 frames/s, one in about six days.
+# Fraction of pure noise frames that pass as a signal: at 1.85 frames/s, one in about six days.
 FALSE_ALARM = 1e-6
 # Cells scored at a time: with 896 channels, 1024 × 897 complex numbers and their correlations take 30 MB.
 CHUNK_CELLS = 1024

@@ -25,7 +25,7 @@ INTERVAL_S = 1.0
 WIDTH_PX, HEIGHT_PX, GIF_WIDTH_PX, COLOURS = 1400, 860, 840, 128
 # The page's summary of the experiment, at the end.
 SUMMARY_PICTURES = 4
-# In the hold, as a share of the demo's time.
+# In the hold, as a fraction of the demo's time.
 HOLD = 0.82
 _ADDRESS = re.compile(r"http://\S+#token=\S+")
 

@@ -21,7 +21,7 @@ from shearloop.words import CountedReasons, counted, times
 if TYPE_CHECKING:
     from shearloop.daemon.logs import NonBlockingWriter
 
-# A torque within this share of the set point counts as held.
+# A torque within this fraction of the set point counts as held.
 BAND = 0.10
 # A torque has recovered from a disturbance when it stays in the band for this time.
 STAYS_S = 1.0

@@ -16,7 +16,7 @@ from shearloop.errors import UserError
 # Mean and frame-to-frame standard deviation of the recorded frames.
 MEAN_V = 0.13
 NOISE_V = 0.002
-# With this share of the modelled conductivity change, difference frames have an RMS of 5 mV, as the 49 torque slices
+# With this fraction of the modelled conductivity change, difference frames have an RMS of 5 mV, as the 49 torque slices
 # (Gaussian derivative, k = 3.25 cm, σ from 1.25 to 1.85 cm).
 AMPLITUDE = 0.17
 # σ at rest and at the largest torque of the slices, in N·m; k of the thinnest and thickest recorded cylinder.

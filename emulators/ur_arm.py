@@ -166,7 +166,7 @@ class LinearMove:
         return q_rad + step, np.zeros(6) if finished else step / dt_s, finished
 
     def _advance_trapezoid(self, dt_s: float) -> float:
-        """Return the covered share of the length one cycle later."""
+        """Return the covered fraction of the length one cycle later."""
         left = self._end - self._done
         self._rate = min(self.speed, self._rate + self.acceleration * dt_s, math.sqrt(2 * self.acceleration * left))
         # The last cycle of a discrete trapezoid would creep for ever.

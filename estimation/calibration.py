@@ -39,7 +39,7 @@ _ONE_SIGN = {
     sign: f"no torque is {other}, because its recordings have {recorded} torques alone"
     for sign, recorded, other in ((1, "positive", "negative"), (-1, "negative", "positive"))
 }
-# Tools differ if their diameters differ by a larger share.
+# Tools differ if their diameters differ by a larger fraction.
 LARGEST_TOOL_FRACTION = 0.15
 
 

@@ -16,8 +16,8 @@ from shearloop.estimation.ridge import Ridge
 
 # Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.
 _N_NUISANCE, _MAX_FRAMES = 16, 500
-# The tools differ along a direction where the positions vary by this factor more than their noise. At least this share
-# of the variation along the clearest direction counts as the tools', at any noise.
+# The tools differ along a direction where the positions vary by this factor more than their noise. At least this
+# fraction of the variation along the clearest direction counts as the tools', at any noise.
 _CLEAR, _MIN_FRACTION = 2.0, 0.2
 # Centred positions have one direction less than their number; the last one is rounding.
 _ROUNDING = 1e-9

@@ -191,7 +191,7 @@ class Estimator(ABC):
     ) -> tuple[Self, IntervalRegressor, float]:
         """Return the torque's regressor on frames of numbered grips (n,), and the estimator as it uses them.
 
-        The third value is the share of the torque's variance that a tool's motion leaves unexplained on frames left
+        The third value is the fraction of the torque's variance that a tool's motion leaves unexplained on frames left
         out, 0 where that is not tested.
         """
         from shearloop.estimation.interval_fit import fit_interval_regressor

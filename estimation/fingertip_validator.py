@@ -26,7 +26,7 @@ MIN_NOISE_V = float(_CONVERTER_STEP_V / np.sqrt(12.0))
 LARGEST_DEVIATION = 0.12
 # Added to voltages in denominators: a relative change of less is noise.
 SMALL_V = 0.01
-# Channels that are compared, and the least share of them.
+# Channels that are compared, and the minimum fraction of them.
 _WELL_ABOVE_NOISE_V, _MIN_COMPARED_FRACTION = 0.03, 0.25
 LARGEST_JUMPING_FRACTION = 0.12
 LARGEST_UNUSABLE_FRACTION = 0.25
@@ -41,20 +41,20 @@ _N_NUISANCE = 2
 _MIN_AT_RAIL = 9
 # Closing and opening take this many frames and move further than twisting under load by this factor.
 STEP_FRAMES, _STEP_MARGIN = 4, 1.25
-# A grip scores above the idle frames by this many standard deviations, and by at least this share of the calibrated
+# A grip scores above the idle frames by this many standard deviations, and by at least this fraction of the calibrated
 # grip. Idle frames of other sessions score at most 0.06, their grips at least 0.12 (docs/decisions/0042).
 _IDLE_DEVIATIONS, _MIN_RISE = 3.0, 0.08
 _MIN_IDLE, _MIN_GRIPPED = 5, 20
 # The first frame of a session counts as idle unless it is clearly nearer to the gripped frame. Below the second
 # deviation it is from the calibration's own session, and its score decides.
 _CLEARLY_NEARER, _SAME_SESSION, _GRIPPED_SCORE = 0.8, 0.01, 0.5
-# A grip ends when its score falls below this share of its mean over this many frames.
+# A grip ends when its score falls below this fraction of its mean over this many frames.
 _LOOSE_FRACTION, _LEVEL_FRAMES = 0.4, 60
 # A channel that reads 0 in more of a part's frames is dead at calibration.
 _SILENT_FRACTION = 0.05
-# The least noise of a relative change, as a share of the median of all channels.
+# The least noise of a relative change, as a fraction of the median of all channels.
 _MIN_NOISE_FRACTION = 0.3
-# The threshold's largest share of the way from idle to the weakest grip.
+# The threshold's largest fraction of the way from idle to the weakest grip.
 _LARGEST_RISE = 1 / 3
 
 
@@ -232,13 +232,13 @@ class FingertipSet:
         return reasons, lost[:, 0] & lost[:, 1]
 
     def jumping_shares(self, frame: FloatArray, before: FloatArray, usable: BoolArray) -> FloatArray:
-        """Return the share of each side's usable channels that moved further than noise explains; 1 without any."""
+        """Return the fraction of each side's usable channels that moved further than noise explains; 1 without any."""
         jumping = (np.abs(frame - before) > self._jump_limits_v) & usable
         counts = np.count_nonzero(usable, axis=1)
         return np.where(counts > 0, np.count_nonzero(jumping, axis=1) / np.maximum(counts, 1), 1.0)
 
     def disturbance(self, jumping_shares: FloatArray) -> str:
-        """Return why shares of jumping channels mean a disturbance."""
+        """Return why fractions of jumping channels mean a disturbance."""
         number = int(np.argmax(jumping_shares > LARGEST_JUMPING_FRACTION))
         return (
             f"{self.sides[number].side} fingertip: {100 * jumping_shares[number]:.0f} % of the channels jumped since "
@@ -250,8 +250,8 @@ class GripDetector:
     """Detects whether one fingertip is gripped, from its grip score and its steps, frame by frame.
 
     A grip starts when the score rises by the threshold above the lowest score since the last grip, because a gel that
-    recovers from a release scores less and less. It ends below half of that rise, or below a share of this grip's own
-    mean score, because grips may be a fifth or three times as strong as the calibrated one.
+    recovers from a release scores less and less. It ends below half of that rise, or below a fraction of this grip's
+    own mean score, because grips may be a fifth or three times as strong as the calibrated one.
     """
 
     def __init__(self, side: FingertipValidator) -> None:

@@ -40,7 +40,7 @@ from shearloop.words import counted
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75
-# Share of a recording's frames below its released torque, and the penalty while tools are compared.
+# Fraction of a recording's frames below its released torque, and the penalty while tools are compared.
 _RELEASED, _TOOLS_STRENGTH = 0.05, 1e-5
 # Tools have a torque in common where their gains differ by less than this factor.
 _TOOLS_DIFFER = 2.0

@@ -11,9 +11,9 @@ from shearloop.estimation.values import TactileFrame
 
 # Longest step between frames while the period is unknown: two frames of 0.54 s are missing.
 _LARGEST_GAP_S = 1.4
-# The median of this many steps is the period, if the configured one is not shorter. A step longer than the first share
-# of the period has one frame missing, a step longer than the second has more.
-_STEPS, _MISSING_FRACTION, _LARGEST_GAP_FRACTION = 9, 1.5, 2.5
+# The median of this many steps is the period, if the configured one is not shorter. A step longer than the first number
+# of periods has one frame missing, a step longer than the second has more.
+_STEPS, _MISSING_PERIODS, _LARGEST_GAP_PERIODS = 9, 1.5, 2.5
 
 
 class FrameTimer:
@@ -35,7 +35,7 @@ class FrameTimer:
         if 0 < step_s <= _LARGEST_GAP_S:
             self._steps_s.append(step_s)
         self.gap = ""
-        if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_FRACTION * period_s):
+        if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_PERIODS * period_s):
             if np.isfinite(step_s):
                 happened = (
                     f"no frame came for {step_s:.1f} s (a loose cable or a busy computer)"
@@ -44,7 +44,7 @@ class FrameTimer:
                 )
                 self.gap = f"{happened}, and the gel's motion in between is not known"
             return None
-        return int(step_s > _MISSING_FRACTION * period_s)
+        return int(step_s > _MISSING_PERIODS * period_s)
 
 
 class ChannelChecks:
@@ -66,7 +66,7 @@ class ChannelChecks:
         self.before, self._disturbed = before, None
 
     def check(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, list[str], FloatArray]:
-        """Return the filled channels, the usable ones, each side's reason, and its share of jumping channels.
+        """Return the filled channels, the usable ones, each side's reason, and its fraction of jumping channels.
 
         There are no shares without an earlier frame.
         """

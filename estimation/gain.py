@@ -34,7 +34,7 @@ TOOL_SPREAD = 0.7
 # The minimum spread of a recording's twists: a few equal ones are chance.
 _MIN_WITHIN = 0.05
 _MIN_NOISE, _MIN_ZERO, _MIN_CHANGE = 1e-3, 1e-6, 1e-3
-# The gain drifts while the gel settles, so successive twists deviate alike from the later ones, by this share of the
+# The gain drifts while the gel settles, so successive twists deviate alike from the later ones, by this fraction of the
 # variance; more twists do not average it away.
 _ALIKE = 0.8
 # Twists change the gain if the square of their deviation, in standard errors, exceeds this. One more unknown improves a
@@ -55,7 +55,7 @@ class GainSpread:
     `between` is of one grip to the next, and as certain as from this number of `recordings`; `within` is of twists
     of one grip. The first twist after a grip differs from the later ones by `first`, with the deviation `first_spread`.
     `drift` is by how much more one half of a grip's twists deviates from the other than grips from each other.
-    `zero` is of the torque without motion, as a share of the load: 0 for the calibration's tool.
+    `zero` is of the torque without motion, as a fraction of the load: 0 for the calibration's tool.
     """
 
     between: float = 0.0

@@ -12,7 +12,7 @@ from shearloop.words import counted
 
 # Frames (half a minute) in the mean difference of a grip: twists come and go within it.
 _HELD_FRAMES = 60
-# Most frames in a row that are interpolated, and most of those remembered, as a share.
+# The maximum of frames in a row that are interpolated, and of those remembered, as a fraction.
 _LARGEST_BRIDGED, _LARGEST_BRIDGED_FRACTION = 3, 0.25
 
 

@@ -15,12 +15,12 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.fingertip_validator import STEP_FRAMES, channel_noise, frame_steps
 from shearloop.estimation.values import FrameSeries
 
-# Torques above this share of the largest one count as a load.
+# Torques above this fraction of the largest one count as a load.
 _LOADED_FRACTION = 0.1
 # A large step exceeds the steps of twisting under load by this factor.
 _LARGE_STEP = 1.4
-# Frames below this share of the way from idle to loaded, in this running median, are idle. Gripped and not twisted they
-# are at 0.57 and more, in recovery from a touch or a release at 0.41 and less.
+# Frames below this fraction of the way from idle to loaded, in this running median, are idle. Gripped and not twisted
+# they are at 0.57 and more, in recovery from a touch or a release at 0.41 and less.
 _IDLE_FRACTION, _MEDIAN_FRAMES = 0.45, 5
 # Fewer loaded frames have no second differences to show the noise.
 _MIN_LOADED = 3

@@ -47,7 +47,7 @@ class IntervalRegressor:
     def predict(self, features: FloatArray, usable_share: float = 1.0) -> tuple[float, float, float]:
         """Return the value of (d,) features and how far its 95 % interval extends below and above it.
 
-        With a share of the channels unusable, the interval grows by the root of it.
+        With a fraction of the channels unusable, the interval grows by the root of it.
         """
         raw = float(self.point.predict(features[None])[0])
         value = float(reported_values(self.point, np.array(raw)))

@@ -17,7 +17,7 @@ from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
 
 MIN_IN_STRATUM = 20
 _MIN_RESIDUALS = 5
-# Narrowest interval as a share of the calibrated range: load cells are noisy too.
+# Narrowest interval as a fraction of the calibrated range: load cells are noisy too.
 MIN_HALF_WIDTH = 1e-3
 # Values further beyond the calibrated range, in spans of it, are refused as extrapolation.
 _LARGEST_BEYOND = 0.35

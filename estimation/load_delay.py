@@ -31,7 +31,7 @@ _N_DIRECTIONS = 6
 _STRENGTH = 1e-3
 # Moves are clipped to this many times the median: larger ones come from knocks.
 _LARGEST_MOVE = 4.0
-# The peak must explain this share, and this factor more than any shift this far away. A minute with a single twist
+# The peak must explain this fraction, and this factor more than any shift this far away. A minute with a single twist
 # (`glitch_20241202_173837`) has a chance peak of 0.06 at five seconds.
 _MIN_EXPLAINED, _PROMINENCE, _APART_S = 0.1, 1.5, 1.1
 # With fewer gripped frames than the first nothing is refused. From the second on a peak this high gives a warning: of
@@ -59,7 +59,7 @@ _NOISE_READINGS, _MIN_QUIET = 64, 4
 
 @dataclass(frozen=True, slots=True)
 class LoadDelay:
-    """Delay of the torques after the frames' motion in s, its standard error, and the explained share of change.
+    """Delay of the torques after the frames' motion in s, its standard error, and the explained fraction of change.
 
     late_s is the delay beyond the load cell's own one, 0 where that is usual. few_frames is the number of gripped
     frames where they are too few to be sure, else 0.
@@ -283,5 +283,5 @@ def _cross_validated_residual(moves: FloatArray, changes: FloatArray) -> FloatAr
 
 
 def _explained(total: FloatArray, rest: FloatArray) -> FloatArray:
-    """Return the explained shares of (s,) sums of squares; 0 for a shift without a change of load."""
+    """Return the explained fractions of (s,) sums of squares; 0 for a shift without a change of load."""
     return np.where(total > 0, 1.0 - rest / np.where(total > 0, total, 1.0), 0.0)

@@ -34,11 +34,11 @@ _MIN_LAGS = 12
 # A longer memory in a file would fill the session's own.
 _MAX_LAGS = 1000
 # Positions drift between recordings, motion does not. So the position must lower motion's squared error on frames left
-# out to the second share where motion leaves more than the first of the torque's variance, else to the third. On
-# recorded fingertips, which were twisted one way, the share is 0.54 to 18, on emulated ones 0.01 to 0.4.
+# out to the second fraction where motion leaves more than the first of the torque's variance, else to the third. On
+# recorded fingertips, which were twisted one way, the fraction is 0.54 to 18, on emulated ones 0.01 to 0.4.
 _MOTION_MAY_LEAVE, _POSITION_GAINS, _POSITION_GAINS_MUCH = 0.5, 0.5, 0.3
 # Of twists both ways, motion may learn the order, which is another one next time, and twists left out do not show it.
-# There the position also serves where it leaves this share of the torque's variance at most.
+# There the position also serves where it leaves this fraction of the torque's variance at most.
 _POSITION_MAY_LEAVE = 0.1
 
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 
-# Readings below this share of the largest torque mean that the lever does not touch.
+# Readings below this fraction of the largest torque mean that the lever does not touch.
 CENSORED_FRACTION = 0.02
-# Their bound lies this share of it below zero. Of 0 to 0.3 this has the least error on recorded twists left out.
+# Their bound lies this fraction of it below zero. Of 0 to 0.3 this has the least error on recorded twists left out.
 _MARGIN_FRACTION = 0.05
 _MIN_SIGMA_FRACTION, _HINGE_ROUNDS = 0.01, 50
 # Penalties to choose from, in units of the features' sum of squares.

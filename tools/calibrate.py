@@ -80,7 +80,7 @@ def calibrate(
     load_cell_delay_s: float | None = None,
     tool_mm: float | None = None,
 ) -> CalibrationResult:
-    """Fit an estimator to these shares (0 to 1) of recordings, oldest first.
+    """Fit an estimator to these fractions (0 to 1) of recordings, oldest first.
 
     A `load_cell_delay_s` is subtracted from the load cell's times, which are then not checked. Raises UserError for
     recordings that are given twice, and CalibrationError for those that determine no calibration.
@@ -114,7 +114,7 @@ def read_parts(
     load_cell_delay_s: float | None = None,
     tool_mm: float | None = None,
 ) -> ReadParts:
-    """Return what `calibrate` fits to these shares (0 to 1) of recordings.
+    """Return what `calibrate` fits to these fractions (0 to 1) of recordings.
 
     Raises UserError for recordings that are given twice, and CalibrationError for a load cell with a wrong clock.
     """
@@ -155,7 +155,7 @@ def adapt_to_recordings(
     load_cell_delay_s: float = 0.0,
     tool_mm: float | None = None,
 ) -> tuple[Calibration, GainCorrection]:
-    """Return a calibration adapted to the twists within these shares of recordings, and the correction of its gain.
+    """Return a calibration adapted to the twists within these fractions of recordings, and the correction of its gain.
 
     Raises UserError for recordings that are given twice, also as copies, and CalibrationError for those that show no
     gain, or frames that the calibration has learned from.

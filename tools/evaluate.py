@@ -52,7 +52,7 @@ def evaluate_recordings(
     calibration: Calibration, named: Sequence[tuple[Path, FrameSeries]], bank: Path | None,
     time_range: tuple[float, float], pool: Executor,
 ) -> Evaluation:  # fmt: skip
-    """Return a calibration's estimates of these shares (0 to 1) of recordings; raises UserError for copies."""
+    """Return a calibration's estimates of these fractions (0 to 1) of recordings; raises UserError for copies."""
     start, stop = time_range
     parts = [part_of(series, start, stop) for _, series in named]
     check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
@@ -93,7 +93,7 @@ def known_data(learned: LearnedFrames, tracks: Sequence[EstimateTrack], paths: S
             at_least, frames = "at least " if learned.is_sample else "", counted(len(judged), "judged frame")
             found.append(
                 f"the calibration has learned from {at_least}{known} of {frames} of {path}; errors on known frames are "
-                "smaller than on new ones, so judge it on others"
+                "smaller than on new ones, so take other recordings"
             )
     return found
 

@@ -17,11 +17,12 @@ from shearloop.words import counted
 
 Series = TypeVar("Series", bound=FrameSeries)
 
-# Largest distance in time of a pair of frames, as a share of the period.
+# Largest distance in time of a pair of frames, as a fraction of the period.
 _LARGEST_APART = 0.75
-# Share of the time with another grip that does not count as another tool: the fingers met something or gripped again.
+# Fraction of the time with another grip that does not count as another tool: the fingers met something or gripped
+# again.
 _MOMENTARY = 0.05
-# Share of a recording's frames that another may hold too: emulated rigs of one seed begin with the same idle frames.
+# Fraction of a recording's frames that another may hold too: emulated rigs of one seed begin with the same idle frames.
 _MAX_SHARED = 0.5
 
 
@@ -90,7 +91,7 @@ def _unpaired(side: str, apart: BoolArray) -> str:
 
 
 def part_of(series: Series, start: float, stop: float) -> Series:
-    """Return the frames between two shares (0 to 1) of a series, in time order; UserError for an empty part."""
+    """Return the frames between two fractions (0 to 1) of a series, in time order; UserError for an empty part."""
     n = len(series.t_s)
     first, end = round(start * n), round(stop * n)
     if first == end:

@@ -32,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
     tracks = [estimate_series(calibration, series, bank) for _, series in named]
     grips = [grip for track in tracks for grip in grips_of(track)]
     found = fit_creep(grips)
+    doubts = known_data(calibration.learned, tracks, [path for path, _ in named])
     share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)
     result = {
         "share": share,
@@ -42,14 +43,15 @@ def run(args: argparse.Namespace) -> int:
         "error_after_nm": found.after_nm,
         "scale": found.scale,
         "offset_nm": found.offset_nm,
+        "warnings": doubts,
     }
     sentences = [
         f"creep: {{share: {share:g}, time_s: {time_s:g}}}",
         f"From {result['frames']} frames of {counted(len(grips), 'grip')}: the estimates, scaled by {found.scale:.3f} "
         f"and shifted by {1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} "
         f"mN·m instead of {1e3 * found.before_nm:.1f} (standard deviation).",
-        *known_data(calibration.learned, tracks, [path for path, _ in named]),
-        "The line above does not correct scale and zero. If the scale is far from 1, calibrate the estimator again; if "
-        "the shift is far from 0, tare untouched.",
+        *(f"Warning: {doubt}." for doubt in doubts),
+        "The line `creep:` does not correct scale and zero. If the scale is far from 1, calibrate the estimator again; "
+        "if the shift is far from 0, tare untouched.",
     ]
     return print_result(result, sentences, as_json=args.json)

@@ -16,7 +16,7 @@ from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
 
 # An angle counts as reached within this; the wrist's resolution is ten times finer.
 ANGLE_TOLERANCE_RAD = 0.002
-# A torque counts as reached within this share of the set point: the closed loop's accuracy.
+# A torque counts as reached within this fraction of the set point: the closed loop's accuracy.
 TORQUE_TOLERANCE = 0.10
 
 

@@ -39,7 +39,7 @@ from shearloop.errors import UserError
 
 # The ramp does not catch up when the loop was late for longer than this.
 LONGEST_STEP_NS = 50_000_000
-# A rest ends at the deadband, a motion at this share of it: the hysteresis keeps noise from toggling the two.
+# A rest ends at the deadband, a motion at this fraction of it: the hysteresis keeps noise from toggling the two.
 _SETTLED_FRACTION = 0.1
 # CUSUM test for jumps, in standard deviations: the slack per innovation, the threshold of the sum, and the bound of an
 # innovation, which keeps one wild value below the threshold.
@@ -65,7 +65,7 @@ class ControllerSettings:
     window_s: float
     # By how much the torque lags behind its own stamp, as identified; 0 where the stamps are right.
     lag_s: float = 0.0
-    # Shares of an innovation: taken up at once, and per measurement from then on.
+    # Fractions of an innovation: taken up at once, and per measurement from then on.
     kp: float
     ki: float
     wrist_bandwidth_per_s: float

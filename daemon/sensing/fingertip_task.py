@@ -67,7 +67,7 @@ class FingertipTask:
     """The I/O of one session: frames of one fingertip or of several together in, estimates out.
 
     Estimates go to the control loop and to subscribers. The gripper gives the held tool, and receives the diameters.
-    `inputs` keeps the moments of tares and of changes of the tool, and the frames during which the fingers moved.
+    `inputs` keeps what comes before each frame, for a replay.
     """
 
     name: str
@@ -80,7 +80,7 @@ class FingertipTask:
     # The longest time of a tare that no step of an experiment waits for.
     longest_tare_s: float = LONGEST_TARE_S
     count: int = 0
-    # The latest request for an idle frame, and why its frames were refused.
+    # The latest request for an idle frame.
     _zero: ZeroRequest | None = None
     # Why the frames of the present tare gave no estimate.
     _refused: CountedReasons = field(default_factory=CountedReasons)
@@ -201,9 +201,13 @@ class FingertipTask:
         """Return the torques for the correction of the gain that somebody waits for, None without one."""
         if self._adapting is None or self._adapting[1].done():
             return None
-        reference, _ = self._adapting
-        times_ns, torques_nm = self.loop.torques_of(reference) if self.loop is not None else ([], [])
-        of_grip = torque_at(self.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
+        reference, ended = self._adapting
+        try:
+            times_ns, torques_nm = self.loop.torques_of(reference) if self.loop is not None else ([], [])
+            of_grip = torque_at(self.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
+        except Exception as error:  # noqa: BLE001 - it fails the step, and the frames go on
+            ended.set_exception(error)
+            return None
         return KnownTorques(reference, of_grip)
 
     def _end_correction(self, frames: tuple[Frame, ...], corrected: Adaptation | Exception) -> None:

@@ -2,7 +2,7 @@
 
 from shearloop.drivers.eit_kit import Frame
 
-# Largest distance in time of a pair of frames, as a share of the frame period.
+# Largest distance in time of a pair of frames, as a fraction of the frame period.
 _MAX_APART_PERIODS = 0.75
 
 

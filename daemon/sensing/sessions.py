@@ -28,7 +28,7 @@ _PAPER = "paper"
 # A search has no state, so fingertips with the same bank share one.
 _in_use: "WeakValueDictionary[tuple[str, str], BankSearch]" = WeakValueDictionary()
 # After a grip some frames are disturbed or missing.
-_WARM_UP_FRACTION = 2.0
+_WARM_UP_FACTOR = 2.0
 
 
 def channel_table(config: DaemonConfig) -> ChannelTable:
@@ -145,7 +145,7 @@ def _torque_source(session: Session, name: str, period_s: float) -> TorqueSource
         window_s=period_s * session.averaged_frames,
         measures_torque=calibration.measures_torque,
         # The first torque after a grip needs the lagged frames too, and none is of a frame that saw the fingers move.
-        warm_up_s=_WARM_UP_FRACTION * max(calibration.estimator.motion.n_needed, 2) * period_s,
+        warm_up_s=_WARM_UP_FACTOR * max(calibration.estimator.motion.n_needed, 2) * period_s,
         has_gain=calibration.measures_torque,
         only_sign=calibration.only_sign,
     )

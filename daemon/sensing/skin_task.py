@@ -106,8 +106,12 @@ class SkinTask:
 
     @property
     def taring(self) -> bool:
-        """Whether the next samples belong to a zero that was asked for a short time ago."""
-        return self._zero is not None and self._zero.is_under_way(self._clock.now_ns())
+        """Whether the next samples belong to a zero that was asked for a short time ago, also after a refused one."""
+        zero, now_ns = self._zero, self._clock.now_ns()
+        if zero is None or now_ns > zero.until_ns:
+            return False
+        retakes = zero.state is ZeroState.FAILED and self._estimator.zero is None and not self._estimator.given_up
+        return retakes or zero.is_under_way(now_ns)
 
     async def tare_and_wait(self, within_s: float) -> str | None:
         """Take a new zero and wait until it is done; return None, or why it was not taken."""

@@ -63,7 +63,7 @@ class ZeroRequest:
         self._end(ZeroState.FAILED, reason)
 
     def expire(self, reason: str = "") -> None:
-        """End it without a zero: nobody waits for it any longer."""
+        """End it without a zero: its time is over, or nobody waits for it any longer."""
         self._end(ZeroState.EXPIRED, reason)
 
     def replace(self, later: "ZeroRequest") -> None:

@@ -58,7 +58,7 @@ SCAN = "READ?"
 ADC_BAUD = 115200
 # "-0.123456,-0.123456" has 19 characters.
 MAX_PAIR_BYTES = 40
-# Values above this share of the range are at its end.
+# Values above this fraction of the range are at its end.
 _END_OF_RANGE = 0.9995
 _PAIR = re.compile(rb"[+-]?[0-9]{1,3}\.[0-9]{1,9}, ?[+-]?[0-9]{1,3}\.[0-9]{1,9}")
 

@@ -15,9 +15,9 @@ from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430
 
 # The resistance of the paper's gauges.
 GAUGE_OHM = 25.0
-# Shares of that: a gauge at rest may be made 40 % smaller, a stretched one has at most twice its resistance.
-MIN_FRACTION, MAX_FRACTION = 0.6, 2.0
-SHORT_FRACTION, OPEN_FRACTION = 0.1, 4.0
+# Multiples of that: a gauge at rest may be made 40 % smaller, a stretched one has at most twice its resistance.
+MIN_FACTOR, MAX_FACTOR = 0.6, 2.0
+SHORT_FACTOR, OPEN_FACTOR = 0.1, 4.0
 # Largest relative error of the current.
 CURRENT_TOLERANCE = 0.01
 # Leads and contacts in series with the gauges.
@@ -165,8 +165,8 @@ class SampleValidator:
     def _gauge_faults(self, voltages: Voltages) -> list[SkinFault]:
         values = (voltages.v1_v, voltages.v2_v)
         overranges = (voltages.over_1, voltages.over_2)
-        is_open = [over or abs(v) > OPEN_FRACTION * self._gauge_v for v, over in zip(values, overranges, strict=True)]
-        is_short = [abs(v) < SHORT_FRACTION * self._gauge_v for v in values]
+        is_open = [over or abs(v) > OPEN_FACTOR * self._gauge_v for v, over in zip(values, overranges, strict=True)]
+        is_short = [abs(v) < SHORT_FACTOR * self._gauge_v for v in values]
         found = []
         for i, (v, over) in enumerate(zip(values, overranges, strict=True)):
             if is_open[i] and is_short[1 - i]:
@@ -179,7 +179,7 @@ class SampleValidator:
                     found.append(SkinFault.of_gauge("SHORT", i))
             elif v < 0:
                 found.append(SkinFault.of_gauge("REVERSED", i))
-            elif not MIN_FRACTION * self._gauge_v <= v <= MAX_FRACTION * self._gauge_v:
+            elif not MIN_FACTOR * self._gauge_v <= v <= MAX_FACTOR * self._gauge_v:
                 found.append(SkinFault.of_gauge("IMPLAUSIBLE", i))
         return found
 

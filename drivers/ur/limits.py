@@ -255,7 +255,7 @@ def _room(direction: float, sample: RtdeSample, limits: UrLimits) -> float:
 
 
 def _fading(sample: RtdeSample, limits: UrLimits) -> list[tuple[float, str]]:
-    """Return the share of the speed left, and the reason, for each of force and torque above its inner limit."""
+    """Return the fraction of the speed left, and the reason, for each of force and torque above its inner limit."""
     found = []
     for name, value, bound, unit in _loads(sample, limits):
         if value > bound.inner:

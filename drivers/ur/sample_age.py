@@ -2,8 +2,8 @@
 
 import math
 
-# The smallest clock offset may rise by this share of the time. Clocks drift by up to 500 ppm, and a simulator's may be
-# slow by some thousandths on a busy computer. A delay of 0.1 s is forgotten after 10 s.
+# The smallest clock offset may rise by this fraction of the time. Clocks drift by up to 500 ppm, and a simulator's may
+# be slow by some thousandths on a busy computer. A delay of 0.1 s is forgotten after 10 s.
 _OFFSET_RISE = 1e-2
 
 

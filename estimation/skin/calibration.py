@@ -407,7 +407,7 @@ class _CurveFit:
 
 
 def _knots(tension: FloatArray) -> FloatArray:
-    """Return where the pieces beyond the straight one begin: as many as the rows support, with equal shares."""
+    """Return where the pieces beyond the straight one begin: as many as the rows support, with equal fractions."""
     beyond = np.sort(tension[tension > LINEAR_TO_N])
     pieces = min(MAX_PIECES, len(beyond) // MIN_ROWS_PER_PIECE)
     if not pieces:

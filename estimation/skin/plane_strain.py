@@ -195,7 +195,7 @@ class SkinMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaugeLine:
-    """The m elements at the gauges' depth, by rising angle: middles, the gauges' weights (2, m), shares of 3 points."""
+    """The m elements at the gauges' depth, by rising angle: middles, gauges' weights (2, m), fractions of 3 points."""
 
     basis: skfem.Basis
     degrees: FloatArray
@@ -290,7 +290,7 @@ def gauge_strains(skin: CondensedSkin, states: Iterable[ContactState]) -> FloatA
 def gauge_depth_mm(section: Section, slack_ratio: float) -> float | None:
     """Return the depth (mm, outwards from mid-thickness) where the slack gauge reads this fraction of the other one.
 
-    The slack side bends, so the share rises outwards. None where no depth within the skin has this share.
+    The slack side bends, so the fraction rises outwards. None where no depth within the skin has this fraction.
     """
     depths = np.linspace(-0.5, 0.5, 5) * section.thickness_mm
     shares = []

@@ -80,7 +80,7 @@ def _lost(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatArr
 
 
 def _saturated(scene: FaultScene, level: float, _: np.random.Generator) -> FloatArray:
-    """Clip the amplifier's readings so that this share of the idle frame's channels is at its rail."""
+    """Clip the amplifier's readings so that this fraction of the idle frame's channels is at its rail."""
     channels = scene.series.channels
     if not level:
         return channels
@@ -102,7 +102,7 @@ def _drift(scene: FaultScene, level: float, rng: np.random.Generator) -> FloatAr
 
 
 def _gain(scene: FaultScene, level: float, _: np.random.Generator) -> FloatArray:
-    """Raise all channels by this share, as when the gel dries or the current source drifts."""
+    """Raise all channels by this fraction, as when the gel dries or the current source drifts."""
     channels = scene.series.channels
     return channels + level * (scene.idle if isinstance(scene.series, SliceSeries) else channels)
 
@@ -156,10 +156,10 @@ _LOADED_FRACTION = 0.1
 
 @dataclass(frozen=True, slots=True)
 class FaultLevel:
-    """Errors at one level of a fault: bias and spread of valid estimates in N·m, and shares of all frames.
+    """Errors at one level of a fault: bias and spread of valid estimates in N·m, and fractions of all frames.
 
-    `false_valid` is the share of frames called valid although the truth is outside the 95 % interval. Without more, no
-    estimate is valid.
+    `false_valid` is the fraction of frames called valid although the truth is outside the 95 % interval. Without more,
+    no estimate is valid.
     """
 
     level: float
@@ -312,7 +312,7 @@ def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration | S
 
 
 def sweeps_figure(title: str, curves: Sequence[FaultCurve], panels: int = 3) -> Figure:
-    """Draw bias, valid and false-valid share of every estimator, one row per fault; more panels stay empty."""
+    """Draw bias, valid and false-valid fraction of every estimator, one row per fault; more panels stay empty."""
     faults = list(dict.fromkeys((curve.fault, curve.unit) for curve in curves))
     names = list(dict.fromkeys(curve.estimator for curve in curves))
     made = figure(5 * panels, 2.75 * len(faults) + 1.0)

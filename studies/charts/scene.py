@@ -25,7 +25,7 @@ _MIN_SHOWN, _MAX_TICKS = 1e-3, 12
 def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
     """Design for each recording on each fingertip, draw and write; print doubts on stderr, as `bank design` does.
 
-    Recordings are of the paper's fingertip. On the others the same grip is simulated with the same share of noise.
+    Recordings are of the paper's fingertip. On the others the same grip is simulated with the same fraction of noise.
     """
     titles = [split.title.split(",", maxsplit=1)[0] for split in parts]
     wholes = [split.whole for split in parts]

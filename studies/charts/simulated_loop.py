@@ -300,7 +300,7 @@ def started_controller(plant: Plant, found: ToolModel, settings: ControllerSetti
 
 # The chart's loop panel: how closely the torque follows over how many frames are averaged.
 WINDOWS = (1, 2, 3, 4, 6, 9)
-# All smoothing is in the window: each mean corrects by this share. The tuned controller takes single frames.
+# All smoothing is in the window: each mean corrects by this fraction. The tuned controller takes single frames.
 GAIN = 0.5
 LOOPS = ("twist controller", "no delay compensator", "twist controller, gain tuned to the noise")
 # The set point wanders and an unknown load comes and goes; only measurements reveal the load.

@@ -37,7 +37,7 @@ AGE_S, ACTUATION_TICKS = 0.06, 2
 # At 0.25 s a reading is stale and the loop holds.
 AGES_S = (0.02, 0.06, 0.1, 0.15, 0.2)
 RADIUS_MM, SET_POINTS_N = 15.0, (1.0, 0.6, 1.0)
-# The judged share of each hold, at its end.
+# The judged fraction of each hold, at its end.
 SETTLED_FRACTION = 0.6
 # Noise of one resistance, as in the emulated DAQ: 1.6 mN of shear force over both gauges.
 RELATIVE_NOISE = 0.0016 * 0.088 / 2**0.5

@@ -68,7 +68,7 @@ class MeasuredMethod:
 def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> list[MeasuredMethod]:
     """Run all methods in turn, `rounds` times, so that a busy moment of the machine affects all alike.
 
-    Errors and valid shares are of the frames with a known truth.
+    Errors and valid fractions are of the frames with a known truth.
     """
     times: dict[str, list[float]] = {method.name: [] for method in methods}
     torques: dict[str, FloatArray] = {}
@@ -186,7 +186,7 @@ def _timed(split: Split, read: Callable[[FloatArray], float]) -> Callable[[], tu
 
 # The largest noise that the loop's identification tolerates.
 _LARGEST_LOOP_NOISE_NM = 0.02
-# Errors count valid frames only. A method below this share of the most valid one stays off the frontier.
+# Errors count valid frames only. A method below this fraction of the most valid one stays off the frontier.
 _OFTEN_VALID = 0.9
 # Fill of a single window's mark, from the smallest noise to the largest.
 _FILLS: tuple[Literal["none", "left", "full"], ...] = ("none", "left", "full")
@@ -307,7 +307,7 @@ def often_valid(methods: Sequence[MeasuredMethod]) -> list[int]:
 
 
 def _short(one: MeasuredMethod, is_often_valid: bool) -> str:
-    """Return a label, with the valid share where it is clearly below the others'."""
+    """Return a label, with the valid fraction where it is clearly below the others'."""
     short = one.name.removeprefix("rank ").removesuffix(" channels").replace("zero lag, ", "").replace("all lags, ", "")
     short = short.replace("paper: reference", "paper").replace("fast and exact", "fast").replace(", right", "")
     return short if is_often_valid else f"{short} ({one.valid_fraction:.0%} valid)"

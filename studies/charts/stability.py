@@ -104,10 +104,10 @@ def _written(name: str, title: str, curves: Sequence[FaultCurve], out: Path) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContinuityWalk:
-    """Torques (n,) in N·m along a path through frames, NaN where not valid; `share_nm` is the fair share of a step.
+    """Torques (n,) in N·m along a path through frames, NaN where not valid; `share_nm` is the fair fraction of a step.
 
     `largest_hop_nm` is the largest change within a step, 0 where nothing was valid; `hops` counts the changes by more
-    than ten fair shares.
+    than ten fair fractions.
     """
 
     name: str
@@ -148,7 +148,7 @@ def walks(split: Split, bank: Bank, calibrations: Sequence[AnyCalibration]) -> l
     return found
 
 
-# Shares of the slices to calibrate on, from the smallest torques or from the largest.
+# Fractions of the slices to calibrate on, from the smallest torques or from the largest.
 CALIBRATED_FRACTIONS = (0.8, 0.65, 0.5, 0.4, 0.3)
 SMALLER = "calibrated on the smaller torques alone"
 LARGER = "calibrated on the larger torques alone"

@@ -77,7 +77,7 @@ _GROUPS = 10
 # Without repeats, the held-out parts are stretches of time.
 _STRETCHES = 5
 _BATCH = 8
-# A fall by more than this share of the whole range begins a new series.
+# A fall by more than this fraction of the whole range begins a new series.
 _RESTART_FRACTION = 0.5
 # This share of a series' steps must rise: noise may swap neighbouring levels.
 _RISING_FRACTION = 0.8
@@ -85,7 +85,7 @@ _RISING_FRACTION = 0.8
 ENVELOPES = tuple(
     EnvelopeSettings(distance, averaged) for distance in (30, 40, 50, 60, 70) for averaged in (1, 3, 5, 7, 9)
 )
-# A model is tried at these shares of the height for the matching score. More change it by less than 0.001.
+# A model is tried at these fractions of the height for the matching score. More change it by less than 0.001.
 _PLACES = np.linspace(0.02, 0.98, 49)
 
 

@@ -24,7 +24,7 @@ PAPER_CHANNELS, PAPER_FRACTION = 272, 0.8
 # Every number up to here, then evenly spaced logarithms.
 _EVERY_COUNT, _N_COUNTS = 64, 30
 _SIDE = "right"
-# More than this share of the largest torque is a twist.
+# More than this fraction of the largest torque is a twist.
 _TWISTED = 0.1
 PHASES = ("no action", "gripped", "twisted")
 _SHADES = ("#8c8c8c", "#1f5f99", "#d6338a")
@@ -34,7 +34,7 @@ _SHADES = ("#8c8c8c", "#1f5f99", "#d6338a")
 class ChannelRegression:
     """How well least squares on the n best channels predicts the torques of parts left out, for each n of counts (m,).
 
-    r (m,) and r2 (m,) are the correlation and the explained share of the variance; the last is of all channels.
+    r (m,) and r2 (m,) are the correlation and the explained fraction of the variance; the last is of all channels.
     """
 
     ranking: str
@@ -43,11 +43,11 @@ class ChannelRegression:
     r2: FloatArray
 
     def r_share_at(self, count: int) -> float:
-        """Return the correlation with the nearest number of channels, as a share of all channels' correlation."""
+        """Return the correlation with the nearest number of channels, as a fraction of all channels' correlation."""
         return float(self.r[np.abs(self.counts - count).argmin()] / self.r[-1])
 
     def counts_reaching(self, share: float) -> tuple[int, int] | None:
-        """Return the least number of channels with this share of all channels' R², and the least that keeps it.
+        """Return the least number of channels with this fraction of all channels' R², and the least that keeps it.
 
         None if all channels explain nothing.
         """

@@ -62,7 +62,7 @@ class Reproduction:
     notes: tuple[str, ...]
 
     def region_agreement(self) -> dict[str, float]:
-        """Return the share of the wide bank's cells whose validity agrees with the paper's region, by its reading."""
+        """Return the fraction of the wide bank's cells whose validity agrees with the paper's region, by reading."""
         wide = self.banks["wide"]
         in_k, in_sigma = (wide.k_grid > PAPER_REGION_CM[0])[:, None], wide.sigma_grid > PAPER_REGION_CM[1]
         return {

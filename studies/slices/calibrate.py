@@ -79,7 +79,7 @@ def calibrate_slices(
     time_range: tuple[float, float],
     assume_full_range: bool = False,
 ) -> SliceResult:
-    """Fit an estimator to these shares (0 to 1) of folders of slices, oldest first.
+    """Fit an estimator to these fractions (0 to 1) of folders of slices, oldest first.
 
     With `assume_full_range` no torque will exceed the calibrated range. Raises UserError for a folder that is given
     twice, and CalibrationError for slices that determine no calibration.

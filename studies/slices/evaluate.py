@@ -45,7 +45,7 @@ def estimate_in_worker(shared: tuple[SliceCalibration, str | None], series: Slic
 def evaluate_slices(
     calibration: Path, folders: Sequence[Path], bank: Path | None, time_range: tuple[float, float], pool: Executor
 ) -> Evaluation:
-    """Return the estimates of these shares (0 to 1) of folders of slices, by a calibration's file."""
+    """Return the estimates of these fractions (0 to 1) of folders of slices, by a calibration's file."""
     made = SliceCalibration.load(calibration)
     if bank is not None:
         Bank.open(bank)

@@ -13,7 +13,7 @@ from shearloop.estimation.intervals import ValueRange
 from shearloop.estimation.ridge import Ridge
 from shearloop.studies.slices.curve import CurveMean
 
-# Share of values left out at either end of the range to test extrapolation. It fails if the prediction covers less
+# Fraction of values left out at either end of the range to test extrapolation. It fails if the prediction covers less
 # than half of the way beyond.
 _AT_END, _LARGEST_SHORTFALL = 0.2, 0.5
 # Left-out values count as at least this far beyond the rest, in spans: noise would dominate a shorter distance.

@@ -31,7 +31,7 @@ _MAX_MISSING = 0.5
 # Directions of slices that the reciprocity check ignores, and its margin beyond the largest residual of blocks left
 # out: later slices stay within 1.39 times of it after two repeats, and within 0.8 times after four.
 _RECIPROCITY_DIRECTIONS, _RECIPROCITY_MARGIN = 12, 1.5
-# Less than this share of a slice is rounding: a board's converter alone makes thousands of times as much.
+# Less than this fraction of a slice is rounding: a board's converter alone makes thousands of times as much.
 _MIN_NOISE = 1e-6
 
 
@@ -131,7 +131,7 @@ class NoveltyDetector:
         return cls(mean, spread, vt[:rank], variances, 0.0, np.inf, np.inf, np.inf, None, 0.0)
 
     def q_residual(self, difference: FloatArray, usable: BoolArray) -> tuple[float, float]:
-        """Return the mean squared residual of a (c,) difference, and the share of outlying channels."""
+        """Return the mean squared residual of a (c,) difference, and the fraction of outlying channels."""
         x = self._scale(difference)
         residual = (x - _coordinates(self.directions, x, usable) @ self.directions)[usable]
         return float((residual**2).mean()), float((np.abs(residual) > _OUTLYING_SPREADS).mean())
@@ -142,7 +142,7 @@ class NoveltyDetector:
         return float((scores**2 / self.variances[:_T2_DIRECTIONS]).sum())
 
     def response_share(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return the share of the mean in a (c,) difference, by its part off the main directions.
+        """Return the fraction of the mean in a (c,) difference, by its part off the main directions.
 
         A smaller response, as where a foreign signal replaces it, moves a difference along the main directions like
         another torque. A torque leaves the other part alone (partial regression, Frisch–Waugh).
@@ -191,7 +191,7 @@ class NoveltyDetector:
         return ()
 
     def missing_share(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return the share of the fingertip's own response that foreign signals may have replaced."""
+        """Return the fraction of the fingertip's own response that foreign signals may have replaced."""
         if self.typical_response <= 0:
             return 0.0
         left = self.response_share(difference, usable) / self.typical_response

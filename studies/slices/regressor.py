@@ -40,7 +40,7 @@ class SliceRegressor:
     ) -> tuple[float, float, float]:
         """Return the value of (d,) features and how far its 95 % interval extends below and above it.
 
-        With a share of the channels unusable, the interval grows by the root of it. `complete` (d,) are the features
+        With a fraction of the channels unusable, the interval grows by the root of it. `complete` (d,) are the features
         with a response that may be missing: the interval extends to their value.
         """
         rows = features[None] if complete is None else np.array([features, complete])

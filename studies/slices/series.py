@@ -75,7 +75,7 @@ def _series_of(slices: Slices) -> SliceSeries:
 
 
 def read_parts(folders: Sequence[Path], time_range: tuple[float, float]) -> tuple[list[Path], list[SliceSeries]]:
-    """Return these shares (0 to 1) of the series of folders, and the folder of each.
+    """Return these fractions (0 to 1) of the series of folders, and the folder of each.
 
     Raises UserError for a folder that is given twice, and for copies of a slice.
     """

@@ -47,7 +47,10 @@ from shearloop.errors import UserError
 from shearloop.files import open_file
 
 Progress = Callable[[int], None]
-_JOINED = "several recordings follow one another in this file, whose messages would be mixed; repair each alone"
+_JOINED = (
+    "it holds several recordings, joined by `cat` for instance, and their messages would be mixed; use the files that "
+    "it was made of"
+)
 NOTHING_INTACT = "it holds no intact message, so nothing can be saved"
 # A recorder makes chunks of 16 MB and attaches files of up to 32 MB.
 LARGEST_RECORD_BYTES = 64 << 20

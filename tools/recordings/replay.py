@@ -95,11 +95,6 @@ class RecordedBefore:
             self._tools.append((number, before.tool))
         self._before[number] = self._before.get(number, BeforeFrame()).with_later(replace(before, tool=None))
 
-    @property
-    def tares(self) -> list[int]:
-        """The numbers of the frames that tares begin with."""
-        return [number for number, before in self._before.items() if before.begins_tare]
-
     def of(self, number: int, last: int) -> BeforeFrame:
         """Return what comes before a frame and after the `last` one.
 

@@ -286,5 +286,5 @@ def test_recordings_that_were_joined_by_cat_are_refused(content, cut, tmp_path):
     for number, second in enumerate((content, other)):
         path = tmp_path / f"joined-{number}.mcap.partial"
         path.write_bytes(content[: len(content) - cut] + second)
-        with pytest.raises(UserError, match="several recordings follow one another"):
+        with pytest.raises(UserError, match="it holds several recordings"):
             repair(path)

@@ -167,6 +167,14 @@ class Browsed:
         except PlaywrightTimeoutError:
             assert self.page.evaluate(texts, dict(shown)) == shown
 
+    def until_complete(self) -> None:
+        """Wait until every message is shown: a panel whose message comes late could not become old."""
+        self.page.wait_for_function(
+            """() => !document.querySelector('#shear').hidden && document.querySelector('.fingertip:not([hidden])') &&
+              ['torque-now', 'diameter', 'speed-sent', 'phase-name'].every(
+                (id) => document.getElementById(id).textContent !== '–')"""
+        )
+
     def until_old(self, count: int) -> None:
         """Wait until so many panels are marked as old."""
         self.page.wait_for_function("n => document.querySelectorAll('.panel.old').length === n", arg=count)

@@ -362,6 +362,7 @@ def test_a_dead_daemon_is_shown_within_two_seconds(browsed):
               }).observe(document.querySelector('#link'), { subtree: true, childList: true, characterData: true });
             }"""
         )
+        browsed.until_complete()
         browsed.daemon.kill()
         browsed.until("#link-state", "✗ DAEMON SILENT")
         shown_after_s.append(page.evaluate("window.shownDead"))
@@ -378,7 +379,7 @@ def test_a_dead_daemon_is_shown_within_two_seconds(browsed):
 
 def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     page = browsed.open()
-    browsed.until("#link-state", "● live")
+    browsed.until_complete()
     silent = dict.fromkeys(name for name in MESSAGES if name != "end")
     figures = ("torque-now", "wanted", "other-torque", "diameter", "speed-sent")
     shown = {name: browsed.text(f"#{name}") for name in figures}
@@ -413,6 +414,7 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
 
 def test_a_lost_viewer_is_shown_and_reconnects(browsed):
     page = browsed.open(token=True)
+    browsed.until_complete()
     browsed.viewer.kill()
     browsed.until("#link-state", "✗ VIEWER LOST")
     browsed.until_all_old()

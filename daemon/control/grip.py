@@ -51,12 +51,16 @@ class Grip:
         return replace(self, width_mm=min(self.width_mm, gripper.width_mm))
 
     def followed(self, gripper: GripperStatus) -> "Grip":
-        """Return this grip with the width and the position of the gripper's present state."""
+        """Return this grip with the width and the position of the gripper's present state.
+
+        A width is first known from an object that is felt: a later grip tightens on that one alone.
+        """
         grip = self
-        may_hold = gripper.holding or gripper.unfelt
-        if may_hold and (self.width_mm is None or abs(gripper.width_mm - self.width_mm) > FOLLOWED_MM):
+        held_on = gripper.unfelt and self.known
+        has_width = gripper.holding or (held_on and self.width_mm is not None)
+        if has_width and (self.width_mm is None or abs(gripper.width_mm - self.width_mm) > FOLLOWED_MM):
             grip = replace(grip, width_mm=gripper.width_mm)
-        if may_hold or gripper.moving:
+        if gripper.holding or gripper.moving or held_on:
             grip = replace(grip, requested_counts=gripper.requested_counts)
         return grip
 

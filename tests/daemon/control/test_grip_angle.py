@@ -286,3 +286,21 @@ async def test_the_operator_says_that_another_tool_is_clamped():
         assert cell.control_loop.tool.grip.known
         assert await cell.runner.release() is None
         assert not cell.control_loop.tool.grip.known
+
+
+def test_a_grip_after_one_that_met_nothing_begins_an_angle_of_its_own():
+    """The turn between was of empty fingers, and is no twist of the tool."""
+    rig = Rig(new_loop())
+    rig.force_n, rig.width_mm, rig.hand = 0.0, 60.0, replace(rig.hand, unfelt=True)
+    met_nothing = {**GRIP, "width_mm": 60.0, "expect_object": False}
+    started(rig, met_nothing, TWIST_AGAIN, torque_source="load_cell")
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    again_rad = rig.wrist_rad
+    started(rig, GRIP, TWIST_AGAIN, **TWISTED)
+    while not rig.pending:
+        rig.step()
+    rig.force_n, rig.width_mm, rig.hand = 60.0, 30.0, replace(rig.hand, unfelt=False)
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+    assert rig.wrist_rad - again_rad == pytest.approx(0.25, abs=0.01)

@@ -17,7 +17,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.control_output import End
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.grip import FOLLOWED_MM, SAME_WIDTH_MM, Grip
+from shearloop.daemon.control.grip import FOLLOWED_MM, NO_GRIP, SAME_WIDTH_MM, Grip
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.control.wrench import wrench_source
@@ -549,11 +549,14 @@ def test_an_unfelt_grip_is_another_one_after_another_request():
     grip = Grip(0.3, 60.0).followed(
         GripperStatus(0, 30.0, holding=False, moving=False, unfelt=True, requested_counts=140)
     )
-    assert (grip.width_mm, grip.requested_counts) == (30.0, 140)
+    assert (grip.width_mm, grip.requested_counts) == (None, 140)
     same = GripperStatus(1, 30.0, holding=False, moving=False, unfelt=True, requested_counts=140)
     assert grip.why_another(same) == ""
     assert "it was asked for the position 60 since then" in grip.why_another(replace(same, requested_counts=60))
-    assert "its fingers are 80.0 mm apart" in grip.why_another(replace(same, width_mm=80.0, requested_counts=60))
+    felt = replace(grip, width_mm=30.0).followed(replace(same, width_mm=28.0))
+    assert felt.width_mm == 28.0
+    assert "its fingers are 80.0 mm apart" in felt.why_another(replace(same, width_mm=80.0))
+    assert NO_GRIP.followed(same) == NO_GRIP, "fingers that stand somewhere are no grip"
 
 
 async def test_a_write_that_is_cut_off_is_no_other_programs_for_the_next_one(monkeypatch):

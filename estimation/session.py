@@ -95,7 +95,7 @@ class Session:
             return None
         try:
             return self.adapt(before.known_torques.torque_nm)
-        except Exception as error:  # noqa: BLE001 - whoever asked for the correction is told
+        except Exception as error:  # noqa: BLE001 - it is the result of the step that waits
             return error
 
     def set_tool(self, tool: Measured | None) -> None:

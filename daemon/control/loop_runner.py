@@ -41,7 +41,7 @@ BRAKE_S = 0.5
 ENABLED_WITHIN_S = 0.5
 ENDING = "the daemon ends; start it again"
 STOPPED_AT_START = "it was stopped during its start"
-# Somebody who sends a stop may not have seen yet that the experiment has ended by itself.
+# An operator who sends a stop may not have seen yet that the experiment has ended by itself.
 UNSEEN_S = 5.0
 
 
@@ -133,7 +133,8 @@ class ControlLoopRunner:
         experiment, ended_ns = self._control_loop.experiment, self._ended_ns
         if experiment is None or ended_ns is None or self._clock.now_ns() - ended_ns > UNSEEN_S * 1e9:
             return None
-        stop = self._control_loop.safety.waiting
+        safety, was_stopped = self._control_loop.safety, experiment.phase is ExperimentPhase.STOPPED
+        stop = safety.waiting or (safety.acknowledged if was_stopped else None)
         asked = stop is not None and any(fault.code is FaultCode.OPERATOR_STOP for fault in stop.faults)
         return None if asked else experiment.file.name
 

@@ -321,7 +321,7 @@ class Stop:
     faults: tuple[Fault, ...]
     # Grows with each cause that begins a stop or joins one.
     number: int
-    # Why somebody asked for it, as the status shows it; empty for a stop that nobody asked for.
+    # The reason of a stop on request, as the status shows it; empty for a stop by a fault.
     reason: str = ""
     # Whether it has opened the gripper.
     released: bool = False

@@ -85,7 +85,7 @@ class FingertipTask:
     # Why the frames of the present tare gave no estimate.
     _refused: CountedReasons = field(default_factory=CountedReasons)
     _held: Measured | None = None
-    # Whether the gripper has not said yet that nothing was held in an idle frame that nobody asked for.
+    # Whether an idle frame was taken without a request, before the gripper has reported that it held nothing.
     _unconfirmed: bool = field(init=False)
     # The source of the known torque of a correction that waits for the next frame, and its result.
     _adapting: tuple[str, asyncio.Future[None]] | None = None
@@ -198,7 +198,7 @@ class FingertipTask:
         return self.gripper.moved_between(min(frame.t_begin_ns for frame in frames), ended_ns)
 
     def _known_torques(self) -> KnownTorques | None:
-        """Return the torques for the correction of the gain that somebody waits for, None without one."""
+        """Return the torques for the correction of the gain that a step waits for, None without one."""
         if self._adapting is None or self._adapting[1].done():
             return None
         reference, ended = self._adapting
@@ -211,9 +211,9 @@ class FingertipTask:
         return KnownTorques(reference, of_grip)
 
     def _end_correction(self, frames: tuple[Frame, ...], corrected: Adaptation | Exception) -> None:
-        """Publish a correction of the gain that begins with these frames; tell whoever waits for it how it ended."""
+        """Publish a correction of the gain that begins with these frames; give its result to the waiting step."""
         if self._adapting is None:
-            raise RuntimeError("nobody waits for a correction of the gain")
+            raise RuntimeError("no step waits for a correction of the gain")
         reference, ended = self._adapting
         if isinstance(corrected, Exception):
             # It fails the step, and the frames go on.

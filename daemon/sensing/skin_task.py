@@ -33,7 +33,7 @@ SKIN_SOURCES = SKIN, SKIN_CURRENT, SKIN_DAQ
 ZERO_TIMEOUT_S = 15.0
 # The paper's bound.
 MAX_WARMING_K = 5.0
-# The recorded data where a zero is given up before its time is over, because nobody waits for it any longer.
+# The recorded data of a zero that is given up before its time is over, because its step has ended.
 GIVEN_UP = b"given up"
 
 

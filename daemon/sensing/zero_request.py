@@ -6,7 +6,7 @@ from enum import Enum
 
 from shearloop.timeouts import timeout
 
-# Why there is no zero for whoever waits for one, if the wait for a later one was cancelled.
+# The reason for a waiting step, if the later request that replaced its own was cancelled.
 _CALLED_OFF = "the zero was asked for again, and that was called off"
 
 
@@ -29,7 +29,7 @@ class ZeroRequest:
         self.from_ns = from_ns
         self.until_ns = until_ns
         self.state = ZeroState.REQUESTED
-        # Why it failed or expired, where somebody has to know.
+        # Why it failed or expired; may be empty.
         self.reason = ""
         self._later: ZeroRequest | None = None
         self._ended = asyncio.Event()
@@ -63,11 +63,11 @@ class ZeroRequest:
         self._end(ZeroState.FAILED, reason)
 
     def expire(self, reason: str = "") -> None:
-        """End it without a zero: its time is over, or nobody waits for it any longer."""
+        """End it without a zero, after its time or when its step has ended."""
         self._end(ZeroState.EXPIRED, reason)
 
     def replace(self, later: "ZeroRequest") -> None:
-        """End it by a later request, which is also of whoever waits for this one."""
+        """End it by a later request; a step that waits for this one then waits for that one."""
         if self.is_open:
             self._later = later
         self._end(ZeroState.REPLACED)

@@ -333,7 +333,7 @@ class UrSettings(_Checked):
     hang_timeout_s: Annotated[float, Field(ge=_SHORTEST_HANG_S, le=10)] = 1.5
     """A longer cycle is a hang and ends the worker, because calls of ur-rtde block for up to 301 s."""
     recover_timeout_s: Annotated[float, Field(ge=_SHORTEST_RECOVERY_S, le=300)] = 30.0
-    """Time for one attempt to make the robot ready."""
+    """Time for each step of making the robot ready: power, brakes, control program."""
     reaction_s: Annotated[float, Field(ge=_SHORTEST_REACTION_S, le=0.5)] = 0.04
     """Delay until a commanded speed takes effect; distances to the joint limits include it."""
     rest_rad_per_s: Annotated[float, Field(ge=_MIN_REST_RAD_PER_S, le=0.05)] = REST_RAD_PER_S

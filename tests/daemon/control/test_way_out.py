@@ -603,10 +603,13 @@ async def test_a_stop_just_after_an_experiment_has_ended_by_itself_does_not_end_
         assert await stop_command({}) == {"ended": True, "process": os.getpid()}
 
 
-async def test_a_second_stop_of_an_operator_ends_the_daemon_at_once():
+@pytest.mark.parametrize("acknowledged", [False, True])
+async def test_a_second_stop_of_an_operator_ends_the_daemon_at_once(acknowledged):
     async with driven({"do": "wait", "wait_s": 60}) as cell:
         cell.holding = False
         stop_command = commands_of(cell)["stop"]
         assert (await stop_command({}))["stopped"] == "test"
         await cell.cycles(5)
+        if acknowledged:
+            cell.control_loop.acknowledge()
         assert await stop_command({}) == {"ended": True, "process": os.getpid()}

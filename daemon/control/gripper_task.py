@@ -200,7 +200,8 @@ class GripperTask:
     def _unfelt(self, state: GripperState) -> bool:
         """Return whether the fingers stand at their target, and did not open to it: an object as wide is not felt.
 
-        The detection of objects "is precise only to the order of a few mm" (manual of the 2F-140, object detection).
+        A gripper tells an object from its target only if they differ by some millimetres (manual of the 2F-140, object
+        detection).
         """
         at_target = state.object is ObjectStatus.AT_TARGET or state.diameter_mm is not None
         return at_target and not (state.opened or self._nearly_open(state) or self._holds(state))

@@ -15,7 +15,7 @@ from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
-# A gripper feels a tool that is wider than its target by this much: its manual says "only to the order of a few mm".
+# A gripper feels a tool that is wider than its target by this much: by the manual it takes some millimetres.
 FELT_MM = 5.0
 
 

@@ -1,7 +1,7 @@
 """What sensors and control loop exchange: torques with their sources, zeros, and known torques."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from statistics import fmean
@@ -12,7 +12,7 @@ from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
 # The paper's ten frames take 5.4 s.
 LONGEST_TARE_S = 30.0
-# A torque below this counts as drift: a tare needs no confirmation.
+# A torque below this counts as drift of the zero, and not as a load, if its source names no other one.
 LOADED_NM = 0.05
 # A stretch within the noise may be a load if its mean exceeds this fraction of the noise. Noise has a smaller mean.
 _LOAD_IN_NOISE = 0.5
@@ -26,7 +26,7 @@ class TorqueSample:
     """One torque of one source, with the time of its measurement (`t_mid_ns`) and of its arrival (`t_ns`).
 
     `torque_nm` is None if it is not valid, for `reason`. `low_nm` and `high_nm` bound the friction band that
-    hides the torque.
+    hides the torque. A torque beyond `loaded_nm` is a load; a smaller one may be drift of the zero.
     """
 
     source: str
@@ -36,6 +36,7 @@ class TorqueSample:
     t_ns: int
     low_nm: float | None = None
     high_nm: float | None = None
+    loaded_nm: float = LOADED_NM
 
     def __post_init__(self) -> None:
         """Treat NaN and infinity as no torque."""
@@ -101,19 +102,16 @@ class LatestTorques:
     """The listener of sensors without a robot: it knows which of them is loaded."""
 
     def __init__(self) -> None:
-        self._torques_nm: dict[str, float] = {}
+        self._torques: dict[str, TorqueSample] = {}
 
     def on_link(self, _device: str, _sentence: str, *, up: bool) -> None:
         """Forget all torques when a device is lost, also `combined`; the other devices send new ones at once."""
         if not up:
-            self._torques_nm.clear()
+            self._torques.clear()
 
     def on_torque(self, torque: TorqueSample) -> None:
         """Accept a torque sample from any source."""
-        if torque.torque_nm is None:
-            self._torques_nm.pop(torque.source, None)
-        else:
-            self._torques_nm[torque.source] = torque.torque_nm
+        self._torques[torque.source] = torque
 
     def on_zero(self, source: str, *, known: bool = True) -> None:
         """Ignore a zero: nothing turns that could need it."""
@@ -124,7 +122,7 @@ class LatestTorques:
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
-        loaded = loaded_sentence(self._torques_nm)
+        loaded = loaded_sentence(self._torques.values())
         if confirmed or not loaded:
             return None
         return f"{loaded}, which would become the zero; {CONFIRM_TARE}"
@@ -151,11 +149,11 @@ def beyond_noise(times_ns: Sequence[int], torques_nm: Sequence[float], noise_nm:
     return found
 
 
-def loaded_sentence(torques_nm: Mapping[str, float | None]) -> str:
+def loaded_sentence(torques: Iterable[TorqueSample]) -> str:
     """Return which source measures a load that does not come from its drift, or an empty string."""
-    for name, torque_nm in torques_nm.items():
-        if torque_nm is not None and abs(torque_nm) > LOADED_NM:
-            return f"{name} measures {torque_nm:+.3f} N·m"
+    for torque in torques:
+        if torque.torque_nm is not None and abs(torque.torque_nm) > torque.loaded_nm:
+            return f"{torque.source} measures {torque.torque_nm:+.3f} N·m"
     return ""
 
 

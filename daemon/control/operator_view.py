@@ -75,6 +75,8 @@ class OperatorView:
             return f"{uncertain}; {CONFIRM_TARE}"
         if loaded := self._loaded():
             return f"{loaded}, which would become the zero; {CONFIRM_TARE}"
+        if turned := self._turned():
+            return f"{turned}, and its load would become the zero; {CONFIRM_TARE}"
         return None
 
     def why_no_tare_step(self) -> str | None:
@@ -84,29 +86,27 @@ class OperatorView:
         if loaded := self._loaded():
             cure = "if nothing is loaded, `shearloop command tare --yes` takes the zero before the start"
             return f"{loaded}, which would become the zero; take the load off ({cure})"
-        if turned := self._turned_on_wrench():
-            return f"{turned}, and its load would become the zero of the wrench; {CLAMPED_CURE}"
+        if turned := self._turned():
+            return f"{turned}, and its load would become the zero; {CLAMPED_CURE}"
         return None
 
     def _loaded(self) -> str:
         """Return which sensor measures a load, as a sentence; empty without one. Drift does not count."""
         # Empty fingers of the gripper do not load a fingertip, so its torque is drift.
         empty = self.tool.has_gripper and self.inputs.gripper is not None
-        judged = {
-            name: latest.torque_nm
+        return loaded_sentence(
+            latest
             for name, latest in self.inputs.torques.items()
             if not self.sources[name].from_robot and not (empty and self.sources[name].warm_up_s)
-        }
-        return loaded_sentence(judged)
+        )
 
-    def _turned_on_wrench(self) -> str:
-        """Return how far a clamped tool is turned, which may load the robot's wrench; empty where it is not.
+    def _turned(self) -> str:
+        """Return how far a clamped tool is turned, which may load the sensors; empty where it is not.
 
-        Its angle says so without an error that adds up. A torque below the wrench's noise would, from zero to zero.
+        Its angle says so without an error that adds up. A torque below a load's bound would, from zero to zero.
         """
-        from_robot = any(source.from_robot for source in self.sources.values())
         angle_rad = self.tool.twisted_rad
-        if self.tool.has_gripper or not from_robot or abs(angle_rad) <= UNTURNED_RAD:
+        if self.tool.has_gripper or abs(angle_rad) <= UNTURNED_RAD:
             return ""
         return f"the clamped tool is turned by {angle_rad:+.3f} rad"
 

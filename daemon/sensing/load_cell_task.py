@@ -147,7 +147,9 @@ class LoadCellTask:
             return f"its torque changed by {changed_nm:.3f} N·m during the tare; {cure}"
         if self._judged_by is None:
             self._judged_by = calibration
-        loaded = loaded_sentence({LOAD_CELL: self._judged_by.torque_nm(raw)})
+        now_ns = self._clock.now_ns()
+        torque = TorqueSample(LOAD_CELL, self._judged_by.torque_nm(raw), "", now_ns, now_ns)
+        loaded = loaded_sentence([torque])
         if loaded and not self._confirmed:
             return f"{loaded}, counted from the last confirmed tare or the daemon's start; {CONFIRM_TARE}"
         return ""

@@ -184,6 +184,11 @@ class SkinEstimator:
         return bool(self._taker.samples)
 
     @property
+    def loaded_n(self) -> float:
+        """The shear force (N) that no drift explains: a zero that differs so from the calibration is refused."""
+        return MAX_CHANGE / self._calibration.slope_per_n
+
+    @property
     def fixed(self) -> dict[str, object]:
         """What follows from the configuration, and is no state."""
         return {"calibration": self._calibration}

@@ -236,6 +236,21 @@ async def test_the_zeros_of_a_clamped_tool_outlive_the_process(tared):
     assert after.control_loop.has_zero("wrench") is tared
 
 
+@pytest.mark.parametrize("make", [clamped_rig, clamped_with_wrench])
+def test_a_turned_clamped_tool_becomes_no_zero_of_any_sensor_unless_the_operator_confirms(make):
+    """Its load may be below what counts as drift."""
+    rig = make()
+    rig.run(0.1)
+    operator, tool = rig.control_loop.operator, rig.control_loop.tool
+    tool.count_angle(rig.control_loop.inputs.arm.wrist_rad - 0.08)
+    turned = "the clamped tool is turned by +0.080 rad, and its load would become the zero; "
+    assert operator.why_no_tare_step().startswith(turned)
+    assert operator.tare_refusal().startswith(turned)
+    assert operator.tare_refusal(confirmed=True) is None
+    tool.on_release_ended()
+    assert operator.why_no_tare_step() is operator.tare_refusal() is None
+
+
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("torque_nm", [0.0, 0.08, 0.15])
 def test_a_step_takes_no_zero_of_the_wrench_under_a_clamped_tool_that_is_turned(known, torque_nm):

@@ -206,6 +206,11 @@ def test_without_a_robot_only_present_torques_count_as_loads():
     assert latest.tare_refusal(confirmed=True) is None
     latest.on_torque(TorqueSample("load_cell", 0.04, "", 1, 1))
     assert latest.tare_refusal() is None
+    # A source knows from which torque on it is loaded.
+    latest.on_torque(TorqueSample("load_cell", 0.04, "", 2, 2, loaded_nm=0.03))
+    assert latest.tare_refusal() is not None
+    latest.on_torque(TorqueSample("load_cell", None, "its cable is out", 3, 3, loaded_nm=0.03))
+    assert latest.tare_refusal() is None
     # The estimate of both fingertips ends with either of them.
     latest.on_torque(TorqueSample("combined", 0.2, "", 2, 2))
     assert latest.tare_refusal() is not None

@@ -157,7 +157,12 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path):
     async with played(tmp_path) as bench:
         await bench.valid()
         bench.skin.push(0.8)
-        assert await bench.command("tare", source="skin") == {"ok": True, "taring": ["skin"]}
+        await bench.until(lambda content: (content["torque_nm"] or 0.0) > 0.01)
+        # A working load of this skin, which another sensor would count as drift.
+        refused = await bench.command("tare", source="skin")
+        assert refused["reason"].startswith("skin measures +0.01")
+        await bench.until(lambda content: content["valid"] and content["torque_nm"] > 0.01)
+        assert await bench.command("tare", source="skin", confirmed=True) == {"ok": True, "taring": ["skin"]}
         await bench.says("the zero was refused and is taken again")
         with pytest.raises(ActionError, match="the skin's zero was refused"):
             await tare_all(bench.daemon.sensors.tareable.values())

@@ -207,8 +207,10 @@ class AllLagsBounds:
     def __init__(self, matcher: "PrunedMatcher", frame: FloatArray) -> None:
         self._matcher, bank = matcher, matcher.compressed
         n = frame.size
-        self._padded, self._channels = np.zeros(3 * n), np.arange(n)
+        self._padded = np.zeros(3 * n)
         self._padded[n : 2 * n] = frame
+        # The frame at all lags, as a view: only rows that are chosen take memory.
+        self._shifted = np.lib.stride_tricks.sliding_window_view(self._padded, n)
         # The squared norm of the frame's overlap with the channels at each lag.
         self._energies = np.zeros(2 * n)
         np.cumsum((frame * frame)[:-1], out=self._energies[1:n])
@@ -271,7 +273,7 @@ class AllLagsBounds:
         self._highest = self._group_bounds.max(axis=0)
 
     def _frames(self, lags: IntArray) -> FloatArray:
-        return self._padded.take(lags[:, None] + self._channels)
+        return self._shifted[lags]
 
 
 class _PruningMatcher(Matcher):

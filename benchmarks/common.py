@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -121,8 +121,13 @@ def emulated_rig(folder: Path, bank: Path, *options: str) -> Iterator["subproces
 
 
 @contextlib.contextmanager
-def running_daemon(config: Path, module: str = "shearloop") -> Iterator[tuple["subprocess.Popen[bytes]", float]]:
-    """Run a daemon in its own process, by the module's command line; yield it and the seconds until it was ready."""
+def running_daemon(
+    config: Path, module: str = "shearloop", environment: Mapping[str, str] | None = None
+) -> Iterator[tuple["subprocess.Popen[bytes]", float]]:
+    """Run a daemon in its own process, by the module's command line; yield it and the seconds until it was ready.
+
+    `environment` has further variables of the process.
+    """
     folder = config.parent
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready, (folder / "daemon.log").open("wb") as log:
         ready.bind(str(folder / "notify"))
@@ -132,7 +137,7 @@ def running_daemon(config: Path, module: str = "shearloop") -> Iterator[tuple["s
         begun = time.monotonic()
         process = subprocess.Popen(
             [sys.executable, "-m", module, "run", str(config)],
-            env={**kept, "NOTIFY_SOCKET": str(folder / "notify")},
+            env={**kept, **(environment or {}), "NOTIFY_SOCKET": str(folder / "notify")},
             stderr=log,
         )
         try:

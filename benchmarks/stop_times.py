@@ -110,8 +110,19 @@ def write_random_bank(path: Path) -> None:
 class RunningRig:
     """One emulated rig, and a daemon that is started again when it ends."""
 
-    def __init__(self, folder: Path, stack: ExitStack, speed: int = 1, **content: Any) -> None:
-        """Start both; boards, gel and fingers are `speed` times as fast. `content` has further configuration keys."""
+    def __init__(
+        self,
+        folder: Path,
+        stack: ExitStack,
+        speed: int = 1,
+        environment: Mapping[str, str] | None = None,
+        **content: Any,
+    ) -> None:
+        """Start both; boards, gel and fingers are `speed` times as fast.
+
+        `environment` has further variables of the daemon's process, and `content` further configuration keys.
+        """
+        self._environment = environment
         write_random_bank(folder / "rig.bank")
         os.mkfifo(folder / "cause")
         self._causes = stack.enter_context((folder / "cause").open("r+b", buffering=0))
@@ -142,7 +153,8 @@ class RunningRig:
         self._daemons.close()
         for name in ("notify", "daemon.log"):
             (self._folder / name).unlink(missing_ok=True)
-        self.daemon, _ = self._daemons.enter_context(running_daemon(self._config, "benchmarks.breakable_daemon"))
+        run = running_daemon(self._config, "benchmarks.breakable_daemon", self._environment)
+        self.daemon, _ = self._daemons.enter_context(run)
 
     def worker_pid(self) -> int:
         """Return the worker."""

@@ -36,6 +36,8 @@ class Message:
     topic: ClassVar[str]
     # Expected messages per second; None for a message that is sent on change only.
     rate_hz: ClassVar[float | None]
+    # Whether several sources send it, as both fingertips do; a recording has a topic for each of them.
+    per_source: ClassVar[bool]
 
     source: str
     t_mono_ns: int
@@ -48,19 +50,19 @@ TOPICS: dict[str, type[Message]] = {}
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(column,))
-def message(topic: str, *, rate_hz: float | None) -> Callable[[type[M]], type[M]]:
+def message(topic: str, *, rate_hz: float | None, per_source: bool) -> Callable[[type[M]], type[M]]:
     """Declare the dataclass of a topic."""
 
     def declare(kind: type[M]) -> type[M]:
         kind = dataclass(frozen=True, slots=True, kw_only=True)(kind)
-        kind.topic, kind.rate_hz = topic, rate_hz
+        kind.topic, kind.rate_hz, kind.per_source = topic, rate_hz, per_source
         TOPICS[topic] = kind
         return kind
 
     return declare
 
 
-@message("eit.frame", rate_hz=1.85)
+@message("eit.frame", rate_hz=1.85, per_source=True)
 class EitFrame(Message):
     """One frame of a fingertip; its time is the middle of the acquisition."""
 
@@ -73,7 +75,7 @@ class EitFrame(Message):
     repeated: bool = column("", "whether the line is exactly equal to the previous line")
 
 
-@message("eit.estimate", rate_hz=1.85)
+@message("eit.estimate", rate_hz=1.85, per_source=True)
 class EitEstimate(Message):
     """The estimate from one frame; torque and diameter are nil unless `valid` is true."""
 
@@ -95,7 +97,7 @@ class EitEstimate(Message):
     latency_s: float = column("s", "time from the arrival of the frame's last byte to this message")
 
 
-@message("eit.adapted", rate_hz=None)
+@message("eit.adapted", rate_hz=None, per_source=True)
 class EitAdapted(Message):
     """A correction of a fingertip's gain by a known torque, valid until the next grip or tare."""
 
@@ -113,7 +115,7 @@ class EitAdapted(Message):
     frame: int = column("", "number of the first frame with the correction")
 
 
-@message("eit.heatmap", rate_hz=None)
+@message("eit.heatmap", rate_hz=None, per_source=True)
 class EitHeatmap(Message):
     """The scores of all cells for one frame, NaN for invalid cells; sent while there is a subscriber, or always."""
 
@@ -126,7 +128,7 @@ class EitHeatmap(Message):
     frame: int = column("", "number of the frame")
 
 
-@message("load.torque", rate_hz=10.9)
+@message("load.torque", rate_hz=10.9, per_source=False)
 class LoadTorque(Message):
     """One reading of the load cell on the lever; the torque can be used only if `valid` is true."""
 
@@ -138,7 +140,7 @@ class LoadTorque(Message):
     reason: str = column("", "why it is not valid, in a sentence; empty when it is")
 
 
-@message("skin.shear", rate_hz=10.0)
+@message("skin.shear", rate_hz=10.0, per_source=False)
 class SkinShear(Message):
     """One reading of the shear skin; the force and its interval are nil unless `valid` is true."""
 
@@ -160,7 +162,7 @@ class SkinShear(Message):
     latency_s: float = column("s", "time from the reading's arrival to this message")
 
 
-@message("robot.state", rate_hz=25.0)
+@message("robot.state", rate_hz=25.0, per_source=False)
 class RobotStateMessage(Message):
     """The state of the robot's controller."""
 
@@ -190,7 +192,7 @@ class RobotStateMessage(Message):
     age_s: float = column("s", "age of the sample, by the controller's clock against ours")
 
 
-@message("gripper.state", rate_hz=10.0)
+@message("gripper.state", rate_hz=10.0, per_source=False)
 class GripperStateMessage(Message):
     """The state of the gripper; its width when it stops on an object is a diameter measurement."""
 
@@ -205,7 +207,7 @@ class GripperStateMessage(Message):
     fault_text: str = column("", "the fault in a sentence; empty for none")
 
 
-@message("loop.state", rate_hz=1.0)
+@message("loop.state", rate_hz=1.0, per_source=False)
 class LoopState(Message):
     """The state of the closed loop: setpoints, the command that was sent, and every reason for holding."""
 
@@ -242,7 +244,7 @@ class LoopState(Message):
     reasons: str = column("", "every reason for holding or stopping, in sentences")
 
 
-@message("loop.stop", rate_hz=None)
+@message("loop.stop", rate_hz=None, per_source=False)
 class LoopStop(Message):
     """One stop of an experiment, with the times since its cause; its own time is the cause's."""
 
@@ -262,7 +264,7 @@ class LoopStop(Message):
     )
 
 
-@message("daemon.command", rate_hz=None)
+@message("daemon.command", rate_hz=None, per_source=False)
 class DaemonCommand(Message):
     """A command to the daemon, except `status`, and its answer."""
 
@@ -273,7 +275,7 @@ class DaemonCommand(Message):
     reason: str = column("", "why it was refused, in sentences; empty when it was accepted")
 
 
-@message("health", rate_hz=1.0)
+@message("health", rate_hz=1.0, per_source=False)
 class Health(Message):
     """The state of the process and of each of its tasks."""
 
@@ -293,7 +295,7 @@ class Health(Message):
     cpu_percent: float = column("%", "processor time since the previous message, in percent of one core")
 
 
-@message("daemon.end", rate_hz=None)
+@message("daemon.end", rate_hz=None, per_source=False)
 class DaemonEnd(Message):
     """The last message of a daemon that ends on request or with its experiment; a crashed one sends none."""
 

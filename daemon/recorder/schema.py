@@ -4,7 +4,7 @@ A recording is an MCAP file (mcap.dev) that any MCAP tool can show. Log times ar
 time of its measurement (for a frame the middle of its acquisition), for a raw input its arrival. All Unix times of a
 file are the monotonic clock's plus one offset, CLOCK_OFFSET, so a wall clock that is set does not change their order.
 
-Topics have the names of the live messages. Topics that each fingertip sends end in the source: `eit.frame.right`.
+Topics have the names of the live messages. A topic with several sources ends in the source: `eit.frame.right`.
 `input.SOURCE` holds the raw input of a parser as Latin-1 text, so that each byte is one character. `input.clock` holds
 each change of the offset between the monotonic clock and Unix time. Replay needs only these two.
 
@@ -19,6 +19,7 @@ import types
 import typing
 from collections.abc import Mapping
 from functools import cache
+from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
-from shearloop.daemon.messaging.messages import TOPICS, EitAdapted, EitEstimate, EitFrame, EitHeatmap, LoadTorque
+from shearloop.daemon.messaging.messages import TOPICS, EitFrame, EitHeatmap, LoadTorque
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 FORMAT_VERSION = "2"
@@ -64,7 +65,8 @@ LOAD_DOUBT_NOTE = "load_doubt"
 REMARKS_NOTE = "remarks"
 LOAD_DOUBT = "the load's values waited in a buffer, and nothing shows for how long: its times may be seconds off"
 
-_FINGERTIP_TOPICS = (EitFrame.topic, EitEstimate.topic, EitAdapted.topic, EitHeatmap.topic)
+# The rooms that a replay runs.
+_REPLAYED_ROOMS = ("bank", "estimation", "drivers", "daemon", "tools")
 _SCALARS = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
 
@@ -94,18 +96,25 @@ def software_version() -> str:
 @cache
 def code_digest() -> str:
     """Return a hash of shearloop's own sources; equal code must give equal replays."""
-    root = Path(__file__).resolve().parents[2]
+    root = Path(str(resources.files("shearloop")))
     digest = hashlib.sha256()
-    for package in ("bank", "estimation", "drivers", "daemon", "tools"):
-        for path in sorted((root / package).rglob("*.py")):
-            digest.update(f"{path.relative_to(root)}\0".encode())
-            digest.update(path.read_bytes())
+    for path in replayed_files(root):
+        digest.update(f"{path.relative_to(root)}\0".encode())
+        digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def replayed_files(root: Path) -> list[Path]:
+    """Return the Python files of the package at `root` that a replay may run: modules, then rooms."""
+    found = sorted(root.glob("*.py"))
+    for room in _REPLAYED_ROOMS:
+        found += sorted((root / room).rglob("*.py"))
+    return found
 
 
 def recorded_topic(topic: str, source: str) -> str:
     """Return the topic under which a message is recorded."""
-    return f"{topic}.{source}" if topic in _FINGERTIP_TOPICS else topic
+    return f"{topic}.{source}" if TOPICS[topic].per_source else topic
 
 
 def input_topic(source: str) -> str:
@@ -119,8 +128,8 @@ def schema_name(topic: str) -> str:
         return topic
     if topic.startswith(f"{INPUT}."):
         return INPUT
-    for live in _FINGERTIP_TOPICS:
-        if topic.startswith(f"{live}."):
+    for live, kind in TOPICS.items():
+        if kind.per_source and topic.startswith(f"{live}."):
             return live
     raise UnknownTopicError(topic)
 

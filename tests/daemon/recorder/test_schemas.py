@@ -3,7 +3,10 @@
 import dataclasses
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -13,7 +16,9 @@ from jsonschema import Draft202012Validator
 from numpy.typing import NDArray
 from typing_extensions import TypeAliasType
 
-from shearloop.daemon.messaging.messages import TOPICS, EitFrame, Message, wire_map
+import shearloop
+from shearloop.daemon.messaging import messages
+from shearloop.daemon.messaging.messages import TOPICS, EitFrame, Message, column, wire_map
 from shearloop.daemon.recorder.schema import (
     INPUT,
     as_json,
@@ -22,6 +27,8 @@ from shearloop.daemon.recorder.schema import (
     json_type,
     message_json,
     recorded_topic,
+    replayed_files,
+    schema_name,
     schemas,
 )
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
@@ -80,6 +87,39 @@ def test_each_message_matches_its_schema(topic):
             elif not isinstance(value, np.ndarray):
                 missing = value is None or value != value  # noqa: PLR0124 - NaN alone is unlike itself
                 assert restored[item.name] == (None if missing else value), item.name
+
+
+def test_a_new_topic_of_each_fingertip_is_recorded_for_each_of_them(monkeypatch):
+    # So that the topic goes away with this test.
+    monkeypatch.setitem(TOPICS, "eit.temperature", EitFrame)
+
+    @messages.message("eit.temperature", rate_hz=1.0, per_source=True)
+    class EitTemperature(Message):
+        """The temperature of a fingertip."""
+
+        temperature_c: float = column("°C", "temperature of the gel")
+
+    right, left = (recorded_topic(EitTemperature.topic, side) for side in ("right", "left"))
+    assert (right, left) == ("eit.temperature.right", "eit.temperature.left")
+    assert schema_name(right) == schema_name(left) == "eit.temperature"
+
+
+def test_each_message_of_a_fingertip_has_a_recorded_topic_for_each_source():
+    assert [topic for topic, kind in TOPICS.items() if topic.startswith("eit.") and not kind.per_source] == []
+
+
+def test_the_code_s_hash_covers_every_module_that_a_replay_loads():
+    code = (
+        "import sys, shearloop.cli.replay, shearloop.tools.recordings.replay; "
+        "print(*(one.__file__ for name, one in sys.modules.items() if name.startswith('shearloop')), sep='\\n')"
+    )
+    printed = subprocess.check_output([sys.executable, "-c", code], text=True)
+    loaded = {Path(line) for line in printed.splitlines()}
+    root = Path(shearloop.__file__).parent
+    # The command line only parses and prints.
+    computing = {path for path in loaded if path.parent != root / "cli"}
+    assert root / "words.py" in computing
+    assert computing - set(replayed_files(root)) == set()
 
 
 def test_raw_input_matches_its_schema_and_round_trips():

@@ -8,7 +8,7 @@ from typing import Any, get_args, get_type_hints
 
 from shearloop.cli.command import DAEMON_COMMANDS
 from shearloop.cli.config_schema import MODELS, Section, references, schema_of, schema_text, sections
-from shearloop.daemon.control.safety import TABLE, Response
+from shearloop.daemon.control.faults import TABLE, Response
 from shearloop.daemon.messaging.messages import TOPICS, Message
 from shearloop.daemon.recorder.schema import json_type
 from shearloop.units import unit_of

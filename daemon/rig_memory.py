@@ -15,9 +15,9 @@ import structlog
 from pydantic import ConfigDict
 
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
 from shearloop.daemon.control.operator_view import CLAMPED_CURE
-from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.load_cell import LoadCell

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.messaging.messages import stop_times, with_unit
 from shearloop.daemon.torques import LOAD_CELL
 from shearloop.printable import printable
@@ -30,23 +30,7 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 # The name of the emulated tool's torque, which no sensor measures.
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
-# Emulated devices have these faults on command, or because the computer is too busy. A step's time limit and a blocked
-# robot are not among them, because they have other causes.
-_LATE_FAULTS = frozenset(
-    code.text
-    for code in (
-        FaultCode.ESTIMATE_STALE,
-        FaultCode.STATE_STALE,
-        FaultCode.DEVICE_LOST,
-        FaultCode.ROBOT_LOST,
-        FaultCode.ROBOT_UNCONTROLLED,
-        FaultCode.DAEMON_PAUSED,
-        FaultCode.LOOP_LATE,
-    )
-)
 _TOO_BUSY = "This computer was too busy for the emulated rig: close other programs and run it again."
-# Stops by an operator: they are not errors, and need no cure.
-_ASKED_FOR = frozenset((FaultCode.OPERATOR_STOP.text, FaultCode.DAEMON_ENDED.text))
 # The time of each disturbance in ns, and its description.
 _Events: TypeAlias = Sequence[tuple[int, str]]
 
@@ -166,20 +150,20 @@ class RunSummary:
 
 def _was_asked_for(content: Mapping[str, Any]) -> bool:
     """Return whether a person stopped the experiment of a `loop.state`."""
-    return bool(_ASKED_FOR.intersection(_codes(content)[:1]))
+    return any(fault.value.asked_for for fault in _faults(content)[:1])
 
 
 def _may_be_late(content: Mapping[str, Any]) -> bool:
     """Return whether a busy computer can be the cause of a stop; a consequence of another fault does not count."""
-    codes = _codes(content)
+    faults = _faults(content)
     # Several holds together have no cause among them.
-    causes = codes if FaultCode.HELD_TOO_LONG.text in codes[:1] else codes[:1]
-    return bool(_LATE_FAULTS.intersection(causes))
+    causes = faults if FaultCode.HELD_TOO_LONG in faults[:1] else faults[:1]
+    return any(fault.value.by_busy_computer for fault in causes)
 
 
-def _codes(content: Mapping[str, Any]) -> list[str]:
-    """Return the codes of the faults of a `loop.state`, the cause's first."""
-    return list(filter(None, content["faults"].split(", ")))
+def _faults(content: Mapping[str, Any]) -> list[FaultCode]:
+    """Return the faults of a `loop.state`, the cause first."""
+    return [FaultCode.of_text(code) for code in content["faults"].split(", ") if code]
 
 
 def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
@@ -202,7 +186,7 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
     if run.last["phase"] == "paused" and run.steps:
         run.steps[-1].paused_s += _elapsed_s(run.last, content)
     if content["response"] == "hold" and run.last["response"] != "hold":
-        run.hold_reasons[FaultCode.of_text(_codes(content)[0]).value.kind] += 1
+        run.hold_reasons[_faults(content)[0].value.kind] += 1
     run.last = content
     if run.steps:
         run.steps[-1].to_ns = now_ns

@@ -18,8 +18,8 @@ from shearloop.daemon.control.experiment_schema import (
     Opening,
     TareStep,
 )
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.control.fingers import Fingers
-from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.straight_moves import StraightMoves
 from shearloop.daemon.supervisor import error_text
 from shearloop.daemon.torques import LONGEST_TARE_S, Adaptable, Tareable

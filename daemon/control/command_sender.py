@@ -8,7 +8,7 @@ import structlog
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.supervisor import error_text
 from shearloop.drivers.ur.client import UrRobot

@@ -19,10 +19,11 @@ from shearloop.daemon.control.experiment_schema import (
     TareStep,
 )
 from shearloop.daemon.control.fault_detection import Grasp, RunningStep, Watched, compared_for_s, detect_faults
+from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.held_tool import HeldTool
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.operator_view import OperatorView
-from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
+from shearloop.daemon.control.safety import SafetyDecision, SafetyMonitor
 from shearloop.daemon.control.step_motions import Speeds
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import Compute, WristController, at_once

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
+from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.inputs import GripperStatus, LatestInputs
-from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
 from shearloop.daemon.torques import TorqueSample, TorqueSource

@@ -13,11 +13,11 @@ from shearloop.daemon.control.control_output import Drive, End, StandStill
 from shearloop.daemon.control.experiment import Experiment, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
+from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.fingers import Fingers
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.inputs import ArmStatus
 from shearloop.daemon.control.operator_action import UNLOCKING, OperatorAction
-from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.state_publisher import StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.straight_moves import StraightMoves

@@ -8,8 +8,8 @@ import structlog
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import Experiment
+from shearloop.daemon.control.faults import FaultCode, Response
 from shearloop.daemon.control.identification import ToolModel
-from shearloop.daemon.control.safety import FaultCode, Response
 from shearloop.daemon.control.torque_controller import TorqueController
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage, cause_of
 from shearloop.daemon.messaging.publisher import Publisher

@@ -25,7 +25,7 @@ import zmq.asyncio
 from aiohttp import WSCloseCode, web
 
 from shearloop.bank.fingertip import Fingertip
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.callers import caller

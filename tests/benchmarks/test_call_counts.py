@@ -25,7 +25,7 @@ def test_the_daemon_loads_nothing_but_what_runs_on_the_robots_pc():
 def test_sensors_alone_load_neither_control_loop_nor_drivers_of_robot_and_gripper():
     loaded = loaded_by_run(robot=False)
     # The summary of a run knows the faults, and the configuration the grippers' models.
-    known = ["daemon.control", "daemon.control.safety", "drivers.robotiq", "drivers.robotiq.models"]
+    known = ["daemon.control", "daemon.control.faults", "drivers.robotiq", "drivers.robotiq.models"]
     robots = ("shearloop.daemon.control", "shearloop.drivers.ur", "shearloop.drivers.robotiq")
     assert [name.removeprefix("shearloop.") for name in loaded.modules if name.startswith(robots)] == known
     assert loaded.lines <= MAX_LINES

@@ -13,7 +13,7 @@ from shearloop.cli.config_schema import MODELS, schema_of
 from shearloop.cli.docgen import DOCS, pages
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.safety import TABLE
+from shearloop.daemon.control.faults import TABLE
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame
 from shearloop.daemon.messaging.publisher import Publisher

@@ -9,8 +9,9 @@ from shearloop.daemon import rig
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import Watched, detect_faults
+from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
-from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyMonitor
+from shearloop.daemon.control.safety import SafetyMonitor
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.patience import EMULATED_PATIENCE, patience_of
 from shearloop.daemon.rig import make_loop, open_settings

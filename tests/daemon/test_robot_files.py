@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memories, write_memory
 from shearloop.daemon.robot_files import RobotFiles, lock_robot, memory_path
 from shearloop.drivers import hosts

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.run_summary import RunSummary, TorqueSeries
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.run_summary import RunSummary
 from tests.fixtures.rigs import running_rig
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.messaging.client import Subscriber, send_command
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand

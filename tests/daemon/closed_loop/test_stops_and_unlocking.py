@@ -2,7 +2,7 @@
 
 import pytest
 
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from tests.fixtures.rigs import SLOW_TWIST, experiment, pendant, running_rig, started
 
 pytestmark = pytest.mark.real_time

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from tests.fixtures.rigs import SLOW_TWIST, experiment, running_rig, started
 
 pytestmark = pytest.mark.real_time

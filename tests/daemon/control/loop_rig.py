@@ -10,8 +10,8 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.control_output import ControlOutput, Drive, End, StandStill
 from shearloop.daemon.control.experiment import Action, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
+from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus
-from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample, TorqueSource
 from shearloop.emulators.scene import Twin, TwinSettings

@@ -11,9 +11,9 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.control_output import End
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, Opening, TareStep
+from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.inputs import GripperStatus
-from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.torques import TorqueSample, beyond_noise

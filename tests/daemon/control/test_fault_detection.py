@@ -12,8 +12,8 @@ from shearloop.daemon.control.fault_detection import (
     compared_for_s,
     detect_faults,
 )
+from shearloop.daemon.control.faults import TABLE, Fault, FaultCode, Response
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
-from shearloop.daemon.control.safety import TABLE, Fault, FaultCode, Response
 from shearloop.daemon.control.wrench import publish_every, wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample, TorqueSource

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from shearloop.daemon.control.control_output import ControlOutput
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import GripStep
+from shearloop.daemon.control.faults import Response
 from shearloop.daemon.control.inputs import GripperStatus
-from shearloop.daemon.control.safety import Response
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 from shearloop.emulators.scene import Twin, TwinSettings

@@ -17,9 +17,9 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.control_output import End
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.grip import FOLLOWED_MM, NO_GRIP, SAME_WIDTH_MM, Grip
 from shearloop.daemon.control.inputs import GripperStatus
-from shearloop.daemon.control.safety import Fault, FaultCode, Response
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memory
 from shearloop.daemon.robot_files import RobotFiles

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
-from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.straight_moves import along_tool
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shearloop.daemon.control.experiment import ExperimentPhase
-from shearloop.daemon.control.safety import Response
+from shearloop.daemon.control.faults import Response
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment
 
 TURN = {"do": "turn_to", "angle_rad": 0.5}

@@ -7,7 +7,7 @@ import pytest
 from shearloop.daemon.control import fault_detection
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
-from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import WRENCH

@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.safety import LONGEST_HOLD_S, TABLE, Fault, FaultCode, Response, SafetyMonitor
+from shearloop.daemon.control.faults import LONGEST_HOLD_S, TABLE, Fault, FaultCode, Response
+from shearloop.daemon.control.safety import SafetyMonitor
 
 STOPS = (Response.STOP_AND_KEEP_GRIP, Response.STOP_AND_RELEASE)
 SECOND = 10**9

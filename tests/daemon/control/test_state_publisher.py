@@ -7,8 +7,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.control.inputs import GripperStatus
-from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import wire_map

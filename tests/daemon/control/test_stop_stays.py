@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from shearloop.daemon.control.experiment import ExperimentPhase
-from shearloop.daemon.control.safety import TABLE, Response
+from shearloop.daemon.control.faults import TABLE, Response
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import Enable
 from tests.daemon.control.cell import GRIP, MOVE, Cell, driven, experiment

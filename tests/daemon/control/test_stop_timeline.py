@@ -5,7 +5,8 @@ from typing import cast
 
 import pytest
 
-from shearloop.daemon.control.safety import Response, SafetyDecision
+from shearloop.daemon.control.faults import Response
+from shearloop.daemon.control.safety import SafetyDecision
 from shearloop.daemon.control.stop_timeline import LONGEST_NS, REPLY_NS, StopTimeline
 from shearloop.drivers.ur.messages import RobotState
 

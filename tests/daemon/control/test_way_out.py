@@ -16,9 +16,9 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
 from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.loop_runner import UNSEEN_S
 from shearloop.daemon.control.plan import plan_of, speeds_of
-from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.step_motions import first_motion
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ReadExperiment

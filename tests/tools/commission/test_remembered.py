@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.rig_memory import Remembered, read_memories, read_memory, write_memory
 from shearloop.daemon.robot_files import RobotFiles, memory_path
 from shearloop.errors import UserError

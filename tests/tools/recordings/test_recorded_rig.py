@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.tools.recordings.summary import summarise
 from tests.fixtures.rigs import experiment, running_rig, started
 

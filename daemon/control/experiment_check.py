@@ -43,8 +43,9 @@ class Turn(NamedTuple):
 
     `loads` is the direction of the torque or the angle that it leaves, None where that is as before. `low_rad` and
     `high_rad` bound the angle since the grip at the end of the step, and during an identification; infinite where it
-    is unknown. `by_angle`: it turns the tool by an angle, with a torque that is not known before. `way_unknown`: a tool
-    may be held, and is turned to an angle of the wrist joint from one that is not known before.
+    is unknown. `turns_tool`: it turns a tool that is held, or may be. `by_angle`: it does so by an angle, with a torque
+    that is not known before. `way_unknown`: a tool may be held, and is turned to an angle of the wrist joint from one
+    that is not known before.
     """
 
     begins: Direction | None
@@ -52,6 +53,7 @@ class Turn(NamedTuple):
     loads: Direction | None
     low_rad: float
     high_rad: float
+    turns_tool: bool
     by_angle: bool
     way_unknown: bool
 
@@ -132,9 +134,10 @@ def turns(file: ExperimentFile) -> Iterator[Turn]:
                 angle_rad = torque_nm = _UNKNOWN
             case IdentifyStep(amplitude_rad=around_rad):
                 pass
+        turns_tool = isinstance(step, TwistingStep) or target_rad is not None
         by_angle = isinstance(step, TwistStep | IdentifyStep) or target_rad is not None
         low_rad, high_rad = angle_rad.low - around_rad, angle_rad.high + around_rad
-        yield Turn(begins, leaves, loads, low_rad, high_rad, by_angle, way_unknown)
+        yield Turn(begins, leaves, loads, low_rad, high_rad, turns_tool, by_angle, way_unknown)
         held = _may_hold_after(step, held=held)
         wrist_rad = wrist_after(step, wrist_rad)
 

@@ -143,13 +143,14 @@ def plan_of(
 ) -> Plan:
     """Return the plan of an experiment within the limits of the robot and the gripper, where they are known.
 
-    `refused` has the reasons against each step by its index; `warm_up_s` passes after a grip until the first torque.
+    `refused` has the reasons against each step by its index. `warm_up_s` passes after a grip or a tare until the first
+    torque.
     """
     speeds = speeds_of(robot)
     back = {one.number: one.sentence(file) for one in reversals(file)}
     planned: list[StepPlan] = []
-    # Whether the next step that twists waits for the first torques of a grip or a tare.
-    waits = False
+    # The latest grip or tare, with its number: the next step that turns a tool waits for the first torques after it.
+    awaited = ""
     opened = False
     untared = first_turn_before_tare(file) if file.torque_source in (LOAD_CELL, WRENCH) else None
     expected = zip(file.steps, turns(file), demands(file.steps, speeds), strict=True)
@@ -157,11 +158,11 @@ def plan_of(
         duration_s = needs.takes_s
         notes = list(_notes(file, step, turn, robot))
         if isinstance(step, steps.GripStep | steps.TareStep):
-            waits = warm_up_s > 0
-        elif waits and isinstance(step, steps.TwistingStep):
-            notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques of the grip")
+            awaited = f"step {number} ({step.do})"
+        elif awaited and warm_up_s > 0 and turn.turns_tool:
+            notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques after {awaited}")
             duration_s += warm_up_s
-            waits = False
+            awaited = ""
         if turn.way_unknown:
             notes.append("a tool may be held, and turns too: which way, and how far, depends on where wrist 3 stands")
         if needs.begins_anywhere:

@@ -20,7 +20,7 @@ from shearloop.daemon.control.experiment_schema import (
     WaitStep,
 )
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
-from shearloop.drivers.ur.poses import ONLY_TURNS_M, turn_between
+from shearloop.drivers.ur.poses import ONLY_TURNS_M, along_tool, turn_between
 
 
 class Demand(NamedTuple):
@@ -68,15 +68,35 @@ def demands(planned: Iterable[Step], speeds: Speeds = AS_ASKED) -> Iterator[Dema
     before = NOTHING_BEFORE
     for step in planned:
         yield demand(step, speeds, before)
-        wrist_rad = wrist_after(step, before.wrist_rad)
-        match step:
-            case HoldTorqueStep():
-                before = Before(step.signed_torque_nm, wrist_rad)
-            case ApproachStep(pose_m_rad=pose):
-                before = Before(before.torque_nm, wrist_rad, pose)
-            case GripStep() | ReleaseStep() | TurnToStep() | TwistStep() | TightenStep() | IdentifyStep():
-                # With which torque a twist ends is not known before.
-                before = Before(wrist_rad=wrist_rad)
+        before = Before(
+            _torque_after(step, before.torque_nm),
+            wrist_after(step, before.wrist_rad),
+            _pose_after(step, before.pose_m_rad),
+        )
+
+
+def _torque_after(step: Step, torque_nm: float) -> float:
+    """Return the torque after a step, from the one before; 0 where it is not known."""
+    match step:
+        case HoldTorqueStep():
+            return step.signed_torque_nm
+        case GripStep() | ReleaseStep() | TurnToStep() | TwistStep() | TightenStep() | IdentifyStep():
+            return 0.0
+    return torque_nm
+
+
+def _pose_after(step: Step, pose_m_rad: Sequence[float] | None) -> Sequence[float] | None:
+    """Return the tool's pose after a step, from the one before; None where it is not known."""
+    match step:
+        case ApproachStep(pose_m_rad=tuple() as pose):
+            return pose
+        case ApproachStep(along_tool_m=float() as distance_m) if pose_m_rad is not None:
+            return along_tool(pose_m_rad, distance_m)
+        case TwistStep(return_to_start=True):
+            return pose_m_rad
+        case ApproachStep() | TurnToStep() | TwistStep() | TightenStep() | HoldTorqueStep() | IdentifyStep():
+            return None
+    return pose_m_rad
 
 
 def wrist_after(step: Step, wrist_rad: float | None) -> float | None:

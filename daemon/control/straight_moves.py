@@ -10,8 +10,7 @@ from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.experiment_schema import ApproachStep
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import ARRIVED, STOPPED_ON_COMMAND, MoveLinear
-from shearloop.drivers.ur.poses import tool_axis
-from shearloop.drivers.ur.settings import Six
+from shearloop.drivers.ur.poses import along_tool
 from shearloop.errors import ActionError
 
 LINEAR_ACCELERATION_M_PER_S2 = 0.3
@@ -96,10 +95,3 @@ class StraightMoves:
     def _end_by_stop(self) -> MoveEnd:
         """Return how a move ended that was stopped or refused: interrupted, if the control loop has stopped it."""
         return MoveEnd.INTERRUPTED if self._interrupted else MoveEnd.ENDED_EARLY
-
-
-def along_tool(pose: Six, distance_m: float) -> Six:
-    """Return the pose (x, y, z in m, rotation vector in rad) at a distance along the tool's axis."""
-    x, y, z, rx, ry, rz = pose
-    dx, dy, dz = tool_axis(pose)
-    return x + dx * distance_m, y + dy * distance_m, z + dz * distance_m, rx, ry, rz

@@ -36,3 +36,10 @@ def tool_axis(pose: Sequence[float]) -> tuple[float, float, float]:
     x, y, z = x / angle_rad, y / angle_rad, z / angle_rad
     sine, versine = math.sin(angle_rad), 1.0 - math.cos(angle_rad)
     return x * z * versine + y * sine, y * z * versine - x * sine, 1.0 - (x * x + y * y) * versine
+
+
+def along_tool(pose: Sequence[float], distance_m: float) -> tuple[float, float, float, float, float, float]:
+    """Return the pose at a distance along the tool's axis."""
+    x, y, z, rx, ry, rz = pose
+    dx, dy, dz = tool_axis(pose)
+    return x + dx * distance_m, y + dy * distance_m, z + dz * distance_m, rx, ry, rz

@@ -302,6 +302,45 @@ def test_the_duration_of_a_move_between_two_poses_counts_the_tools_turn():
     assert straight.duration_s == pytest.approx(1.0 + 0.1 / 0.05, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("between", "guessed"),
+    [
+        ([GRIP, {"do": "wait", "wait_s": 1}, {"do": "tare"}], False),
+        ([{"do": "release"}, {"do": "retreat", "along_tool_m": -0.1}], False),
+        ([GRIP, {"do": "twist", "angles_rad": [0.1]}], False),
+        ([GRIP, {"do": "twist", "angles_rad": [0.1], "return_to_start": False}], True),
+        ([TURN], True),
+    ],
+)
+def test_a_pose_stays_known_until_the_wrist_turns(between, guessed):
+    approach = {"do": "approach", "pose_m_rad": (0.3, -0.4, 0.3, 3.14159, 0.0, 0.0), "speed_m_per_s": 0.05}
+    back = {**approach, "pose_m_rad": (0.3, -0.4, 0.2, 3.14159, 0.0, 0.0)}
+    *_, last = plan_of(ExperimentFile.model_validate({"name": "one", "steps": [approach, *between, back]})).steps
+    assert ("is a guess here" in " ".join(last.notes)) is guessed
+    # A retreat by -0.1 m moves away from the table: the tool points down.
+    way_m = 0.2 if between[-1]["do"] == "retreat" else 0.1
+    assert last.duration_s == pytest.approx(3.0 if guessed else 1.0 + way_m / 0.05, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("steps", "waits"),
+    [
+        ([{"do": "tare"}, TURN], "step 1 (tare)"),
+        ([GRIP, {"do": "wait", "wait_s": 1}, TURN], "step 1 (grip)"),
+        ([GRIP, TIGHTEN], "step 1 (grip)"),
+        ([{"do": "tare"}, GRIP, TIGHTEN], "step 2 (grip)"),
+        ([GRIP, TURN, TIGHTEN], ""),
+        ([{"do": "release"}, {"do": "tare"}, TURN], ""),
+    ],
+)
+def test_the_first_turn_of_a_held_tool_waits_for_the_first_torques(steps, waits):
+    file = ExperimentFile.model_validate({"name": "one", "steps": steps})
+    last, at_once = plan_of(file, warm_up_s=7.0).steps[-1], plan_of(file).steps[-1]
+    noted = [note for note in last.notes if "first torques" in note]
+    assert noted == ([f"before it, up to 7 s for the first torques after {waits}"] if waits else [])
+    assert last.duration_s - at_once.duration_s == (pytest.approx(7.0) if waits else 0.0)
+
+
 def test_an_experiment_without_its_steps_is_still_one(tmp_path, capsys):
     path = tmp_path / "experiment.yaml"
     path.write_text("{name: one, torque_source: load_cell, step: [{do: release}]}")

@@ -13,11 +13,11 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
-from shearloop.daemon.control.straight_moves import along_tool
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
+from shearloop.drivers.ur.poses import along_tool
 from shearloop.errors import ActionError
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment, no_tick
 from tests.drivers.ur.handler_bench import SETTINGS

@@ -57,13 +57,13 @@ class LoopCase:
             stiffness_nm_per_rad=believed, sample_period_s=FRAME_PERIOD_S, window_s=FRAME_PERIOD_S, kp=kp, ki=ki,
             wrist_bandwidth_per_s=BANDWIDTH_PER_S, ramp_nm_per_s=1e3, deadband_nm=0.0, torque_limit_nm=1e3,
             wrist_limit=WristLimit(1e6, 1e9), travel_limit_rad=1e6, age_limit_s=10.0,
-            stale_periods=np.inf,
+            fresh_s=np.inf,
         )  # fmt: skip
         if not self.compensated:
             return simulated_loop.UncompensatedController(settings)
         # Enough known measurements for a gain of kp from the start.
         controller = TorqueController(settings, 0, 0.0, 0.0, 1e9)
-        controller.set_point(0.0)
+        controller.change_set_point(0.0)
         return controller
 
 

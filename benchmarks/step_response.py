@@ -154,7 +154,7 @@ def step(plant: sim.Plant, scenario: sim.LoopScenario) -> tuple[FloatArray, Torq
     controller = sim.started_controller(plant, found, sim.settings_for(found, scenario))
     while controller.filter.fresh_ns is None:
         sim.run(plant, controller, plant.period_s)
-    controller.set_point(TARGET_NM)
+    controller.change_set_point(TARGET_NM)
     return sim.run(plant, controller, scenario.hold_s).torque_nm, controller
 
 

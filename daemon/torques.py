@@ -74,6 +74,14 @@ class TorqueSource:
         """Return how long after its arrival a torque is fresh."""
         return max(STALE_AFTER_PERIODS * self.period_s, config.stale_after_s)
 
+    def oldest_s(self, config: LoopConfig) -> float:
+        """Return how long after its measurement a torque is fresh.
+
+        A torque is half its acquisition old at its end. The rest of its age is transport: a board or an estimator that
+        falls behind sends on time, but old torques.
+        """
+        return self.fresh_s(config) + 0.5 * max(self.window_s, self.period_s)
+
     def as_read_nm(self, torque_nm: float) -> float:
         """Return what the source reads of another one's torque: 0 where it has the sign that it does not measure."""
         return 0.0 if torque_nm * self.only_sign < 0 else torque_nm

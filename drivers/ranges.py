@@ -40,7 +40,7 @@ ToolForce = Annotated[float, _range("N", gt=0, le=250)]
 ToolTorque = Annotated[float, _range("N·m", gt=0, le=60)]
 # The largest UR arm carries 35 kg.
 Payload = Annotated[float, _range("kg", ge=0, le=35)]
-TorqueSetpoint = Annotated[float, _range("N·m", ge=-LARGEST_TORQUE_NM, le=LARGEST_TORQUE_NM)]
+TorqueSetPoint = Annotated[float, _range("N·m", ge=-LARGEST_TORQUE_NM, le=LARGEST_TORQUE_NM)]
 TorqueLimit = Annotated[float, _range("N·m", gt=0, le=LARGEST_TORQUE_NM)]
 Seconds = Annotated[float, _range("s", ge=0, le=24 * 3600)]
 Duration = Annotated[float, _range("s", gt=0, le=24 * 3600)]

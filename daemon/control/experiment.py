@@ -48,7 +48,7 @@ class TrackTorque:
     ramp_nm_per_s: float
 
 
-WristSetpoint: TypeAlias = Hold | MoveToAngle | ConstantVelocity | TrackTorque
+WristSetPoint: TypeAlias = Hold | MoveToAngle | ConstantVelocity | TrackTorque
 
 
 # An action of the devices or of the identification; a retreat is an approach, and a release a grip as well.
@@ -77,7 +77,7 @@ class StepCommand:
     torques at which a step waits, from 1; 0 while it waits at none.
     """
 
-    wrist: WristSetpoint = Hold()
+    wrist: WristSetPoint = Hold()
     action: Action | None = None
     activity: str = ""
     hold_number: int = 0
@@ -261,7 +261,7 @@ def _act(action: Action, activity: str) -> StepProgram:
         yield StepCommand(Hold(), action, activity)
 
 
-def _wait(wrist: WristSetpoint, wait_s: float, now_s: float, activity: str, hold_number: int = 0) -> StepProgram:
+def _wait(wrist: WristSetPoint, wait_s: float, now_s: float, activity: str, hold_number: int = 0) -> StepProgram:
     end_s = now_s + wait_s
     while (left_s := end_s - now_s) > 0:
         view = yield StepCommand(wrist, activity=f"{activity}, {left_s:.1f} s left", hold_number=hold_number)

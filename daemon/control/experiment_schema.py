@@ -177,7 +177,7 @@ class HoldTorqueStep(_Step):
     """Ramp the torque to a set point, and hold it in closed loop."""
 
     do: Literal["hold_torque"]
-    torque_nm: ranges.TorqueSetpoint = Field(description="the set point; counterclockwise is positive")
+    torque_nm: ranges.TorqueSetPoint = Field(description="the set point; counterclockwise is positive")
     direction: Direction | None = Field(None, description="direction of the torque, which then has no sign")
     ramp_nm_per_s: float = Field(0.05, gt=0, le=1, description="rise of the set point")
     hold_s: ranges.Seconds = Field(10.0, description="time at the set point")

@@ -138,7 +138,7 @@ def _torque_faults(inputs: LatestInputs, watched: Watched, step: RunningStep, t_
     source, config = watched.driving, watched.config
     # The age of a robot's torque is checked with its state.
     judged = (*(one for one in watched.supervising if not one.from_robot), source)
-    faults = [_unusable(inputs, one, one.fresh_s(config), t_ns) for one in judged]
+    faults = [_unusable(inputs, one, config, t_ns) for one in judged]
     found = [fault for fault in faults if fault is not None]
     latest = inputs.torques.get(source.name)
     if faults[-1] is not None or latest is None or latest.torque_nm is None:
@@ -151,7 +151,7 @@ def _torque_faults(inputs: LatestInputs, watched: Watched, step: RunningStep, t_
     return found
 
 
-def _unusable(inputs: LatestInputs, source: TorqueSource, allowed_s: float, t_ns: int) -> Fault | None:
+def _unusable(inputs: LatestInputs, source: TorqueSource, config: LoopConfig, t_ns: int) -> Fault | None:
     """Return the fault of a source that is gone, silent, late or invalid."""
     latest = inputs.torques.get(source.name)
     if source.name in inputs.lost:
@@ -161,12 +161,10 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, allowed_s: float, t_ns
         return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
     what = "torque" if source.measures_torque else "frame"
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
+    allowed_s, oldest_s = source.fresh_s(config), source.oldest_s(config)
     if came_s > allowed_s:
         silent = f"the last {what} of {source.name} came {came_s:.1f} s ago, {allowed_s:.1f} s are allowed"
         return Fault(FaultCode.ESTIMATE_STALE, silent, t_ns=latest.t_ns)
-    # A torque is half its acquisition old at its end. The rest of its age is transport: a board or an estimator that
-    # falls behind sends on time, but old torques.
-    oldest_s = allowed_s + 0.5 * max(source.window_s, source.period_s)
     if measured_s > oldest_s:
         late = (
             f"the last {what} of {source.name} was measured {measured_s:.1f} s ago, {oldest_s:.1f} s are allowed; "

@@ -85,9 +85,9 @@ class ControllerSettings:
     # From the angle at the start, either way.
     travel_limit_rad: float
     # A measurement that is older than this on arrival is refused.
-    age_limit_s: float = 2.0
-    # Without a measurement for this many periods the wrist is held.
-    stale_periods: float = 2.5
+    age_limit_s: float
+    # Without a measurement for this time after the latest arrival the wrist is held.
+    fresh_s: float
 
 
 class ControllerReason(StrEnum):
@@ -292,7 +292,8 @@ class TorqueController:
         self.ramp_nm: float | None = None
         self._angle_rad = angle_rad
         self._t_ns = t_ns
-        self._wanted_rad_per_s = self._sent_rad_per_s = 0.0
+        # The latest command before and after clipping; `sent` replaces the second by what was sent.
+        self._wanted_rad_per_s = self._speed_rad_per_s = 0.0
         # Less was sent than was wanted; nothing is integrated then.
         self._clipped = False
 
@@ -301,7 +302,7 @@ class TorqueController:
         """The standard deviation of the filtered torque at the latest command."""
         return self.filter.std_nm(self._angle_rad)
 
-    def set_point(self, torque_nm: float, settings: ControllerSettings | None = None) -> None:
+    def change_set_point(self, torque_nm: float, settings: ControllerSettings | None = None) -> None:
         """Change the set point; the ramp continues, or begins at the present torque.
 
         `settings` count from this set point on, if its ramp or its limit differ. Raises UserError for a torque beyond
@@ -322,9 +323,15 @@ class TorqueController:
         """
         self._rest()
 
-    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> bool:
-        """Use a torque of the time t_mid_ns that arrived at t_ns; return whether it can be used."""
-        return self.filter.measure(torque_nm, t_mid_ns, t_ns, integrates=not self._clipped)
+    def measure(self, torque: TorqueSample) -> bool:
+        """Use a torque; return whether it can be used.
+
+        Of a friction band, the torque that is nearest to the expected one counts.
+        """
+        torque_nm = torque.torque_nm
+        if torque_nm is not None and torque.low_nm is not None and torque.high_nm is not None:
+            torque_nm = min(max(self.filter.expected_nm(self._angle_rad), torque.low_nm), torque.high_nm)
+        return self.filter.measure(torque_nm, torque.t_mid_ns, torque.t_ns, integrates=not self._clipped)
 
     def command(self, t_ns: int, wrist_angle_rad: float, torques: Iterable[TorqueSample] = ()) -> WristCommand:
         """Return the wrist speed for now, from the angle that the robot reports (NaN: unknown) and new torques.
@@ -332,7 +339,7 @@ class TorqueController:
         The torques come after the angle, which their windows need, and before the decision. The speed is 0 while
         anything forbids motion, and never exceeds the limit. It counts as sent until `sent` corrects it.
         """
-        settings, tool = self.settings, self.filter
+        tool = self.filter
         elapsed_s = min(max(t_ns - self._t_ns, 0), LONGEST_STEP_NS) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
         reasons = []
@@ -342,17 +349,13 @@ class TorqueController:
         else:
             reasons.append(ControllerReason.NO_ANGLE)
         for torque in torques:
-            torque_nm = torque.torque_nm
-            if torque_nm is not None and torque.low_nm is not None and torque.high_nm is not None:
-                # The torque of the friction band that is nearest to the expected one.
-                torque_nm = min(max(tool.expected_nm(self._angle_rad), torque.low_nm), torque.high_nm)
-            tool.measure(torque_nm, torque.t_mid_ns, torque.t_ns, integrates=not self._clipped)
+            self.measure(torque)
         self.torque_nm = tool.expected_nm(self._angle_rad)
         if self.set_point_nm is None:
             reasons.append(ControllerReason.NO_SET_POINT)
         if tool.fresh_ns is None:
             reasons.append(ControllerReason.NOT_MEASURED)
-        elif t_ns - tool.fresh_ns > settings.stale_periods * settings.sample_period_s * 1e9:
+        elif t_ns - tool.fresh_ns > self.settings.fresh_s * 1e9:
             reasons.append(ControllerReason.STALE)
         if tool.slipped:
             reasons.append(ControllerReason.NOT_FOLLOWING)
@@ -363,14 +366,14 @@ class TorqueController:
 
     def sent(self, speed_rad_per_s: float) -> None:
         """Correct the speed that was sent for the last command, after clipping by driver and safety."""
-        self._sent_rad_per_s = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
-        is_slower = abs(self._sent_rad_per_s) < abs(self._wanted_rad_per_s)
-        self._clipped = is_slower and abs(self._sent_rad_per_s - self._wanted_rad_per_s) > 1e-9
+        self._speed_rad_per_s = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
+        is_slower = abs(self._speed_rad_per_s) < abs(self._wanted_rad_per_s)
+        self._clipped = is_slower and abs(self._speed_rad_per_s - self._wanted_rad_per_s) > 1e-9
 
     def _rest(self) -> None:
         """Stand still; the next ramp begins at the present torque."""
         self._moving = self._clipped = False
-        self._wanted_rad_per_s = self._sent_rad_per_s = 0.0
+        self._wanted_rad_per_s = self._speed_rad_per_s = 0.0
         if self.set_point_nm is not None:
             self.ramp_nm = self.torque_nm
 
@@ -387,7 +390,7 @@ class TorqueController:
             wanted_rad_per_s = wanted_nm_per_s / settings.stiffness_nm_per_rad
         clipped_rad_per_s = settings.wrist_limit.clip(wanted_rad_per_s)
         reasons = [ControllerReason.SPEED] if clipped_rad_per_s != wanted_rad_per_s else []
-        speed_rad_per_s = settings.wrist_limit.speed_up(self._sent_rad_per_s, clipped_rad_per_s, elapsed_s)
+        speed_rad_per_s = settings.wrist_limit.speed_up(self._speed_rad_per_s, clipped_rad_per_s, elapsed_s)
         # Slow down towards the limit of the travel, so that one period does not overshoot it.
         travel_rad = self._angle_rad - self.filter.origin_rad
         room_rad = max(settings.travel_limit_rad - travel_rad * math.copysign(1.0, speed_rad_per_s), 0.0)
@@ -395,19 +398,19 @@ class TorqueController:
         if abs(speed_rad_per_s) > brakeable_rad_per_s:
             reasons.append(ControllerReason.TRAVEL)
             speed_rad_per_s = math.copysign(brakeable_rad_per_s, speed_rad_per_s)
-        self._wanted_rad_per_s, self._sent_rad_per_s = wanted_rad_per_s, speed_rad_per_s
+        self._wanted_rad_per_s, self._speed_rad_per_s = wanted_rad_per_s, speed_rad_per_s
         self._clipped = abs(wanted_rad_per_s) - abs(speed_rad_per_s) > 1e-9
         return WristCommand(speed_rad_per_s, tuple(reasons))
 
     def _advance_ramp(self, ramp_nm: float, set_point_nm: float, elapsed_s: float) -> tuple[float, float]:
         """Return the ramp, moved no further than the wrist was commanded to turn, and its slope in N·m/s."""
         settings = self.settings
-        blocked = self._sent_rad_per_s == 0.0 and self._wanted_rad_per_s != 0.0
+        blocked = self._speed_rad_per_s == 0.0 and self._wanted_rad_per_s != 0.0
         if blocked or elapsed_s <= 0.0:
             return ramp_nm, 0.0
         towards = math.copysign(1.0, set_point_nm - ramp_nm)
         speed_up_rad_per_s = settings.wrist_limit.acceleration_rad_per_s2 * elapsed_s
-        turning_rad_per_s = max(self._sent_rad_per_s * towards, 0.0) + speed_up_rad_per_s
+        turning_rad_per_s = max(self._speed_rad_per_s * towards, 0.0) + speed_up_rad_per_s
         slope_nm_per_s = min(
             settings.ramp_nm_per_s,
             settings.stiffness_nm_per_rad * turning_rad_per_s,

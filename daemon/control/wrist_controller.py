@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
 
-from shearloop.daemon.control.experiment import ConstantVelocity, Hold, MoveToAngle, TrackTorque, WristSetpoint
+from shearloop.daemon.control.experiment import ConstantVelocity, Hold, MoveToAngle, TrackTorque, WristSetPoint
 from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.margins import JudgedGain, gain_for_noise, integral_gain, judged_gain
@@ -82,15 +82,15 @@ class WristController:
         if self.excitation is not None:
             self.excitation.sent(speed_rad_per_s)
 
-    def turn(self, setpoint: WristSetpoint, t_ns: int, wrist_rad: float, origin_rad: float) -> WristCommand:
+    def turn(self, set_point: WristSetPoint, t_ns: int, wrist_rad: float, origin_rad: float) -> WristCommand:
         """Return the speed for a set point; its angles count from origin_rad."""
-        if not isinstance(setpoint, TrackTorque):
+        if not isinstance(set_point, TrackTorque):
             # An open loop records no angles; the next closed loop starts from the torque measured then.
             self.tracked = self.controller = None
         elif self._stands_still and self.controller is not None:
             self.controller.resume()
         self._stands_still = False
-        match setpoint:
+        match set_point:
             case Hold():
                 return WristCommand()
             case MoveToAngle(angle_rad, speed_rad_per_s):
@@ -100,17 +100,17 @@ class WristController:
             case ConstantVelocity(speed_rad_per_s):
                 return self._clipped(speed_rad_per_s)
             case TrackTorque():
-                if self.controller is None or self.tracked != setpoint:
+                if self.controller is None or self.tracked != set_point:
                     return WristCommand(reasons=("the loop has not been closed",))
                 command = self.controller.command(t_ns, wrist_rad, self._pending)
                 self._pending.clear()
                 return command
 
-    def tracks(self, setpoint: TrackTorque, torque_limit_nm: float) -> bool:
+    def tracks(self, set_point: TrackTorque, torque_limit_nm: float) -> bool:
         """Return whether the loop is closed on this set point, within this limit."""
-        return (self.tracked, self._torque_limit_nm) == (setpoint, torque_limit_nm)
+        return (self.tracked, self._torque_limit_nm) == (set_point, torque_limit_nm)
 
-    def close_loop(self, setpoint: TrackTorque, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> str | None:
+    def close_loop(self, set_point: TrackTorque, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> str | None:
         """Track a torque with the identified tool; return None, or why it cannot be tracked.
 
         Until the check of the gain has ended, the loop stays open and the wrist stands still.
@@ -118,7 +118,7 @@ class WristController:
         tool = self.tool
         if tool is None:
             return "the tool has not been identified; put an `identify` step before the first `hold_torque`"
-        settings = controller_settings(self._config, tool, self.source, setpoint, torque_limit_nm)
+        settings = controller_settings(self._config, tool, self.source, set_point, torque_limit_nm)
         if self._judged is None:
             self._judged = self._compute(partial(judged_gain, settings, tool, self._config))
         if not self._judged.done():
@@ -130,8 +130,8 @@ class WristController:
         if self.controller is None:
             here_nm = tool.torque_nm + tool.stiffness_nm_per_rad * (wrist_rad - tool.angle_rad)
             self.controller = TorqueController(settings, t_ns, wrist_rad, here_nm, tool.known_measurements)
-        self.controller.set_point(setpoint.torque_nm, settings)
-        self.tracked, self._torque_limit_nm = setpoint, torque_limit_nm
+        self.controller.change_set_point(set_point.torque_nm, settings)
+        self.tracked, self._torque_limit_nm = set_point, torque_limit_nm
         return None
 
     def begin_identification(self, action: IdentifyStep, torque_limit_nm: float) -> None:
@@ -180,7 +180,7 @@ class WristController:
 
 
 def controller_settings(
-    config: LoopConfig, found: ToolModel, source: TorqueSource, setpoint: TrackTorque, torque_limit_nm: float
+    config: LoopConfig, found: ToolModel, source: TorqueSource, set_point: TrackTorque, torque_limit_nm: float
 ) -> ControllerSettings:
     """Return the controller's settings for an identified tool."""
     kp = config.kp if config.kp is not None else gain_for_noise(found.noise_nm, config.allowed_noise_nm)
@@ -194,7 +194,7 @@ def controller_settings(
         # An integral that grows while friction hides the torque swings the wrist through the whole friction band.
         ki=0.0 if source.has_friction_band else integral_gain(kp),
         wrist_bandwidth_per_s=config.torque_bandwidth_per_s,
-        ramp_nm_per_s=setpoint.ramp_nm_per_s,
+        ramp_nm_per_s=set_point.ramp_nm_per_s,
         noise_nm=found.noise_nm,
         deadband_nm=config.deadband_nm,
         innovation_limit_nm=max(3.0 * found.noise_nm, MIN_INNOVATION_LIMIT_NM),
@@ -203,4 +203,7 @@ def controller_settings(
         torque_limit_nm=torque_limit_nm,
         wrist_limit=WristLimit.of(config),
         travel_limit_rad=TRAVEL_LIMIT_RAD,
+        # As the fault `estimate stale`, so that the wrist does not rest before its reason is reported.
+        age_limit_s=source.oldest_s(config),
+        fresh_s=source.fresh_s(config),
     )

@@ -209,7 +209,7 @@ class GripperStateMessage(Message):
 
 @message("loop.state", rate_hz=1.0, per_source=False)
 class LoopState(Message):
-    """The state of the closed loop: setpoints, the command that was sent, and every reason for holding."""
+    """The state of the closed loop: set points, the command that was sent, and every reason for holding."""
 
     phase: str = column("", "idle, running, paused, held, done or stopped")
     run: int = column("", "number of the experiment since the daemon began, from 1; 0 before the first")
@@ -228,8 +228,8 @@ class LoopState(Message):
     torque_source: str = column("", "source of the torque that the loop controls")
     torque_nm: float | None = column("N·m", "its latest valid value")
     torque_limit_nm: float | None = column("N·m", "the experiment stops beyond plus or minus this torque")
-    set_point_nm: float | None = column("N·m", "the setpoint at the end of the ramp")
-    ramp_nm: float | None = column("N·m", "the present setpoint")
+    set_point_nm: float | None = column("N·m", "the set point at the end of the ramp")
+    ramp_nm: float | None = column("N·m", "the present set point")
     filtered_torque_nm: float | None = column("N·m", "the present torque, from measurements, wrist angle and stiffness")
     filtered_torque_std_nm: float | None = column("N·m", "its standard deviation by noise and the stiffness's error")
     stiffness_nm_per_rad: float | None = column("N·m/rad", "the tool's identified stiffness")

@@ -23,7 +23,7 @@ from shearloop.daemon.control.torque_controller import ControllerSettings, Torqu
 from shearloop.daemon.control.wrist_controller import controller_settings
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.run_summary import BAND, recovered_s
-from shearloop.daemon.torques import TorqueSource
+from shearloop.daemon.torques import TorqueSample, TorqueSource
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 
 PERIOD_S = 0.008
@@ -166,13 +166,15 @@ class UncompensatedController:
     _origin_rad: float | None = None
     _t_ns: int = 0
 
-    def set_point(self, torque_nm: float) -> None:
+    def change_set_point(self, torque_nm: float) -> None:
         """Set the torque to reach."""
         self._set_point_nm = torque_nm
 
-    def measure(self, torque_nm: float, t_mid_ns: int, t_ns: int) -> None:  # noqa: ARG002 - the controller's
+    def measure(self, torque: TorqueSample) -> None:
         """Correct the offset by the difference from the present ramp."""
-        excess = torque_nm - self._ramp_nm
+        if torque.torque_nm is None:
+            return
+        excess = torque.torque_nm - self._ramp_nm
         self._creep_nm += self.settings.ki * excess
         self._offset_nm += self.settings.kp * excess + self._creep_nm
 
@@ -232,7 +234,8 @@ def run(
                 latest.append(sample)
                 middles_ns = [nanoseconds(measurement.t_mid_s) for measurement in latest]
                 torque_nm = float(np.mean([measurement.torque_nm for measurement in latest]))
-                controller.measure(torque_nm, round(float(np.mean(middles_ns))), now_ns)
+                t_mid_ns = round(float(np.mean(middles_ns)))
+                controller.measure(TorqueSample("plant", torque_nm, "", t_mid_ns, now_ns))
             count += 1
         command = controller.command(now_ns, plant.angle_rad)
         plant.step(command.speed_rad_per_s)
@@ -372,7 +375,7 @@ def _rms_error(plant: Plant, controller: LoopController, frames: int) -> float:
         t_s = plant.t_s - begun
         wanted = _TARGET_NM + _SWING_NM * float(np.sin(2 * np.pi * t_s / _SWING_PERIOD_S))
         plant.disturbance_nm = _LOAD_NM * float(np.sin(2 * np.pi * t_s / _LOAD_PERIOD_S))
-        controller.set_point(wanted)
+        controller.change_set_point(wanted)
         torque = run(plant, controller, _CHUNK_S, latest=latest).torque_nm
         if t_s >= _SETTLING_S:
             squares, n = squares + float(((torque - wanted) ** 2).sum()), n + len(torque)
@@ -399,7 +402,7 @@ def held_loops(seeds: int) -> dict[str, list[tuple[Trace, Trace]]]:
         }
         for name, loop in loops.items():
             plant = copy.deepcopy(gripped)
-            loop.set_point(_TARGET_NM)
+            loop.change_set_point(_TARGET_NM)
             before = run(plant, loop, _KICK_AT_S)
             plant.disturbance_nm = _KICK_NM
             held.setdefault(name, []).append((before, run(plant, loop, _KICKED_S)))

@@ -119,6 +119,14 @@ def test_equal_defaults_of_one_name_come_from_one_constant():
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
 
 
+@pytest.mark.parametrize("stale_after_s", [0.1, 4.0])
+def test_the_controller_uses_every_torque_that_is_no_fault(stale_after_s):
+    """A torque that it refuses and no fault reports would let the wrist rest without a reason."""
+    config, source = LoopConfig(stale_after_s=stale_after_s), TorqueSource(name="right", period_s=0.5, window_s=0.6)
+    tuned = controller_settings(config, FOUND, source, TrackTorque(0.1, 0.05), 0.5)
+    assert (tuned.fresh_s, tuned.age_limit_s) == (source.fresh_s(config), source.fresh_s(config) + 0.3)
+
+
 @pytest.mark.usefixtures("ur_rtde")
 @pytest.mark.parametrize("where", ["loop", "robot"])
 def test_the_wrists_acceleration_reaches_controller_identification_and_robot(where, tmp_path):

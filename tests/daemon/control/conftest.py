@@ -5,6 +5,7 @@ import pytest
 
 from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController
 from shearloop.daemon.control.wrist_limit import WristLimit
+from shearloop.daemon.torques import TorqueSample
 
 DEFAULTS: dict[str, Any] = {
     "stiffness_nm_per_rad": 0.25,
@@ -22,6 +23,8 @@ DEFAULTS: dict[str, Any] = {
     "torque_limit_nm": 0.2,
     "wrist_limit": WristLimit(speed_rad_per_s=0.6, acceleration_rad_per_s2=2.0),
     "travel_limit_rad": 1.0,
+    "age_limit_s": 2.0,
+    "fresh_s": 1.25,
 }
 
 
@@ -45,7 +48,7 @@ class Bench:
         return speeds
 
     def measure(self, torque_nm: float | None, age_s: float = 0.3) -> object:
-        return self.controller.measure(torque_nm, self.t_ns - int(age_s * 1e9), self.t_ns)
+        return self.controller.measure(TorqueSample("bench", torque_nm, "", self.t_ns - int(age_s * 1e9), self.t_ns))
 
     def seen_rad(self) -> float:
         """Return the mean angle of the half second that has ended 50 ms ago, NaN where it is not known."""

@@ -23,10 +23,10 @@ GRIP = {"do": "grip", "width_mm": 10.0, "force_n": 60.0}
 CONFIG = LoopConfig()
 
 
-def new_loop(*, needs_zero: bool = False) -> ControlLoop:
+def new_loop(config: LoopConfig = CONFIG, *, needs_zero: bool = False) -> ControlLoop:
     """Return the loop of a fingertip and a load cell, which may need a zero."""
     sources = {"right": EIT, "load_cell": replace(LOAD, needs_zero=needs_zero)}
-    return ControlLoop(CONFIG, sources, ("gripper", "right"))
+    return ControlLoop(config, sources, ("gripper", "right"))
 
 
 class Rig:

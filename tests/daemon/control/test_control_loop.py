@@ -15,7 +15,9 @@ from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.state_publisher import loop_state
+from shearloop.daemon.control.torque_controller import ControllerReason
 from shearloop.daemon.control.wrench import wrench_source
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample, beyond_noise
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, speed_of, started, stop
 
@@ -51,14 +53,31 @@ def test_a_load_cell_identifies_as_well_in_a_third_of_the_time():
     assert found[0] == pytest.approx(found[1], rel=0.01)
 
 
-def holding(drive: str) -> Rig:
+def holding(drive: str, config: LoopConfig = CONFIG) -> Rig:
     """Return a rig that has reached its torque and holds it."""
     hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 60}
-    rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, hold, {"do": "release"}, torque_source=drive)
+    rig = started(Rig(new_loop(config)), GRIP, {"do": "identify"}, hold, {"do": "release"}, torque_source=drive)
     while not rig.control_loop.experiment.command.hold_number:
         rig.step()
     rig.run(5)
     return rig
+
+
+@pytest.mark.parametrize("stale_after_s", [0.1, 2.0])
+@pytest.mark.parametrize("drive", ["right", "load_cell"])
+def test_a_closed_loop_that_rests_for_want_of_a_torque_reports_the_fault(drive, stale_after_s):
+    config = LoopConfig(stale_after_s=stale_after_s)
+    rig = holding(drive, config)
+    rig.silent.add(drive)
+    silent_from_s = rig.t_ns / 1e9
+    while rig.control_loop.status.phase != "held":
+        assert ControllerReason.STALE not in rig.control_loop.status.velocity.reasons
+        rig.step()
+    assert rig.control_loop.status.decision.faults[0].code is FaultCode.ESTIMATE_STALE
+    source = {"right": EIT, "load_cell": LOAD}[drive]
+    fresh_s = source.fresh_s(config)
+    # The last torque came up to a period before.
+    assert fresh_s - source.period_s - TICK_S <= rig.t_ns / 1e9 - silent_from_s <= fresh_s + 2 * TICK_S
 
 
 def slip(rig: Rig, rate_rad_per_s: float, most_rad: float) -> None:

@@ -17,7 +17,7 @@ from .conftest import Bench
 def running(**changes: Any) -> Bench:
     bench = Bench(**changes)
     bench.measured_for(1.5)
-    bench.controller.set_point(0.1)
+    bench.controller.change_set_point(0.1)
     return bench
 
 
@@ -68,7 +68,7 @@ def test_refused_measurements_change_nothing(batch):
         finite = torque is not None and math.isfinite(torque)
         unusable = not finite or mid_offset > offset or mid_offset < -800_000_000 or offset - mid_offset > 2 * 10**9
         if unusable:
-            assert not poked.controller.measure(torque, t_mid, now)
+            assert not poked.controller.measure(TorqueSample("bench", torque, "", t_mid, now))
     assert poked.advance(0.4) == left_alone.advance(0.4)
 
 
@@ -116,7 +116,7 @@ def test_resume_after_a_hold_does_not_lunge():
 
 def test_a_stale_torque_holds_and_a_fresh_one_lets_go():
     bench = running()
-    bench.controller.set_point(0.2)
+    bench.controller.change_set_point(0.2)
     bench.measured_for(1.0)
     bench.advance(1.24)
     assert bench.speed > 0.0
@@ -143,7 +143,7 @@ def test_without_angle_measurement_or_set_point_the_wrist_stays():
 def test_a_slipping_grip_is_bounded_and_then_held(slip_nm):
     bench = Bench()
     bench.measured_for(1.5)
-    bench.controller.set_point(0.16)
+    bench.controller.change_set_point(0.16)
     for _ in range(120):
         bench.advance(0.5)
         bench.measure(min(0.25 * (bench.angle - 0.3), slip_nm))
@@ -187,7 +187,7 @@ def test_no_command_is_ever_beyond_a_limit(script):
             case "sent":
                 controller.sent(value)
             case "set":
-                controller.set_point(0.2 * value)
+                controller.change_set_point(0.2 * value)
             case "resume":
                 controller.resume()
             case "late":
@@ -302,9 +302,9 @@ def test_the_standard_deviation_is_that_of_the_error():
 
 def test_a_set_point_beyond_the_limit_and_a_start_without_an_angle_are_refused(bench):
     with pytest.raises(UserError, match=r"0\.3 N·m is not within the limit of 0\.2"):
-        bench.controller.set_point(0.3)
+        bench.controller.change_set_point(0.3)
     with pytest.raises(UserError, match="not within"):
-        bench.controller.set_point(math.nan)
+        bench.controller.change_set_point(math.nan)
     with pytest.raises(UserError, match="numbers"):
         TorqueController(bench.settings, 0, math.nan, 0.0)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.daemon.control.torque_controller import WristCommand
+from shearloop.daemon.torques import TorqueSample
 from shearloop.studies.charts.simulated_loop import (
     LOAD_CELL,
     PERIOD_S,
@@ -26,8 +27,8 @@ class FixedSpeed:
         self.speed, self.until_ns = speed, nanoseconds(until_s)
         self.seen: list[tuple[float, int, int]] = []
 
-    def measure(self, torque_nm: float, t_mid_ns: int, t_ns: int) -> None:
-        self.seen.append((torque_nm, t_mid_ns, t_ns))
+    def measure(self, torque: TorqueSample) -> None:
+        self.seen.append((torque.torque_nm, torque.t_mid_ns, torque.t_ns))
 
     def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:  # noqa: ARG002
         return WristCommand(self.speed if t_ns < self.until_ns else 0.0)

@@ -12,8 +12,8 @@ from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
 # The paper's ten frames take 5.4 s.
 LONGEST_TARE_S = 30.0
-# A torque below this counts as drift of the zero, and not as a load, if its source names no other one.
-LOADED_NM = 0.05
+# A torque up to this counts as drift of the zero, and not as a load, if its source names no other one.
+LARGEST_DRIFT_NM = 0.05
 # A stretch within the noise may be a load if its mean exceeds this fraction of the noise. Noise has a smaller mean.
 _LOAD_IN_NOISE = 0.5
 CONFIRM_TARE = "take the load off, or confirm with `shearloop command tare --yes` that there is none"
@@ -36,7 +36,7 @@ class TorqueSample:
     t_ns: int
     low_nm: float | None = None
     high_nm: float | None = None
-    loaded_nm: float = LOADED_NM
+    loaded_nm: float = LARGEST_DRIFT_NM
 
     def __post_init__(self) -> None:
         """Treat NaN and infinity as no torque."""

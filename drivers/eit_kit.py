@@ -41,8 +41,8 @@ FULL_SCALE_SINE_RMS_V = ADC_REFERENCE_V / 2 / 2**0.5
 DEAD_AFTER_FRAMES = 200
 
 START = b"y"
-# A board that is silent for this many periods is opened and started again.
-SILENT_PERIODS = 4
+# A board that sends no frame for this many periods is opened and started again.
+SILENT_FRAMES = 4
 # At fast frame rates a shorter silence may come from a busy computer.
 MIN_SILENCE_S = 0.5
 
@@ -399,7 +399,7 @@ class EitKit(SerialSensor[Frame]):
     @property
     def longest_silence_s(self) -> float:
         """The silence after which the board counts as lost."""
-        return max(SILENT_PERIODS * self.period_s, MIN_SILENCE_S)
+        return max(SILENT_FRAMES * self.period_s, MIN_SILENCE_S)
 
     async def _on_open(self, port: Port) -> None:
         await port.write(START)

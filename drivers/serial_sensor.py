@@ -16,6 +16,7 @@ from shearloop.drivers.refused_lines import BoardKind, refusal_sentence, shown
 
 # Opening the port resets an Uno; its boot loader waits before it starts the sketch.
 BOOT_S = 4.0
+# A board that sends no value for this many periods is opened again.
 SILENT_PERIODS = 8
 # After a timeout, the next wait is twice as long, up to this factor: the board's period can be longer than
 # configured. This many values in time end that.

@@ -254,7 +254,8 @@ class ControlLoop:
         running, arm = self.running, self.inputs.arm
         self.inputs.late_s = late_s
         limits = self.experiment.limits if self.experiment is not None else DEFAULT_LIMITS
-        step = self._running_step(running, t_ns) if running is not None else None
+        awaited = self._awaited_torques(t_ns)
+        step = self._running_step(running, awaited) if running is not None else None
         found = [*detect_faults(self.inputs, self._watched, limits, step, t_ns), *self._reported]
         self._reported.clear()
         self.inputs.unjudged.clear()
@@ -268,14 +269,14 @@ class ControlLoop:
             running.stop(" ".join(decision.reasons))
         if arm is None or decision.response >= Response.STOP_AND_KEEP_GRIP:
             return self._ended(decision)
-        return self._run_step(running, decision, arm.wrist_rad, t_ns)
+        return self._run_step(running, decision, awaited, arm.wrist_rad, t_ns)
 
-    def _running_step(self, running: Experiment, t_ns: int) -> RunningStep:
-        """Return what the experiment needs and expects at t_ns."""
+    def _running_step(self, running: Experiment, awaited: str) -> RunningStep:
+        """Return what the experiment needs and expects; `awaited` are the torques that a turn waits for."""
         command, controller = running.command, self.wrist.controller
         grasp = Grasp.HELD if self.tool.expected else Grasp.NONE
         grasp = Grasp.CHANGING if isinstance(command.action, GripStep) else grasp
-        needed = grasp is Grasp.HELD and _turns(command) and not self._awaited_torques(running, t_ns)
+        needed = grasp is Grasp.HELD and _turns(command) and not awaited
         runs = running.phase is ExperimentPhase.RUNNING
         return RunningStep(
             torque_needed=needed and runs,
@@ -301,13 +302,23 @@ class ControlLoop:
     def _others(self, driving: TorqueSource) -> tuple[TorqueSource, ...]:
         return tuple(source for source in self._sources.values() if source is not driving)
 
-    def _run_step(self, experiment: Experiment, decision: SafetyDecision, wrist_rad: float, t_ns: int) -> ControlOutput:
-        """Let the experiment choose its command, and the wrist's controller a speed."""
+    def _run_step(
+        self, experiment: Experiment, decision: SafetyDecision, awaited: str, wrist_rad: float, t_ns: int
+    ) -> ControlOutput:
+        """Let the experiment choose its command, and the wrist's controller a speed.
+
+        `awaited` are the torques that a turn waits for.
+        """
         on_hold = decision.response is Response.HOLD
         origin_rad = self.tool.count_angle(wrist_rad)
-        self._choose_command(experiment, wrist_rad, origin_rad, t_ns, on_hold=on_hold)
-        awaited = self._awaited_torques(experiment, t_ns)
-        still = on_hold or awaited is not None or experiment.phase is ExperimentPhase.PAUSED
+        clock_stands = on_hold or bool(awaited and _turns(experiment.command))
+        self._choose_command(experiment, origin_rad, t_ns, on_hold=on_hold, clock_stands=clock_stands)
+        turns = _turns(experiment.command)
+        if turns and self.tool.expected and not awaited:
+            # From the first turn on, a torque that does not come is a fault.
+            self._unmeasured_since_ns = None
+        waits = turns and bool(awaited)
+        still = on_hold or waits or experiment.phase is ExperimentPhase.PAUSED
         action = None if still else self._begin_command(experiment, wrist_rad, origin_rad, t_ns)
         velocity = WristCommand()
         if experiment.running:
@@ -315,17 +326,17 @@ class ControlLoop:
         if not experiment.running:
             return self._ended(self.safety.report(decision.faults))
         phase = "held" if on_hold else experiment.phase.value
-        self.status = LoopStatus(phase, awaited or experiment.command.activity, velocity, decision)
+        self.status = LoopStatus(phase, awaited if waits else experiment.command.activity, velocity, decision)
         return StandStill() if still else Drive(velocity.speed_rad_per_s, action)
 
     def _choose_command(
-        self, experiment: Experiment, wrist_rad: float, origin_rad: float, t_ns: int, *, on_hold: bool
+        self, experiment: Experiment, origin_rad: float, t_ns: int, *, on_hold: bool, clock_stands: bool
     ) -> None:
         """Let the experiment choose its command; it ends if it would turn a tool that may be in the gripper."""
         latest = self.inputs.torques.get(experiment.file.torque_source)
         torque_nm = latest.torque_nm if latest is not None and not on_hold else None
-        clock_stands = on_hold or self._awaited_torques(experiment, t_ns) is not None
-        experiment.update(t_ns, wrist_rad - origin_rad, torque_nm, gripped_at_rad=origin_rad, clock_stands=clock_stands)
+        twisted_rad = self.tool.twisted_rad
+        experiment.update(t_ns, twisted_rad, torque_nm, gripped_at_rad=origin_rad, clock_stands=clock_stands)
         # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now. A `grip` that
         # may meet nothing allows turns, although a tool as wide as its target is not felt.
         gripper = self.inputs.gripper
@@ -373,14 +384,14 @@ class ControlLoop:
             return velocity
         return self.wrist.turn(command.wrist, t_ns, wrist_rad, origin_rad)
 
-    def _awaited_torques(self, experiment: Experiment, t_ns: int) -> str | None:
-        """Return which torques a step that turns the tool waits for after a grip or a tare, or None.
+    def _awaited_torques(self, t_ns: int) -> str:
+        """Return in words which torques the next turn of the tool waits for after a grip or a tare; empty for none.
 
         An estimator needs some frames of the new grip; a source without a torque after its `warm_up_s` is a fault.
         """
         since_ns = self._unmeasured_since_ns
-        if since_ns is None or not (self.tool.expected and _turns(experiment.command)):
-            return None
+        if since_ns is None or not self.tool.expected:
+            return ""
         awaited, reason = [], ""
         for name, source in self._sources.items():
             latest = self.inputs.torques.get(name)
@@ -390,8 +401,7 @@ class ControlLoop:
                 awaited.append(name)
                 reason = latest.reason if latest is not None else ""
         if not awaited:
-            self._unmeasured_since_ns = None
-            return None
+            return ""
         return f"waiting for the first torque of {', '.join(awaited)}{f': {reason}' if reason else ''}"
 
     def _fail(self, experiment: Experiment, reason: str) -> None:

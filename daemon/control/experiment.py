@@ -57,13 +57,13 @@ Action: TypeAlias = steps.ApproachStep | steps.GripStep | steps.TareStep | steps
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """Input of a step: wrist angle since the grip, and driving torque.
+    """Input of a step: how far the wrist has turned since the grip, and the driving torque.
 
     `gripped_at_rad` is the wrist joint's angle at the grip. `torque_nm` is None without a fresh valid estimate.
     `elapsed_s` is the experiment's time.
     """
 
-    wrist_rad: float
+    twisted_rad: float
     torque_nm: float | None
     gripped_at_rad: float
     elapsed_s: float
@@ -150,7 +150,7 @@ class Experiment:
     def update(
         self,
         t_ns: int,
-        wrist_rad: float,
+        twisted_rad: float,
         torque_nm: float | None,
         *,
         gripped_at_rad: float = 0.0,
@@ -158,16 +158,16 @@ class Experiment:
     ) -> None:
         """Choose the command for now, unless the experiment is paused or its clock has to stand.
 
-        `wrist_rad` counts from the angle at the grip, `gripped_at_rad`.
+        `twisted_rad` counts from the wrist joint's angle at the grip, `gripped_at_rad`.
         """
         passed_s = max(0, t_ns - self._t_ns) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
         if clock_stands or self.phase is not ExperimentPhase.RUNNING:
             return
         self._elapsed_s += passed_s
-        view = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s)
+        context = StepContext(twisted_rad, torque_nm, gripped_at_rad, self._elapsed_s)
         try:
-            self.command = self._program.send(view)
+            self.command = self._program.send(context)
         except StopIteration:
             self._begin_next()
         longest_s, spent_s = self.step.timeout_s, self._elapsed_s - self._step_began_s
@@ -264,35 +264,35 @@ def _act(action: Action, activity: str) -> StepProgram:
 def _wait(wrist: WristSetPoint, wait_s: float, now_s: float, activity: str, hold_number: int = 0) -> StepProgram:
     end_s = now_s + wait_s
     while (left_s := end_s - now_s) > 0:
-        view = yield StepCommand(wrist, activity=f"{activity}, {left_s:.1f} s left", hold_number=hold_number)
-        now_s = view.elapsed_s
+        context = yield StepCommand(wrist, activity=f"{activity}, {left_s:.1f} s left", hold_number=hold_number)
+        now_s = context.elapsed_s
 
 
 def _go_to(angle_rad: float, speed_rad_per_s: float, activity: str) -> Generator[StepCommand, StepContext, StepContext]:
-    """Turn to an angle; return the view of the arrival."""
+    """Turn to an angle; return the context at the arrival."""
     while True:
-        view = yield StepCommand(MoveToAngle(angle_rad, speed_rad_per_s), activity=activity)
-        if abs(view.wrist_rad - angle_rad) <= ANGLE_TOLERANCE_RAD:
-            return view
+        context = yield StepCommand(MoveToAngle(angle_rad, speed_rad_per_s), activity=activity)
+        if abs(context.twisted_rad - angle_rad) <= ANGLE_TOLERANCE_RAD:
+            return context
 
 
 def _turn_to(step: steps.TurnToStep) -> StepProgram:
-    view = yield StepCommand(activity="reading the wrist's angle")
+    context = yield StepCommand(activity="reading the wrist's angle")
     activity = f"turning the wrist to {step.angle_rad:.3f} rad"
-    yield from _go_to(step.angle_rad - view.gripped_at_rad, step.speed_rad_per_s, activity)
+    yield from _go_to(step.angle_rad - context.gripped_at_rad, step.speed_rad_per_s, activity)
 
 
 def _twist(step: steps.TwistStep) -> StepProgram:
-    view = yield StepCommand(activity="reading the wrist's angle")
-    start_rad, speed_rad_per_s = view.wrist_rad, step.speed_rad_per_s
-    origin_rad = view.gripped_at_rad if step.absolute else 0.0
+    context = yield StepCommand(activity="reading the wrist's angle")
+    start_rad, speed_rad_per_s = context.twisted_rad, step.speed_rad_per_s
+    origin_rad = context.gripped_at_rad if step.absolute else 0.0
     angles_rad = [angle_rad - origin_rad for angle_rad in step.angles_rad]
     for repeat in range(1, step.repeats + 1):
         for number, angle_rad in enumerate(angles_rad, start=1):
             where = f"angle {number} of {len(angles_rad)}, repeat {repeat} of {step.repeats}"
-            view = yield from _go_to(angle_rad, speed_rad_per_s, f"twisting to {angle_rad:.3f} rad: {where}")
+            context = yield from _go_to(angle_rad, speed_rad_per_s, f"twisting to {angle_rad:.3f} rad: {where}")
             hold, hold_number = MoveToAngle(angle_rad, speed_rad_per_s), (repeat - 1) * len(angles_rad) + number
-            yield from _wait(hold, step.hold_s, view.elapsed_s, f"holding {angle_rad:.3f} rad: {where}", hold_number)
+            yield from _wait(hold, step.hold_s, context.elapsed_s, f"holding {angle_rad:.3f} rad: {where}", hold_number)
             if step.return_to_start:
                 yield from _go_to(start_rad, speed_rad_per_s, f"returning: {where}")
 
@@ -302,21 +302,21 @@ def _hold_torque(step: steps.HoldTorqueStep) -> StepProgram:
     track = TrackTorque(torque_nm, step.ramp_nm_per_s)
     tolerance_nm = max(TORQUE_TOLERANCE * abs(torque_nm), 1e-3)
     while True:
-        view = yield StepCommand(track, activity=f"bringing the torque to {torque_nm:+.3f} N·m")
-        if view.torque_nm is not None and abs(view.torque_nm - torque_nm) <= tolerance_nm:
+        context = yield StepCommand(track, activity=f"bringing the torque to {torque_nm:+.3f} N·m")
+        if context.torque_nm is not None and abs(context.torque_nm - torque_nm) <= tolerance_nm:
             break
-    yield from _wait(track, step.hold_s, view.elapsed_s, f"holding {torque_nm:+.3f} N·m", 1)
+    yield from _wait(track, step.hold_s, context.elapsed_s, f"holding {torque_nm:+.3f} N·m", 1)
 
 
 def _tighten(step: steps.TightenStep) -> StepProgram:
-    start_rad = (yield StepCommand(activity="reading the wrist's angle")).wrist_rad
+    start_rad = (yield StepCommand(activity="reading the wrist's angle")).twisted_rad
     sign = steps.SIGNS[step.direction]
     velocity = ConstantVelocity(sign * step.speed_rad_per_s)
     while True:
         activity = f"turning {step.direction} until {step.until_torque_nm:.3f} N·m or {step.until_angle_rad:.2f} rad"
-        view = yield StepCommand(velocity, activity=activity)
+        context = yield StepCommand(velocity, activity=activity)
         # A torque the other way is what the steps before have left.
-        if view.torque_nm is not None and sign * view.torque_nm >= step.until_torque_nm:
+        if context.torque_nm is not None and sign * context.torque_nm >= step.until_torque_nm:
             return
-        if abs(view.wrist_rad - start_rad) >= step.until_angle_rad:
+        if abs(context.twisted_rad - start_rad) >= step.until_angle_rad:
             return

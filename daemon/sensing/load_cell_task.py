@@ -9,16 +9,21 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
-from shearloop.daemon.sensing.zero_request import ZeroRequest
-from shearloop.daemon.torques import CONFIRM_TARE, LOAD_CELL, LOADED_NM, SensorListener, TorqueSample, loaded_sentence
+from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest
+from shearloop.daemon.torques import (
+    CONFIRM_TARE,
+    LARGEST_DRIFT_NM,
+    LOAD_CELL,
+    SensorListener,
+    TorqueSample,
+    loaded_sentence,
+)
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 
 # Two seconds at 10.9 Hz.
 ZERO_SAMPLES = 22
 # An HX711 settles within four conversions (data sheet, "Output settling time": 400 ms at 10 a second, 50 ms at 80).
 SETTLING_PERIODS = 4
-# A zero takes two seconds; with a slower board twice the time of its readings.
-ZERO_TIMEOUT_S = 15.0
 
 
 class LoadCellTask:
@@ -28,6 +33,7 @@ class LoadCellTask:
         self, board: LoadCell, publisher: Publisher, clock: Clock, loop: SensorListener | None, rate_hz: float
     ) -> None:
         self._period_s = 1.0 / rate_hz
+        # A zero of a slow board gets twice the time of its readings.
         self._timeout_s = max(ZERO_TIMEOUT_S, 2.0 * (ZERO_SAMPLES + SETTLING_PERIODS) / rate_hz)
         self._board = board
         self._publisher = publisher
@@ -142,7 +148,7 @@ class LoadCellTask:
         """
         calibration = self._board.calibration
         changed_nm = abs(calibration.torque_nm(max(samples)) - calibration.torque_nm(min(samples)))
-        if changed_nm > LOADED_NM:
+        if changed_nm > LARGEST_DRIFT_NM:
             cure = "keep the load away and send the tare again"
             return f"its torque changed by {changed_nm:.3f} N·m during the tare; {cure}"
         if self._judged_by is None:

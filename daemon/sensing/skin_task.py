@@ -14,8 +14,8 @@ from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.sensing.snapshots import record_state
-from shearloop.daemon.sensing.zero_request import ZeroRequest, ZeroState
-from shearloop.daemon.torques import LOADED_NM, SensorListener, TorqueSample, TorqueSource
+from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest, ZeroState
+from shearloop.daemon.torques import LARGEST_DRIFT_NM, SensorListener, TorqueSample, TorqueSource
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
@@ -29,8 +29,6 @@ SKIN = "skin"
 SKIN_CURRENT, SKIN_DAQ = f"{SKIN}.source", f"{SKIN}.daq"
 # All sources of a skin's recorded inputs.
 SKIN_SOURCES = SKIN, SKIN_CURRENT, SKIN_DAQ
-# A zero takes two seconds, and longer from averaged samples.
-ZERO_TIMEOUT_S = 15.0
 # The paper's bound.
 MAX_WARMING_K = 5.0
 # The recorded data of a zero that is given up before its time is over, because its step has ended.
@@ -207,7 +205,7 @@ def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | No
 
 
 def skin_torque(
-    reading: SkinReading, radius_m: float, t_mid_ns: int, now_ns: int, loaded_nm: float = LOADED_NM
+    reading: SkinReading, radius_m: float, t_mid_ns: int, now_ns: int, loaded_nm: float = LARGEST_DRIFT_NM
 ) -> TorqueSample:
     """Return the torque of a shear force at a radius, with the band that friction leaves; `loaded_nm` as there."""
     if reading.band is None:
@@ -252,7 +250,7 @@ def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:
 
 
 def zero_timeout_s(config: SkinConfig) -> float:
-    """Return the longest time of a zero that was asked for."""
+    """Return the longest time of a zero that was asked for; from averaged samples it takes longer."""
     return max(ZERO_TIMEOUT_S, 2.0 * config.zero_samples * config.daq.sample_period_s)
 
 

@@ -6,6 +6,8 @@ from enum import Enum
 
 from shearloop.timeouts import timeout
 
+# The longest time of a zero, which takes two seconds; a slow sensor gets more.
+ZERO_TIMEOUT_S = 15.0
 # The reason for a waiting step, if the later request that replaced its own was cancelled.
 _CALLED_OFF = "the zero was asked for again, and that was called off"
 

@@ -34,11 +34,11 @@ _SHORTEST_RECOVERY_S = 10.0
 # A controller takes a command in its next cycle, which takes 8 ms on a CB3, 2 ms on an e-Series.
 _SHORTEST_REACTION_S = 0.002
 # The speeds of an arm at rest reach 0.003 rad/s by noise. With a lower threshold an arm is never at rest.
-_MIN_REST_RAD_PER_S = 0.002
+MIN_REST_RAD_PER_S = 0.002
 # The largest age of a state with which a robot on another computer may move.
 _LONGEST_STATE_S = 1.0
 # The longest time from the last decision until the wrist stands (docs/safety.md).
-_PROMISED_S = 0.2
+PROMISED_S = 0.2
 # A client has this time to stop a straight move after its deadline; then the script does.
 MOVE_GRACE_S = 0.05
 # Two cycles of a controller, and some rounding.
@@ -336,7 +336,7 @@ class UrSettings(_Checked):
     """Time for each step of making the robot ready: power, brakes, control program."""
     reaction_s: Annotated[float, Field(ge=_SHORTEST_REACTION_S, le=0.5)] = 0.04
     """Delay until a commanded speed takes effect; distances to the joint limits include it."""
-    rest_rad_per_s: Annotated[float, Field(ge=_MIN_REST_RAD_PER_S, le=0.05)] = REST_RAD_PER_S
+    rest_rad_per_s: Annotated[float, Field(ge=MIN_REST_RAD_PER_S, le=0.05)] = REST_RAD_PER_S
     """A joint slower than this is at rest."""
 
     def __post_init__(self) -> None:
@@ -404,10 +404,10 @@ class UrSettings(_Checked):
     @property
     def why_too_slow(self) -> str:
         """Why a robot on another computer takes longer to stand than docs/safety.md promises; empty if it does not."""
-        if self.standstill_s <= _PROMISED_S or is_loopback_host(self.host):
+        if self.standstill_s <= PROMISED_S or is_loopback_host(self.host):
             return ""
         return (
-            f"the wrist may turn for {self.standstill_s:.2g} s after the last decision, longer than {_PROMISED_S:g} s: "
+            f"the wrist may turn for {self.standstill_s:.2g} s after the last decision, longer than {PROMISED_S:g} s: "
             "lower command_timeout_s, silence_timeout_s or the inner limit of wrist_speed_rad_per_s, or raise rate_hz "
             "or the hard limit of wrist_acceleration_rad_per_s2"
         )

@@ -5,10 +5,7 @@ from typing import Final
 
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.patience import is_patient
-from shearloop.drivers.ur.settings import UrSettings
-
-# The longest time from the last decision until the wrist stands (docs/safety.md).
-PROMISED_S: Final = 0.2
+from shearloop.drivers.ur.settings import PROMISED_S, UrSettings
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from typing import Final
 
 from shearloop.daemon.commissioning import Line, Supplied
 from shearloop.drivers.ur.limits import ACCELERATION_S
+from shearloop.drivers.ur.settings import MIN_REST_RAD_PER_S
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context
@@ -19,7 +20,6 @@ STAGE: Final = "3 empty gripper"
 SPEED_RAD_PER_S: Final = 0.2
 # Noise that many standard deviations high is rare enough for a threshold of rest.
 SIGMAS: Final = 4.0
-_MIN_REST_RAD_PER_S: Final = 0.002
 TRACKING: Final = 0.03
 # Later stages turn by this, either way from the confirmed pose; the distance to the bound is for braking.
 TURN_RAD: Final = 0.08
@@ -89,7 +89,7 @@ def measure(context: Context) -> Measured:
         turns.append(Turn(sent["t_ns"], sign * speed, context.observer.since(sent["t_ns"])))
         context.observer.forget()
     lines, supplies = judge_turns(turns, context, SIGMAS * sigma_rad_per_s)
-    rest_rad_per_s = max(_MIN_REST_RAD_PER_S, round(SIGMAS * sigma_rad_per_s, 4))
+    rest_rad_per_s = max(MIN_REST_RAD_PER_S, round(SIGMAS * sigma_rad_per_s, 4))
     return Measured(
         [noise_line, *lines, _slider(context)], supplies.model_copy(update={"rest_rad_per_s": rest_rad_per_s})
     )

@@ -31,7 +31,7 @@ class Bench:
     """The simplest thing that can carry wishes out: a wrist that turns at once, a spring, and prompt actions."""
 
     def __init__(self, machine: Experiment, tick_ns: int = TICK_NS) -> None:
-        self.machine, self.t_ns, self.wrist_rad, self.tick_ns = machine, 0, 0.0, tick_ns
+        self.machine, self.t_ns, self.twisted_rad, self.tick_ns = machine, 0, 0.0, tick_ns
         self.begun: list[str] = []
         self.wish = StepCommand()
         self.seen: list[StepCommand] = []
@@ -40,8 +40,8 @@ class Bench:
         self.t_ns += self.tick_ns
         if self.wish.action:
             self.machine.end_action()
-        torque_nm = STIFFNESS_NM_PER_RAD * self.wrist_rad
-        self.machine.update(self.t_ns, self.wrist_rad, torque_nm, clock_stands=clock_stands)
+        torque_nm = STIFFNESS_NM_PER_RAD * self.twisted_rad
+        self.machine.update(self.t_ns, self.twisted_rad, torque_nm, clock_stands=clock_stands)
         wish = self.machine.command
         if wish.action is not None and self.machine.begin_action():
             self.begun.append(type(wish.action).__name__)
@@ -49,11 +49,11 @@ class Bench:
         match Hold() if clock_stands or self.machine.phase is ExperimentPhase.PAUSED else wish.wrist:
             case MoveToAngle(angle, speed):
                 reach = speed * step_s
-                self.wrist_rad += max(-reach, min(reach, angle - self.wrist_rad))
+                self.twisted_rad += max(-reach, min(reach, angle - self.twisted_rad))
             case ConstantVelocity(speed):
-                self.wrist_rad += speed * step_s
+                self.twisted_rad += speed * step_s
             case TrackTorque(torque, _):
-                self.wrist_rad += 0.05 * (torque / STIFFNESS_NM_PER_RAD - self.wrist_rad)
+                self.twisted_rad += 0.05 * (torque / STIFFNESS_NM_PER_RAD - self.twisted_rad)
             case Hold():
                 pass
         self.wish = wish
@@ -104,14 +104,14 @@ def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first():
             )
         )
         bench.run()
-        assert bench.wrist_rad == pytest.approx(-reached_rad, abs=0.002), "clockwise is negative"
+        assert bench.twisted_rad == pytest.approx(-reached_rad, abs=0.002), "clockwise is negative"
 
 
 def test_a_torque_the_other_way_does_not_end_a_tightening():
     tighten = {"do": "tighten", "until_torque_nm": 0.05, "until_angle_rad": 3.0}
     bench = Bench(experiment({**tighten, "direction": "counterclockwise"}, {**tighten, "direction": "clockwise"}))
     bench.run()
-    assert bench.wrist_rad == pytest.approx(-0.25, abs=0.002)
+    assert bench.twisted_rad == pytest.approx(-0.25, abs=0.002)
 
 
 def test_a_failed_action_stops_the_experiment_with_its_reason():

@@ -25,7 +25,7 @@ from shearloop.daemon.experiment_files import ReadExperiment
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.rig import Rig as RigOfDaemon
-from shearloop.daemon.torques import LOADED_NM, WRENCH, TorqueSample
+from shearloop.daemon.torques import LARGEST_DRIFT_NM, WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import MODELS
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
@@ -298,7 +298,7 @@ def test_a_tare_with_an_uncertain_gripper_has_to_be_confirmed(sense):
     assert rig.control_loop.operator.tare_refusal(confirmed=True) is None
 
 
-@pytest.mark.parametrize(("torque_nm", "refused"), [(2 * LOADED_NM, True), (0.5 * LOADED_NM, False)])
+@pytest.mark.parametrize(("torque_nm", "refused"), [(2 * LARGEST_DRIFT_NM, True), (0.5 * LARGEST_DRIFT_NM, False)])
 def test_a_tare_under_load_has_to_be_confirmed(torque_nm, refused):
     loop = ControlLoop(LoopConfig(), {"load_cell": LOAD}, ("robot",))
     loop.on_torque(TorqueSample("load_cell", torque_nm, "", 0, 0))

@@ -11,7 +11,8 @@ from shearloop.cli.terminal import message_line
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
 from shearloop.daemon.sensing import load_cell_task
-from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, ZERO_TIMEOUT_S, LoadCellTask
+from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, LoadCellTask
+from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S
 from shearloop.daemon.torques import LatestTorques, TorqueSample
 from shearloop.drivers.load_cell import COUNTS_FOR_TORQUES, COUNTS_REASON, TORQUES_FOR_COUNTS, LoadSample
 from tests.running import running

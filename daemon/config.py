@@ -317,6 +317,7 @@ class DaemonConfig(ConfigModel):
     recording: RecordingConfig | None = Field(None, description="where to record; default: no recording")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
     emulators: tuple[EmulatorConfig, ...] = Field((), description="devices to emulate, for demonstrations")
+    _file: Path | None = PrivateAttr(None)
 
     @field_validator("experiments")
     @classmethod
@@ -330,6 +331,15 @@ class DaemonConfig(ConfigModel):
     def real(self) -> "DaemonConfig":
         """What a report is about: this configuration, or the one that it rehearses."""
         return self
+
+    @property
+    def file(self) -> Path | None:
+        """The file that it was read from, None if it was made in another way."""
+        return self._file
+
+    def note_file(self, path: Path) -> None:
+        """Note the file that it was read from."""
+        self._file = path
 
     @property
     def experiment_folders(self) -> tuple[Path, ...]:
@@ -447,4 +457,6 @@ def _is_hardware(port: Path) -> bool:
 def load_daemon_config(path: Path, values: Mapping[str, str] | None = None) -> DaemonConfig:
     """Return the configuration of a YAML file, some `values` of it replaced; raises UserError with every mistake."""
     config = load_yaml_model(path, DaemonConfig, values)
-    return config if config.name else config.model_copy(update={"name": path.stem})
+    named = config if config.name else config.model_copy(update={"name": path.stem})
+    named.note_file(path)
+    return named

@@ -25,6 +25,7 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_check import check_steps, experiment_mistakes
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
 from shearloop.daemon.errors import InvalidExperimentError
+from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.errors import UserError
@@ -117,12 +118,14 @@ class ExperimentFiles:
     """The experiments that a request may name: regular files of at most 32 kB in `folders`, or below them.
 
     Each can run on the rig of `config`, where it is given: with its torque `sources`, but the robot's, and its `robot`.
+    None begins where a file of `loaded` has changed.
     """
 
     folders: tuple[Path, ...]
     config: DaemonConfig | None = None
     sources: Mapping[str, TorqueSource] = field(default_factory=dict)
     robot: Commissioning | None = None
+    loaded: LoadedFiles | None = None
     # Held by the one thread that reads, also after its request has given up.
     _turn: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
     _waiting: int = field(default=0, init=False)
@@ -284,6 +287,8 @@ class ExperimentFiles:
                 f" (and {counted(len(mistakes) - 1, 'more mistake')}: see the daemon's log)" if mistakes[1:] else ""
             )
             raise InvalidExperimentError(f"{first}{others}")
+        if self.loaded is not None and (outdated := self.loaded.why_outdated()):
+            raise UserError(outdated)
         return ReadExperiment(path, file, data)
 
 

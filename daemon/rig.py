@@ -21,6 +21,7 @@ from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.step_motions import first_motion
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment, check_experiment
+from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
@@ -347,7 +348,7 @@ def build_rig(
     memory = RigMemory(files, loop, sensors.load_cell, robot) if keeps_memory(config) else None
     write_state = memory.save_present if memory is not None else no_state
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock, write_state)
-    experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning)
+    experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning, LoadedFiles.of(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
     if memory is not None:

@@ -8,6 +8,7 @@ from typing import Any, get_type_hints
 
 import numpy as np
 
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.messaging.messages import Message
 
 
@@ -35,6 +36,9 @@ def sample(kind: type[Message], **changes: Any) -> Message:
             values[item.name] = 0.5
         elif "int" in hint:
             values[item.name] = 3
+        elif item.name == "faults":
+            # Faults are codes.
+            values[item.name] = FaultCode.ESTIMATE_STALE.text
         else:
             values[item.name] = "text"
     return kind(**{**values, "t_mono_ns": time.monotonic_ns(), **changes})

@@ -1,0 +1,83 @@
+"""The files that the daemon has read at its start, and whether they have changed since."""
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from shearloop.daemon.config import DaemonConfig
+
+# Of a larger file, such as a bank, only the time and the size tell that it has changed.
+_MAX_HASHED_BYTES = 32 << 20
+
+
+class _Stamp(NamedTuple):
+    """What the file system says of a file's content."""
+
+    changed_ns: int
+    size: int
+    number: int
+
+    @classmethod
+    def of(cls, path: Path) -> "_Stamp":
+        """Return the stamp; raises OSError."""
+        status = path.stat()
+        return cls(status.st_mtime_ns, status.st_size, status.st_ino)
+
+
+class _Loaded(NamedTuple):
+    """A file as it was read; `digest` is None of a large one."""
+
+    stamp: _Stamp
+    digest: bytes | None
+
+
+class LoadedFiles:
+    """The configuration and the files that it names, as they were when the daemon began.
+
+    Experiments are read at each start, and these are not: a limit that was lowered in a file would not hold, and nobody
+    would know.
+    """
+
+    def __init__(self, paths: Iterable[Path]) -> None:
+        """Look at these files; what is no regular file, or cannot be read, is left out."""
+        self._loaded: dict[Path, _Loaded] = {}
+        for path in paths:
+            try:
+                if path.is_file():
+                    stamp = _Stamp.of(path)
+                    self._loaded[path] = _Loaded(stamp, _digest(path, stamp))
+            except OSError:
+                continue
+
+    @classmethod
+    def of(cls, config: DaemonConfig) -> "LoadedFiles":
+        """Look at a configuration's own file and at all that it names, but the experiment."""
+        named = [path for key, path in config.walk() if isinstance(path, Path) and key != "experiment"]
+        return cls([*named, *((config.file,) if config.file is not None else ())])
+
+    def why_outdated(self) -> str:
+        """Return which file has changed since the daemon's start; empty if none has. It reads the files that may have.
+
+        A file that cannot be read now counts as unchanged: the daemon goes on with what the operator last saw.
+        """
+        for path, loaded in self._loaded.items():
+            try:
+                stamp = _Stamp.of(path)
+                same = stamp == loaded.stamp or (loaded.digest is not None and _digest(path, stamp) == loaded.digest)
+            except OSError:
+                continue
+            if not same:
+                return (
+                    f"{path} has changed since the daemon began, and the daemon goes on with what it read then; "
+                    "restart the daemon, or restore the file"
+                )
+        return ""
+
+
+def _digest(path: Path, stamp: _Stamp) -> bytes | None:
+    """Return the hash of a file's content, None of a large one; raises OSError."""
+    if stamp.size > _MAX_HASHED_BYTES:
+        return None
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()

@@ -1,0 +1,78 @@
+"""A daemon says that a file which it has read at its start has changed since."""
+
+import os
+from pathlib import Path
+
+import pytest
+import yaml
+
+from shearloop.daemon import loaded_files
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.experiment_files import ExperimentFiles
+from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.errors import UserError
+
+EXPERIMENT = {"name": "one", "steps": [{"do": "wait", "wait_s": 1}]}
+OUTDATED = "has changed since the daemon began, and the daemon goes on with what it read then; restart the daemon"
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """Write a configuration with a robot's settings and a calibration; return its path."""
+    (tmp_path / "ur.yaml").write_text("host: 10.0.0.2\n")
+    (tmp_path / "right.cal").write_bytes(b"calibration")
+    (tmp_path / "one.yaml").write_text(yaml.safe_dump(EXPERIMENT))
+    content = {
+        "fingertips": {"right": {"device": {"path": "/dev/null"}, "calibration": "right.cal"}},
+        "robot": "ur.yaml",
+        "experiment": "one.yaml",
+        "recording": {"folder": "recordings"},
+    }
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+@pytest.mark.parametrize("name", ["rig.yaml", "ur.yaml", "right.cal"])
+async def test_no_experiment_begins_once_a_file_of_the_rig_has_changed(rig, name):
+    config = load_daemon_config(rig)
+    files = ExperimentFiles(config.experiment_folders, loaded=LoadedFiles.of(config))
+    assert (await files.read(rig.parent / "one.yaml")).file.name == "one"
+    changed = rig.parent / name
+    before = changed.read_bytes()
+    changed.write_bytes(before + b"\n# tighter\n")
+    with pytest.raises(UserError, match=f"^{changed} {OUTDATED}"):
+        await files.read(rig.parent / "one.yaml")
+    changed.write_bytes(before)
+    assert (await files.read(rig.parent / "one.yaml")).file.name == "one"
+
+
+def test_experiments_are_read_at_each_start_and_may_change(rig):
+    loaded = LoadedFiles.of(load_daemon_config(rig))
+    (rig.parent / "one.yaml").write_text("name: another\n")
+    assert loaded.why_outdated() == ""
+
+
+def test_a_file_with_the_same_content_has_not_changed(rig):
+    loaded = LoadedFiles.of(load_daemon_config(rig))
+    os.utime(rig, ns=(1, 1))
+    assert loaded.why_outdated() == ""
+    copy = rig.with_suffix(".new")
+    copy.write_bytes(rig.read_bytes())
+    copy.replace(rig)
+    assert loaded.why_outdated() == ""
+
+
+def test_of_a_large_file_time_and_size_count(rig, monkeypatch):
+    monkeypatch.setattr(loaded_files, "_MAX_HASHED_BYTES", 4)
+    loaded = LoadedFiles([rig])
+    assert loaded.why_outdated() == ""
+    os.utime(rig, ns=(1, 1))
+    assert OUTDATED in loaded.why_outdated()
+
+
+def test_what_cannot_be_read_counts_as_unchanged(rig):
+    loaded = LoadedFiles([rig, rig.parent, Path("/dev/null"), rig.parent / "missing"])
+    rig.unlink()
+    (rig.parent / "missing").write_text("new")
+    assert loaded.why_outdated() == ""

@@ -25,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
 
 def full_parser() -> argparse.ArgumentParser:
     """Return one parser with every command and all its options."""
-    from shearloop.cli import COMMANDS, command_module
+    from shearloop.cli.registry import COMMANDS, command_module
 
     parser = argparse.ArgumentParser(prog="shearloop")
     parser.add_argument("--version", action="store_true", help="show the version and exit")

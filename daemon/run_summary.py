@@ -31,6 +31,8 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
 _TOO_BUSY = "This computer was too busy for the emulated rig: close other programs and run it again."
+_ASKED_FOR = frozenset(code.text for code in FaultCode if code.value.asked_for)
+_BY_BUSY_COMPUTER = frozenset(code.text for code in FaultCode if code.value.by_busy_computer)
 # The time of each disturbance in ns, and its description.
 _Events: TypeAlias = Sequence[tuple[int, str]]
 
@@ -150,20 +152,20 @@ class RunSummary:
 
 def _was_asked_for(content: Mapping[str, Any]) -> bool:
     """Return whether a person stopped the experiment of a `loop.state`."""
-    return any(fault.value.asked_for for fault in _faults(content)[:1])
+    return bool(_ASKED_FOR.intersection(_codes(content)[:1]))
 
 
 def _may_be_late(content: Mapping[str, Any]) -> bool:
     """Return whether a busy computer can be the cause of a stop; a consequence of another fault does not count."""
-    faults = _faults(content)
+    codes = _codes(content)
     # Several holds together have no cause among them.
-    causes = faults if FaultCode.HELD_TOO_LONG in faults[:1] else faults[:1]
-    return any(fault.value.by_busy_computer for fault in causes)
+    causes = codes if FaultCode.HELD_TOO_LONG.text in codes[:1] else codes[:1]
+    return bool(_BY_BUSY_COMPUTER.intersection(causes))
 
 
-def _faults(content: Mapping[str, Any]) -> list[FaultCode]:
-    """Return the faults of a `loop.state`, the cause first."""
-    return [FaultCode.of_text(code) for code in content["faults"].split(", ") if code]
+def _codes(content: Mapping[str, Any]) -> list[str]:
+    """Return the codes of the faults of a `loop.state`, the cause's first."""
+    return list(filter(None, content["faults"].split(", ")))
 
 
 def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
@@ -186,7 +188,7 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
     if run.last["phase"] == "paused" and run.steps:
         run.steps[-1].paused_s += _elapsed_s(run.last, content)
     if content["response"] == "hold" and run.last["response"] != "hold":
-        run.hold_reasons[_faults(content)[0].value.kind] += 1
+        run.hold_reasons[FaultCode.of_text(_codes(content)[0]).value.kind] += 1
     run.last = content
     if run.steps:
         run.steps[-1].to_ns = now_ns

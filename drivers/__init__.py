@@ -1,1 +1,1 @@
-"""Drivers, one module per device; `shearloop.emulators` plays the same devices byte for byte."""
+"""Drivers, a module or a package for each device; `shearloop.emulators` plays the same devices byte for byte."""

@@ -43,10 +43,14 @@ class CommandSender:
         self._send(self.stop_command)
 
     def turn(self, rad_per_s: float, decided_ns: int) -> None:
-        """Turn the wrist, unless it stands still already or a command waits for its reply."""
+        """Turn the wrist, unless it stands still already or a command waits for its reply.
+
+        A straight move goes on for as long as the loop decides, and each decision turns the wrist.
+        """
         if not self.unanswered and (rad_per_s or self.sent_rad_per_s):
             acceleration_rad_per_s2 = self.control_loop.config.wrist_acceleration_rad_per_s2
             self._send(WristSpeed(rad_per_s, acceleration_rad_per_s2, decided_ns))
+        self.robot.keep_moving()
 
     async def wait_for_rest(self) -> None:
         """Wait until no motion is under way; raises ActionError.

@@ -31,9 +31,10 @@ from shearloop.drivers.ur.messages import Enable, RobotState
 from shearloop.errors import ActionError
 from shearloop.timeouts import timeout
 
-# Without a new state the loop decides after this time, half of the time after which the arm's state is stale.
+# Without a new state the loop decides after this time, half of the time after which the arm's state is stale, while
+# something may move.
 LONGEST_SILENCE_S = 0.5 * ARM_STALE_S
-# While nothing moves, a loop is late only after this.
+# While nothing moves, it decides after this time, and is late only then.
 LONGEST_REST_S = ARM_STALE_S
 # A crashed loop waits this long for the reply to its stop.
 BRAKE_S = 0.5
@@ -94,8 +95,7 @@ class ControlLoopRunner:
             while True:
                 # Without a state the loop decides all the same.
                 with suppress(TimeoutError):
-                    longest_s = LONGEST_TICK_S if self._may_be_moving else LONGEST_REST_S
-                    async with timeout(max(longest_s, LONGEST_SILENCE_S)):
+                    async with timeout(LONGEST_SILENCE_S if self._may_be_moving else LONGEST_REST_S):
                         await self._robot.next_state()
                     # After a pause of this process several states arrive at once; only the newest one counts.
                     if self._robot.state is not None:
@@ -317,12 +317,11 @@ class ControlLoopRunner:
         return stopped
 
     def _take_state(self, state: RobotState) -> None:
-        # The controller's own time: a state that is repeated becomes stale.
-        t_ns = state.t_mono_ns - state.age_ns
         self._control_loop.on_arm(
             ArmStatus(
                 wrist_rad=state.wrist_rad,
-                t_ns=t_ns,
+                # The controller's own time: a state that is repeated becomes stale.
+                t_ns=state.measured_ns,
                 protective_stop=state.protective_stop,
                 emergency_stop=state.emergency_stop,
                 blocked=state.blocked,
@@ -351,23 +350,18 @@ class ControlLoopRunner:
                 self.straight_moves.go_on()
                 if action is not None:
                     self.actions.begin(action)
-                self._turn(rad_per_s, now_ns)
+                self._sender.turn(rad_per_s, now_ns)
             case StandStill():
                 self._may_be_moving = True
                 if self.straight_moves.interrupt():
                     self._sender.stop()
-                self._turn(0.0, now_ns)
+                self._sender.turn(0.0, now_ns)
             case End(release):
                 self._end(now_ns)
                 if release:
                     self.actions.release()
         self.states.publish_loop(self._sender.sent_rad_per_s, now_ns)
         self.states.publish_stop(self._timeline.update(self._robot.state, now_ns))
-
-    def _turn(self, rad_per_s: float, now_ns: int) -> None:
-        self._sender.turn(rad_per_s, now_ns)
-        # A straight move goes on for as long as the loop decides.
-        self._robot.keep_moving()
 
     def _end(self, now_ns: int) -> None:
         """Stop what may move, once, and begin the timeline of an experiment that was stopped."""

@@ -16,8 +16,9 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.ur.messages import RobotState
 
 LOOP_STATE_PERIOD_S = 1.0
-# The columns of `robot.state` that the robot's state has under the same name.
-_SAME = {column.name for column in fields(RobotStateMessage)} - {"source", "joints_rad", "age_s", "wrist_torque_nm"}
+# The columns of `robot.state` that are not in the robot's state under the same name, and those that are.
+_OWN = {"source", "t_mono_ns", "joints_rad", "age_s", "wrist_torque_nm"}
+_SAME = {column.name for column in fields(RobotStateMessage)} - _OWN
 
 
 @dataclass(slots=True)
@@ -42,9 +43,13 @@ class StatePublisher:
             return False
         self._block = block
         same: dict[str, Any] = {name: getattr(state, name) for name in _SAME}
-        age_s = state.age_ns / 1e9
         message = RobotStateMessage(
-            source="robot", joints_rad=state.q_rad, age_s=age_s, wrist_torque_nm=wrist_torque_nm, **same
+            source="robot",
+            t_mono_ns=state.measured_ns,
+            joints_rad=state.q_rad,
+            age_s=state.age_ns / 1e9,
+            wrist_torque_nm=wrist_torque_nm,
+            **same,
         )
         self.publisher.publish(message)
         return True

@@ -73,7 +73,7 @@ class StopTimeline:
 
         Without a command that was sent, a state after the decision counts.
         """
-        measured_ns = now_ns if robot is None else robot.t_mono_ns - robot.age_ns
+        measured_ns = now_ns if robot is None else robot.measured_ns
         if robot is not None:
             self._blocked_ns = (self._blocked_ns or measured_ns) if robot.blocked else None
         stop, self._requested_ns = self._stop, None

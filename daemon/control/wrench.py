@@ -47,7 +47,7 @@ class WrenchMean:
 
     def add(self, state: RobotState) -> None:
         """Take the next state, once, and forget those before the window."""
-        t_ns = state.t_mono_ns - state.age_ns
+        t_ns = state.measured_ns
         if self._states and t_ns <= self._states[-1][0]:
             return
         self._states.append((t_ns, state.wrist_torque_nm))

@@ -68,7 +68,7 @@ class WristController:
         self._turned_ns = 0
 
     def on_torque(self, torque: TorqueSample) -> None:
-        """Pass a torque on to controller and identification."""
+        """Give a torque to the identification, and to the closed loop with the next angle."""
         if self.excitation is not None:
             self.excitation.measure(torque.torque_nm, torque.t_mid_ns, torque.t_ns)
         if self.controller is not None:

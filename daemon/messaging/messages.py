@@ -189,7 +189,7 @@ class RobotStateMessage(Message):
     protective_stop: bool = column("", "whether it is in a protective stop")
     emergency_stop: bool = column("", "whether an emergency stop is pressed")
     blocked: str = column("", "why motion is refused at present; empty when it is allowed")
-    age_s: float = column("s", "age of the sample, by the controller's clock against ours")
+    age_s: float = column("s", "age of the sample when it was read, by the controller's clock against ours")
 
 
 @message("gripper.state", rate_hz=10.0, per_source=False)
@@ -226,7 +226,7 @@ class LoopState(Message):
     remaining_s: float = column("s", "estimated time to the end")
     tool_mm: float | None = column("mm", "diameter of the tool, if the experiment names it")
     torque_source: str = column("", "source of the torque that the loop controls")
-    torque_nm: float | None = column("N·m", "its latest valid value")
+    torque_nm: float | None = column("N·m", "its latest value; nil if that is not valid, or stale")
     torque_limit_nm: float | None = column("N·m", "the experiment stops beyond plus or minus this torque")
     set_point_nm: float | None = column("N·m", "the set point at the end of the ramp")
     ramp_nm: float | None = column("N·m", "the present set point")
@@ -235,8 +235,8 @@ class LoopState(Message):
     stiffness_nm_per_rad: float | None = column("N·m/rad", "the tool's identified stiffness")
     delay_s: float | None = column("s", "identified delay of the torque")
     noise_nm: float | None = column("N·m", "identified standard deviation of one torque")
-    speed_command_rad_per_s: float = column("rad/s", "the commanded wrist speed, before clipping")
-    speed_sent_rad_per_s: float = column("rad/s", "the wrist speed that was sent, after clipping")
+    speed_command_rad_per_s: float = column("rad/s", "the commanded wrist speed, before the worker's clipping")
+    speed_sent_rad_per_s: float = column("rad/s", "the wrist speed that was sent, after the worker's clipping")
     response: str = column("", "the safety response")
     stop: int = column("", "number of the stop that waits for `unlock`, larger after each further cause; 0 without one")
     cause: str = column("", "the first reason, which may have caused the others; empty without a reason")

@@ -107,7 +107,7 @@ class UrArm:
             self._script_port.close()
         read = RtdeSample(
             **vars(sample) | {"wrench": _difference(sample.wrench, self.wrench_zero)},
-            t_mono_ns=now_ns,
+            read_ns=now_ns,
             age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
             connected=self._receiver.connected and self._control.isConnected(),
             moving_linearly=self._may_move_linearly

@@ -202,13 +202,18 @@ class RtdeOutputs:
 class RtdeSample(RtdeOutputs):
     """The controller's latest outputs and its connection's state."""
 
-    t_mono_ns: int
-    # Time since the controller made the sample, by its own clock.
+    # When it was read, by CLOCK_MONOTONIC, and the time since the controller made the sample, by its own clock.
+    read_ns: int
     age_ns: int
     connected: bool
     moving_linearly: bool
     # A joint slower than this is at rest.
     rest_rad_per_s: float = field(default=REST_RAD_PER_S, kw_only=True)
+
+    @property
+    def measured_ns(self) -> int:
+        """When the controller made the sample; a sample that is read again keeps its time."""
+        return self.read_ns - self.age_ns
 
     @property
     def program_running(self) -> bool:
@@ -285,7 +290,7 @@ class RtdeSample(RtdeOutputs):
 
 @dataclass(frozen=True)
 class RobotState(RtdeSample):
-    """A sample and the state of the driver; published as `robot.state`."""
+    """A sample and the state of the driver; `robot.state` has a part of it."""
 
     # Why motion is refused at present; empty when it is enabled.
     blocked: str

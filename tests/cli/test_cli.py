@@ -20,11 +20,12 @@ import pytest
 import zmq.asyncio
 
 from shearloop.bank.models import MODELS
-from shearloop.cli import COMMANDS, GROUPS, OTHER_SPELLINGS, command_module, main
+from shearloop.cli import main
 from shearloop.cli.bank import MODEL_NAMES
 from shearloop.cli.command import _lines
 from shearloop.cli.completion import arguments_of, full_parser, parts_of
 from shearloop.cli.options import path_of
+from shearloop.cli.registry import COMMANDS, GROUPS, OTHER_SPELLINGS, command_module
 from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
@@ -469,7 +470,7 @@ def test_help_names_all_basis_models():
 def test_help_loads_no_heavy_modules():
     heavy = ("numpy", "scipy", "pydantic", "zmq", "matplotlib", "skfem", "serial", "yaml", "tqdm")
     program = (
-        "import sys\nfrom shearloop.cli import COMMANDS, main\n"
+        "import sys\nfrom shearloop.cli import main\nfrom shearloop.cli.registry import COMMANDS\n"
         "for arguments in [[], *([name] for name in COMMANDS)]:\n"
         "    try: main([*arguments, '--help'])\n    except SystemExit: pass\n"
         f"    loaded = [name for name in {heavy!r} if name in sys.modules]\n"

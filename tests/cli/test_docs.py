@@ -13,8 +13,8 @@ import yaml
 
 import shearloop
 from shearloop.bank.models import MODELS
-from shearloop.cli import COMMANDS, command_module
 from shearloop.cli.completion import arguments_of, full_parser, parts_of
+from shearloop.cli.registry import COMMANDS, command_module
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import STEP_KINDS
 from shearloop.daemon.experiment_files import check_experiment

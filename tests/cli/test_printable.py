@@ -10,7 +10,8 @@ import sys
 import pytest
 import structlog
 
-from shearloop.cli import COMMANDS, main
+from shearloop.cli import main
+from shearloop.cli.registry import COMMANDS
 from shearloop.cli.terminal import StatusLine, print_estimate
 from shearloop.daemon.logs import CLEAR_LINE, logging_to_stderr
 from shearloop.daemon.messaging.messages import TOPICS, decode, encode, wire_map

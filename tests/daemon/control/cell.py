@@ -104,7 +104,7 @@ class Robot(UrRobot):
             missing_m = self._goal.pose[2] - z
             z += math.copysign(min(step_m, abs(missing_m)), missing_m)
             arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
-        arm.be(t_mono_ns=self.bench.now_ns)
+        arm.be(read_ns=self.bench.now_ns)
         # A straight move goes on as long as the loop decides so.
         self.bench.run(1, daemon_alive=self.bench.state.motion != "linear")
         self._unread.append(self.bench.state)

@@ -103,4 +103,4 @@ async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkey
         for _ in range(5):
             cell.robot.cycle(read=False)
         await cell.cycles(1)
-        assert decided == [cell.state.t_mono_ns]
+        assert decided == [cell.state.read_ns]

@@ -11,7 +11,7 @@ from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.messaging.messages import wire_map
+from shearloop.daemon.messaging.messages import RobotStateMessage, wire_map
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.torques import WRENCH
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven
@@ -50,6 +50,18 @@ async def test_an_experiment_that_fails_in_its_first_decision_ended_by_a_fault(k
             assert f"step 1 of 1  {step['do']}" in summary.text
             assert await cell.runner.unlock() is None
             await cell.cycles(5)
+
+
+async def test_a_state_of_the_robot_has_the_time_of_its_measurement():
+    age_ns, read_ns = 30_000_000, []
+    async with driven() as cell:
+        cell.robot.bench.arm.be(age_ns=age_ns)
+        for _ in range(10):
+            await cell.cycles(1)
+            read_ns.append(cell.state.read_ns)
+        *_, message = (one for one in cell.published.messages if isinstance(one, RobotStateMessage))
+    assert message.age_s == age_ns / 1e9
+    assert message.t_mono_ns + age_ns in read_ns
 
 
 async def test_a_stop_is_logged_once_however_often_a_state_is_out_of_date():

@@ -15,7 +15,7 @@ MS = 1_000_000
 
 def state(at_ms: float, *, rests: bool, blocked: str = "") -> RobotState:
     """Return a state that was measured at this time."""
-    return cast(RobotState, SimpleNamespace(t_mono_ns=round(at_ms * MS), age_ns=0, rests=rests, blocked=blocked))
+    return cast(RobotState, SimpleNamespace(measured_ns=round(at_ms * MS), rests=rests, blocked=blocked))
 
 
 def begun() -> StopTimeline:

@@ -15,9 +15,9 @@ RATE_HZ = 125.0
 PERIOD_NS = 8_000_000
 
 
-def state(number: int, torque_nm: float, *, age_ns: int = 0) -> Any:
+def state(number: int, torque_nm: float) -> Any:
     """Return what a mean takes of a state; `number` counts periods of the controller's clock."""
-    return SimpleNamespace(t_mono_ns=number * PERIOD_NS + age_ns, age_ns=age_ns, wrist_torque_nm=torque_nm)
+    return SimpleNamespace(measured_ns=number * PERIOD_NS, wrist_torque_nm=torque_nm)
 
 
 def test_a_mean_is_of_the_window_and_of_the_middle_of_its_times():
@@ -35,8 +35,8 @@ def test_a_mean_is_of_the_window_and_of_the_middle_of_its_times():
 
 def test_a_state_that_is_repeated_counts_once():
     mean = WrenchMean(RATE_HZ)
-    mean.add(state(0, 1.0))
-    mean.add(state(0, 1.0, age_ns=20_000_000))
+    for _ in range(2):
+        mean.add(state(0, 1.0))
     mean.add(state(1, 0.0))
     assert mean.torque_nm == 0.5
 
@@ -55,7 +55,7 @@ def test_a_mean_is_over_the_same_time_and_published_as_often_at_any_rate_of_stat
     mean = WrenchMean(rate_hz)
     for number in range(round(rate_hz)):
         t_ns = round(number * 1e9 / rate_hz)
-        mean.add(SimpleNamespace(t_mono_ns=t_ns, age_ns=0, wrist_torque_nm=number / rate_hz))
+        mean.add(SimpleNamespace(measured_ns=t_ns, wrist_torque_nm=number / rate_hz))
     assert mean.known
     # Of a ramp of 1 N·m a second: half the window, which at 50 states a second is for 24 of them.
     window_s = max(0.192, 24 / rate_hz)

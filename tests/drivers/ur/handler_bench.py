@@ -25,7 +25,7 @@ LIMITS = UrLimits(
 )
 SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS, command_timeout_s=0.3, silence_timeout_s=0.3)
 AT_REST = messages.RtdeSample(
-    t_mono_ns=0,
+    read_ns=0,
     timestamp_s=0.0,
     age_ns=0,
     connected=True,
@@ -99,7 +99,7 @@ class FakeArm:
         now = speed + min(max(self.target - speed, -step), step)
         wrist += 0.5 * (now + speed) * CYCLE_NS / 1e9
         self.be(
-            t_mono_ns=self.reading.t_mono_ns + CYCLE_NS,
+            read_ns=self.reading.read_ns + CYCLE_NS,
             timestamp_s=self.reading.timestamp_s + CYCLE_NS / 1e9,
             q_rad=(*self.reading.q_rad[:5], wrist),
             qd_rad_per_s=(0.0, 0.0, 0.0, 0.0, 0.0, now),

@@ -63,7 +63,7 @@ class CyclingArm(FakeArm):
     def read(self) -> RtdeSample:
         self.cycle()
         self.read_s.append(worker.time.monotonic() - BEGUN_S)
-        self.be(t_mono_ns=worker.time.monotonic_ns())
+        self.be(read_ns=worker.time.monotonic_ns())
         return super().read()
 
     def wrist(self, command: WristSpeed, left_s: float) -> bool:

@@ -46,7 +46,7 @@ class ScriptedArm(FakeArm):
         arm = self.robot.arm
         self.reading = dataclasses.replace(
             AT_REST,
-            t_mono_ns=self.reading.t_mono_ns + CYCLE_NS,
+            read_ns=self.reading.read_ns + CYCLE_NS,
             timestamp_s=self.robot.clock_s,
             q_rad=tuple(arm.q_rad),
             qd_rad_per_s=tuple(arm.qd_rad_per_s),

@@ -78,11 +78,11 @@ class SimulatedArm(ScriptedArm):
         """Take the controller's latest outputs, unless nothing comes."""
         now_ns = self._rig.now_ns()
         if self._rig.is_silent:
-            self.reading = replace(self.reading, age_ns=now_ns - self.reading.t_mono_ns)
+            self.reading = replace(self.reading, age_ns=now_ns - self.reading.read_ns)
             return
         self.reading = RtdeSample(
             **vars(self._rig.outputs(UPPER)),
-            t_mono_ns=now_ns,
+            read_ns=now_ns,
             age_ns=0,
             connected=True,
             moving_linearly=robots.moving_asynchronously(self.robot),

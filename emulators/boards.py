@@ -155,7 +155,8 @@ class EmulatedBoard:
 
 def format_line(values: NDArray[np.float64]) -> bytes:
     """Return the line of the EIT-kit for (v,) values in volts."""
-    return ("".join(f"{value:.4f}, " for value in values.tolist()) + "\n").encode()
+    # One format of all values takes less time than one for each.
+    return (b"%.4f, " * len(values) + b"\n") % tuple(values.tolist())
 
 
 class EitKitBoard(EmulatedBoard):

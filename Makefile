@@ -11,7 +11,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CONSTRAINTS ?=
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS))
 
-.PHONY: lock coverage notebook install install-dev system-packages demo demo-python docs docs-site test test-fast lint format clean
+.PHONY: lock coverage notebook install install-dev system-packages demo demo-python docs docs-site test test-computing test-the-rest test-fast lint format clean
 
 # Before anything is installed.
 demo-python:
@@ -47,13 +47,25 @@ system-packages:
 demo: demo-python $(VENV)/.installed
 	$(BIN)/shearloop demo --folder . $(if $(RECORDING),--play '$(RECORDING)') || case $$? in 4|130|143) ;; *) exit 1 ;; esac
 
-# Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot in real time run by
-# themselves, because a robot stops when its computer is busy. They mostly wait, so that more of them fit on two cores.
+# Test files run in parallel, the longest first (tests/conftest.py). Three parts:
+#   Tests that drive a robot in real time run by themselves, because a robot stops when its computer is busy. They mostly
+#   wait, so that more of them fit on two cores.
+#   Tests that only compute run beside the rest, at a low priority: they take the time that it leaves of the cores, and
+#   disturb it less than a fourth worker would. On a busy computer they get little time, so that their timeout is long.
 # Status 5: no test was selected.
 PYTEST := $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 test: install-dev
 	$(PYTEST) -n 5 -m real_time $(PYTEST_ARGS) || [ $$? -eq 5 ]
-	$(PYTEST) -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	+$(MAKE) --no-print-directory --jobs=2 --keep-going test-computing test-the-rest
+
+test-computing: install-dev
+	mkdir -p build
+	nice -n 10 $(BIN)/pytest -m computes --timeout=600 $(PYTEST_ARGS) >build/test-computing.log 2>&1 || [ $$? -eq 5 ] || \
+		{ cat build/test-computing.log; exit 1; }
+	tail -n 1 build/test-computing.log
+
+test-the-rest: install-dev
+	$(PYTEST) -m 'not real_time and not computes' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \

@@ -55,6 +55,8 @@ LONGEST = (
     "test_stops_and_unlocking.py", "test_twist_and_hold.py", "test_adapt_in_loop.py", "test_rehearsal.py",
     "test_doctor.py", "test_stop_times.py", "test_ends.py", "test_recorded_rig.py",
 )  # fmt: skip
+# What only computes: nothing there waits, or depends on how long it takes. As much as the rest leaves time for.
+COMPUTING = (_ROOT / "tests" / "estimation",)
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -103,16 +105,32 @@ def tiny_bank(tmp_path_factory) -> Path:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """For `-m real_time` do not import the files and the folders that have no such test, in each worker."""
-    if config.getoption("markexpr") != "real_time":
-        return None
-    if collection_path.is_dir():
-        files = [*collection_path.rglob("test_*.py")]
-    elif collection_path.match("test_*.py"):
-        files = [collection_path]
-    else:
-        return None
-    return None if any("real_time" in file.read_text(encoding="utf-8") for file in files) else True
+    """For a part of the tests do not import the files and the folders that have none of it, in each worker."""
+    part = config.getoption("markexpr")
+    if part == "real_time":
+        return None if _has_real_time(collection_path) else True
+    if part == "computes":
+        leads_there = any(folder.is_relative_to(collection_path) for folder in COMPUTING)
+        return None if leads_there or _computes(collection_path) else True
+    if part == "not real_time and not computes":
+        return True if _computes(collection_path) else None
+    return None
+
+
+def _has_real_time(path: Path) -> bool:
+    if path.is_dir():
+        return any(map(_has_real_time, path.rglob("test_*.py")))
+    return path.match("test_*.py") and "real_time" in path.read_text(encoding="utf-8")
+
+
+def _computes(path: Path) -> bool:
+    return any(path.is_relative_to(folder) for folder in COMPUTING)
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark the tests that only compute."""
+    if _computes(item.path) and item.get_closest_marker("real_time") is None:
+        item.add_marker("computes")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

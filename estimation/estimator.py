@@ -86,6 +86,11 @@ class Reading:
         """Return the reading of a frame; the matcher belongs to the estimator's bank, None without one."""
         return cls(frame, t_s, () if matcher is None else tuple(map(matcher.match, frame.difference)))
 
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether two positions of the bank far apart fit the first side's frame equally well."""
+        return bool(self.matches) and self.matches[0].ambiguous
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Material:

@@ -31,7 +31,7 @@ from shearloop.estimation.grips import Grip, find_grips
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import LearnedFrames
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
-from shearloop.estimation.ridge import CensoredRidge
+from shearloop.estimation.ridge import CensoredRidge, sign_of_loads
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.twists import LOADED_FRACTION, first_twists, loaded_log_gain
@@ -172,9 +172,10 @@ def _fit_outputs(
         if fitted is not None:
             estimator, regressor, law = fitted
         elif unexplained > _TOOLS_MAY_LEAVE:
+            cure = "with twists of every tool in one direction" if enough else "on three diameters"
             raise CalibrationError(
                 f"the tools of {' and '.join(f'{tool.value:.3g}' for tool in tools)} mm turn so differently that they "
-                "have no torque in common; calibrate on each alone, or on three diameters"
+                f"have no torque in common; calibrate on each alone, or {cure}"
             )
     torque = OutputModel(regressor, estimator.k_range(rows.features))
     return replace(calibration, estimator=estimator, torque=torque, diameter=diameter, tools=law)
@@ -190,7 +191,9 @@ def _fit_tools(
     recording counts from its least torque on.
     """
     rows = rows.where(np.isfinite(diameters_mm)[rows.recording])
-    features, torque_nm = rows.features, rows.torque_nm.copy()
+    # The sign of a torque only says how the load cell is mounted: from here on the loads are positive.
+    sign = sign_of_loads(rows.torque_nm)
+    features, torque_nm = rows.features, sign * rows.torque_nm
     tools, recording = np.unique(rows.recording, return_inverse=True)
     diameters_mm = diameters_mm[tools]
     for of_recording in (recording == number for number in range(len(tools))):
@@ -202,12 +205,15 @@ def _fit_tools(
     if _have_torque_in_common(features, torque_nm, each):
         return None
     gains = np.array([np.sqrt((torque_nm[rows] ** 2).mean()) for rows in each])
-    estimator, regressor, _ = estimator.fit_torque(features, torque_nm / gains[recording], None, rows.grip)
+    estimator, regressor, _ = estimator.fit_torque(features, sign * torque_nm / gains[recording], None, rows.grip)
     return estimator, regressor, ToolLaw.fit(diameters_mm, gains)
 
 
 def _have_torque_in_common(features: FloatArray, torque_nm: FloatArray, each: Sequence[IntArray]) -> bool:
-    """Return whether the torques of each recording's rows follow from the others' with nearly the same gain."""
+    """Return whether the torques of each recording's rows follow from the others' with nearly the same gain.
+
+    The loads are positive.
+    """
     found: list[float] = []
     for out in each:
         kept = np.setdiff1d(np.arange(len(torque_nm)), out)
@@ -289,10 +295,15 @@ def _replay(
             before = processed.grip
             if processed.reasons or not np.isfinite(truth[0]):
                 continue
-            features = estimator.features(Reading.of(processed, t_s, matcher))
+            reading = Reading.of(processed, t_s, matcher)
+            if reading.is_ambiguous:
+                continue
+            # Before the gel was seen idle, its position means nothing, and so the frame shows no diameter.
+            torque_nm, diameter_mm = truth if processed.has_baseline else (truth[0], np.nan)
+            features = estimator.features(reading)
             places = (
                 (difference / estimator.scale).ravel()
                 for difference in (processed.difference, processed.mean_difference)
             )
-            rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, *truth, grip))
+            rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, torque_nm, diameter_mm, grip))
     return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None

@@ -24,7 +24,9 @@ class IdleFrames:
         self.least_scores = [-np.inf] * len(self._sides)
         # Whether this session has seen every fingertip idle, and whether frames are averaged into the idle frame.
         self.complete, self.taring = False, wanted > 0
-        self._frames: list[deque[FloatArray]] = [deque(maxlen=BASELINE_FRAMES) for _ in self._sides]
+        # The idle frame goes on as a mean of as many frames as a tare has asked for.
+        averaged = max(BASELINE_FRAMES, wanted)
+        self._frames: list[deque[FloatArray]] = [deque(maxlen=averaged) for _ in self._sides]
         self._followed = False
         self._wanted = wanted
         self._tare_frames: list[FloatArray] = []

@@ -15,7 +15,7 @@ from shearloop.estimation.bank_match import BankMatcher, BankSearch
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.defaults import BASELINE_FRAMES, MAX_GAP_S
 from shearloop.estimation.fingertip_validator import MIN_NOISE_V
-from shearloop.estimation.session import FINGERS_MOVED, Session
+from shearloop.estimation.session import Session
 from shearloop.estimation.values import ProcessedFrame, TactileFrame
 
 # Frames with more unusable channels than this are refused.
@@ -59,13 +59,13 @@ class PaperSession(Session):
         """Whether frames are being averaged into the idle frame."""
         return self._untouched.missing and not self._lacks_idle_frame
 
-    def process(self, frame: TactileFrame) -> ProcessedFrame:
-        """Take the next frame of one side and return its difference to the idle frame, or the reasons against it."""
+    def _process(self, frame: TactileFrame) -> ProcessedFrame:
+        """Return the difference of the next frame of one side to the idle frame, or the reasons against it."""
         if frame.fingers_moved:
             # Neither the idle frame nor a mean has frames from before and after a motion.
             self._untouched.restart()
             self._averaged.clear()
-            return ProcessedFrame.refused(frame.usable, FINGERS_MOVED)
+            return ProcessedFrame.refused(frame.usable)
         usable = frame.usable & (frame.channels != 0.0)
         if self._before is not None:
             usable &= ~self._unknown

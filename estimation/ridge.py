@@ -78,8 +78,7 @@ class CensoredRidge(Ridge):
 
         A frame without load counts only while it is predicted above its bound (squared hinge loss, by Newton steps).
         """
-        largest = float(values[np.argmax(np.abs(values))])
-        sign = 1.0 if largest > 0 else -1.0
+        sign = sign_of_loads(values)
         y = sign * values
         touching = y >= CENSORED_FRACTION * y.max()
         bound = -_MARGIN_FRACTION * float(y.max())
@@ -102,8 +101,13 @@ class CensoredRidge(Ridge):
         return replace(Ridge.scaled(self, factor), sigma=factor * self.sigma)
 
 
+def sign_of_loads(torque_nm: FloatArray) -> float:
+    """Return the sign of the largest of (n,) torques, 1 or −1."""
+    return 1.0 if torque_nm[np.argmax(np.abs(torque_nm))] > 0 else -1.0
+
+
 def is_one_sided(torque_nm: FloatArray) -> bool:
     """Return whether a load cell was pushed from one side only, and was free of load for much of the time."""
-    largest = float(torque_nm[np.argmax(np.abs(torque_nm))])
-    along = torque_nm * np.sign(largest)
-    return bool(along.min() > -0.05 * abs(largest) and (along < 0.02 * abs(largest)).mean() > 0.2)
+    along = sign_of_loads(torque_nm) * torque_nm
+    largest = float(along.max())
+    return bool(along.min() > -0.05 * largest and (along < 0.02 * largest).mean() > 0.2)

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from shearloop.bank.bank_file import Bank
     from shearloop.estimation.bank_match import BankMatch, BankMatcher, BankSearch
 
-_REPEATED_FRAME = ("the board sent the same frame again",)
-_REPEATED_SIDE = ("a fingertip's frame is the one before: the next came late, or the board sent it again",)
+_REPEATED_FRAME = "the board sent the same frame again"
+_REPEATED_SIDE = "a fingertip's frame is the one before: the next came late, or the board sent it again"
 FINGERS_MOVED = "the fingers moved while this frame was acquired"
 _NO_IDLE_FRAME = ("no idle frame: it took too long, or something was gripped; tare again with nothing gripped",)
 _NEVER_IDLE = "it was not seen untouched since the start; if it holds a tool, release it, tare, and grip again"
@@ -196,16 +196,9 @@ class Session:
                 f"the calibration is of {shape[0]} sides ({', '.join(self.calibration.sides)}), and the frame has the "
                 f"shape {frame.channels.shape}"
             )
-        if frame.repeated:
-            return Estimate(valid=False, reasons=_REPEATED_FRAME)
         self.difference = None
         if self._lacks_idle_frame:
             return Estimate(valid=False, reasons=_NO_IDLE_FRAME)
-        # Noise makes every side of a new frame differ, except where no channel has a signal.
-        repeats = ((frame.channels == self._latest).all(axis=1) & frame.channels.any(axis=1)).any()
-        self._latest = frame.channels
-        if repeats:
-            return Estimate(valid=False, reasons=_REPEATED_FRAME if len(frame.channels) == 1 else _REPEATED_SIDE)
         processed = self.process(frame)
         if processed.grip is GripState.NONE:
             self._gain = GripGain()
@@ -219,14 +212,29 @@ class Session:
     def process(self, frame: TactileFrame) -> ProcessedFrame:
         """Take the next frame and return its difference to the idle frame, or the reasons against it.
 
-        A frame of moving fingers belongs to the grip's memory, and gives neither an estimate nor an idle frame.
+        A fit takes its frames from here too, so every check that does not depend on the fit belongs here. A frame of
+        moving fingers belongs to the grip's memory, and gives neither an estimate nor an idle frame.
         """
+        if repeated := self._repeats(frame):
+            return ProcessedFrame.refused(frame.usable, repeated)
         processed = self._process(frame)
         if not frame.fingers_moved:
             return processed
         return replace(processed, reasons=(FINGERS_MOVED, *processed.reasons))
 
+    def _repeats(self, frame: TactileFrame) -> str:
+        """Return why a frame is no new one; empty for a new one."""
+        before, self._latest = self._latest, frame.channels
+        if frame.repeated:
+            return _REPEATED_FRAME
+        # Noise makes every side of a new frame differ, except where no channel has a signal.
+        is_before = (frame.channels == before).all(axis=1) & frame.channels.any(axis=1)
+        if not is_before.any():
+            return ""
+        return _REPEATED_FRAME if len(frame.channels) == 1 else _REPEATED_SIDE
+
     def _process(self, frame: TactileFrame) -> ProcessedFrame:
+        """Return the difference of a new frame, or the reasons against it other than moving fingers."""
         checks, idle = self._checks, self._idle
         missing = self._timer.missing_before(frame.t_s)
         if missing is None:
@@ -335,7 +343,7 @@ class Session:
             self.difference, frame = difference, replace(frame, difference=difference)
         reading = Reading.of(frame, t_s, self._matcher)
         features, match = calibration.estimator.features(reading), next(iter(reading.matches), None)
-        if match is not None and match.ambiguous:
+        if reading.is_ambiguous:
             return estimate_of({}, AMBIGUOUS, match)
         if "torque" in outputs:
             self._gain.frames.append((t_s, features[calibration.estimator.columns["torque"]]))

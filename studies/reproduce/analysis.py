@@ -26,6 +26,7 @@ from shearloop.bank.matching import Match, ReferenceMatcher, best_match
 from shearloop.bank.mesh import Mesh
 from shearloop.bank.models import MODELS
 from shearloop.errors import UserError
+from shearloop.estimation.ridge import sign_of_loads
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.matlab_import import (
     DIAMETER_FOLDER,
@@ -321,10 +322,11 @@ def _curve(x: FloatArray, y: FloatArray, degree: int) -> Polynomial | None:
 def place_in_series(values: FloatArray) -> tuple[IntArray, IntArray] | None:
     """Return the level and the repeat (n,) of values, in order of time, that repeat one rising series; else None.
 
-    A series restarts where the value falls by more than half of the whole range. There must be two series, of three
-    levels or more. The longest series have all levels, and their means define the levels. A shorter series keeps its
-    order; its values go to the levels with the least sum of squared differences.
+    Negative values rise away from 0. A series restarts where the value falls by more than half of the whole range.
+    There must be two series, of three levels or more. The longest series have all levels, and their means define the
+    levels. A shorter series keeps its order; its values go to the levels with the least sum of squared differences.
     """
+    values = sign_of_loads(values) * values
     falls = np.diff(values) < -_RESTART_FRACTION * np.ptp(values)
     repeat = np.concatenate([[0], np.cumsum(falls)]).astype(np.int64)
     length = np.bincount(repeat)

@@ -7,9 +7,10 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.estimation.ridge import sign_of_loads
 from shearloop.studies.slices.series import SliceSeries
 
-# A fall by more than this fraction of the range begins another repeat of a series of slices.
+# A fall of the load by more than this fraction of the range begins another repeat of a series of slices.
 _RESTART = 0.5
 
 
@@ -41,6 +42,7 @@ def _places(torque_nm: FloatArray) -> IntArray:
     The first repeat may lack its first slices, the last one its last slices. A whole repeat is the longest one.
     """
     known = np.nan_to_num(torque_nm)
+    known = sign_of_loads(known) * known
     falls = np.flatnonzero(np.diff(known) < -_RESTART * float(np.ptp(known))) + 1
     starts = np.array([0, *falls.tolist()])
     lengths = np.diff([*starts.tolist(), len(known)])

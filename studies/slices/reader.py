@@ -47,7 +47,7 @@ class SliceReader:
             differences = np.where(usable, differences, imputed)
         reading = self._read(differences, usable, frame.t_s)
         match = next(iter(reading.matches), None)
-        if match is not None and match.ambiguous:
+        if reading.is_ambiguous:
             return estimate_of({}, AMBIGUOUS, match)
         values: dict[Quantity, Interval] = {}
         for quantity, model in models.items():

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import TRUSTED, fit
+from shearloop.estimation import TRUSTED, Physics, Session, fit
+from shearloop.estimation.bank_estimators import BankEstimator
+from shearloop.estimation.bank_match import BankMatch
+from shearloop.estimation.estimator import Estimator, OutputModel
+from shearloop.estimation.motion_regression import MotionRegression
+from tests.estimation.conftest import twisting
 
 
 def with_a_nan(series, name):
@@ -38,3 +43,55 @@ NO_NUMBER = "holds 1 value that is not a finite number"
 def test_recordings_that_determine_nothing_are_refused(recorded, recordings_of, message):
     with pytest.raises(CalibrationError, match=message):
         fit("motion_regression", recordings_of(recorded), "rig", timing=TRUSTED)
+
+
+def test_a_diameter_is_not_fitted_before_the_fingertips_were_seen_idle(monkeypatch):
+    """The daemon gives no diameter there: without its idle position the gel's position means nothing."""
+    fitted = []
+
+    def fit_diameter(_estimator, rows):
+        fitted.append(rows)
+        return OutputModel(None, np.zeros(0))
+
+    process = Session.process
+
+    def seen_idle_late(session, frame):
+        processed = process(session, frame)
+        return replace(processed, has_baseline=processed.has_baseline and frame.t_s > 40.0)
+
+    monkeypatch.setattr(MotionRegression, "fit_diameter", fit_diameter)
+    monkeypatch.setattr(Session, "process", seen_idle_late)
+    series = zip((twisting(cycles=3, tips=(1,), seed=seed) for seed in range(3)), (10.0, 20.0, 40.0), strict=True)
+    recordings = [replace(one, diameter_mm=np.full(len(one.t_s), tool_mm)) for one, tool_mm in series]
+    fit("motion_regression", recordings, "rig", timing=TRUSTED)
+    (rows,) = fitted
+    assert len(rows.frame) > 100
+    assert all(recordings[0].t_s[rows.frame] > 40.0)
+
+
+def test_a_frame_that_fits_two_positions_of_the_bank_is_not_fitted(monkeypatch, bank):
+    class TwoPositions:
+        """Finds the position of a frame in the bank by its size; every third one fits another position too."""
+
+        found = 0
+
+        def match(self, difference):
+            self.found += 1
+            size = float(np.abs(difference).mean())
+            ambiguous = self.found % 3 == 0
+            return BankMatch(9.0 if ambiguous else 1.0 + size, 1.0, size, 0.9, 0.9, ambiguous)
+
+    fitted = []
+    fit_torque = Estimator.fit_torque
+
+    def noted(estimator, features, *others):
+        fitted.append(features)
+        return fit_torque(estimator, features, *others)
+
+    monkeypatch.setattr(BankEstimator, "prepare", classmethod(lambda cls, material: cls(material.scale)))
+    monkeypatch.setattr(BankEstimator, "matcher", lambda *_: TwoPositions())
+    monkeypatch.setattr(BankEstimator, "fit_torque", noted)
+    fit("bank", [twisting(tips=(1,))], "rig", Physics(bank=bank), timing=TRUSTED)
+    (features,) = fitted
+    assert len(features) > 100
+    assert features[:, 0].max() < 9.0

@@ -78,6 +78,21 @@ def test_three_idle_frames_are_a_baseline_for_an_outright_grip(motion_calibratio
     assert np.mean(valid[25:]) > 0.95
 
 
+@pytest.mark.parametrize("wanted", [5, 50])
+def test_an_idle_frame_of_many_frames_stays_one_of_many(motion_calibration, wanted):
+    rng, session = np.random.default_rng(3), Session(motion_calibration, baseline_frames=wanted)
+    idle = twisting(seed=5).channels[2]
+    frames = [idle + rng.normal(0, 0.002, idle.shape) for _ in range(wanted + 20)]
+    session.tare()
+    for number, channels in enumerate(frames):
+        processed = session.process(TactileFrame.of(0.54 * number, channels))
+        if number >= wanted:
+            # A mean of 10 has an error that is more than twice as large as a mean of 50.
+            averaged = max(wanted, 10)
+            expected = channels - np.mean(frames[max(number + 1 - averaged, 0) : number + 1], axis=0)
+            np.testing.assert_allclose(processed.difference, expected, rtol=0.02, atol=1e-5)
+
+
 def test_a_session_that_begins_gripped_is_read_from_its_motion(motion_calibration):
     later = twisting(seed=21).between(60, 240)
     estimates = follow(motion_calibration, later)
@@ -332,6 +347,18 @@ def test_a_frame_that_a_board_sends_again_is_no_new_one(motion_calibration, side
     number = np.arange(len(whole.t_s))
     without = kept(whole, (number <= hung) | (number >= hung + 30))
     assert estimates[hung + 30 :] == follow(motion_calibration, without)[hung + 1 :]
+
+
+@pytest.mark.parametrize("sides", [[0, 1], [1]])
+def test_a_fit_refuses_the_repeated_frames_that_the_daemon_refuses(motion_calibration, sides):
+    whole = twisting(seed=5)
+    frozen = whole.channels.copy()
+    frozen[100:110, sides] = frozen[100, sides]
+    series = replace(whole, channels=frozen)
+    estimates, session = follow(motion_calibration, series), Session(motion_calibration)
+    refused = [session.process(frame).reasons for frame in series.frames()]
+    assert refused[101:110] == [one.reasons for one in estimates[101:110]]
+    assert all("the board sent it again" in reasons[0] for reasons in refused[101:110])
 
 
 STEP_V = 0.00215

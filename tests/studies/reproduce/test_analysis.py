@@ -162,6 +162,13 @@ def test_series_are_found_though_some_lack_a_level(repeats, lacking, seed):
     assert list(zip(repeat.tolist(), level.tolist(), strict=True)) == places
 
 
+def test_a_load_cell_that_reads_negative_shows_the_same_series():
+    values = np.tile(LEVELS, 3) + np.random.default_rng(1).uniform(-0.002, 0.002, 3 * len(LEVELS))
+    series, mirrored = place_in_series(values), place_in_series(-values)
+    assert series is not None
+    np.testing.assert_array_equal(mirrored, series)
+
+
 @given(drift=st.lists(st.floats(-0.02, 0.02), min_size=14, max_size=14), lacking=st.sampled_from([1, 2, 3, 4, 5, 6]))
 def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift, lacking):
     """By all ways there are: each value has its own level, in order of size."""

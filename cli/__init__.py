@@ -19,8 +19,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Colours are control characters, which the output escapes (help of Python 3.14, log outside of `logging_to_stderr`).
 os.environ.setdefault("NO_COLOR", "1")
 
-# Ctrl-C is their usual end, and nothing is left undone.
-_ENDED_BY_INTERRUPT = ("shearloop listen", "shearloop view", "shearloop emulate")
 # Commands of the daemon that are named, and not carried out, without the word `command`.
 _OF_COMMAND = (MOVING - COMMANDS.keys()) | {"tare"}
 EXIT_OK, EXIT_USAGE = 0, 2
@@ -119,13 +117,14 @@ def _run(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] in ([], ["help"]):
         arguments = [*arguments[1:2], "--help"]
-    program = "shearloop"
+    program, interrupt_is_end = "shearloop", False
     if (words := OTHER_SPELLINGS.get(arguments[0])) is not None:
         with contextlib.suppress(OSError):
             print(f"`shearloop {arguments[0]}` is `shearloop {' '.join(words)}`", file=sys.stderr)
         arguments = [*words, *arguments[1:]]
     try:
         name = _overview().parse_args(arguments[:1]).command
+        interrupt_is_end = COMMANDS[name].ended_by_interrupt
         program, module = f"shearloop {name}", command_module(name)
         parser = Parser(prog=program, description=COMMANDS[name].summary)
         module.configure(parser)
@@ -138,7 +137,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(f"{program}: {error}", file=sys.stderr)
         return EXIT_USAGE
     except KeyboardInterrupt as interrupt:
-        if program not in _ENDED_BY_INTERRUPT:
+        if not interrupt_is_end:
             # A closed terminal accepts no output.
             with contextlib.suppress(OSError):
                 print(f"{program}: interrupted before it was done", file=sys.stderr)

@@ -12,10 +12,14 @@ from typing import NamedTuple
 
 
 class Command(NamedTuple):
-    """A command's module in this package, and its summary for the overview."""
+    """A command's module in this package, and its summary for the overview.
+
+    `ended_by_interrupt`: Ctrl-C is its usual end, and nothing is left undone.
+    """
 
     module: str
     summary: str
+    ended_by_interrupt: bool = False
 
 
 # The commands of each group of the overview, in its order.
@@ -24,9 +28,9 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "demo": Command("demo", "run the whole rig, emulated, in closed loop"),
         "init": Command("init", "write a commented configuration and experiments to start from"),
         "run": Command("run", "run the daemon that a configuration describes"),
-        "view": Command("view", "show a running daemon as a page in the browser, with a stop button"),
+        "view": Command("view", "show a running daemon as a page in the browser, with a stop button", True),
         "command": Command("command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),
-        "listen": Command("listen", "print what a running daemon publishes"),
+        "listen": Command("listen", "print what a running daemon publishes", True),
     },
     "bring up": {
         "ports": Command("ports", "list the serial ports with their serial numbers"),
@@ -50,7 +54,7 @@ GROUPS: Mapping[str, Mapping[str, Command]] = {
         "reproduce": Command("reproduce", "compute the paper's numbers and figures from recorded slices"),
         "chart": Command("chart", "chart speed against accuracy, stability, and how much model is needed"),
         "skin": Command("skin", "compare the shear skin's models with its paper, and calibrate a skin"),
-        "emulate": Command("emulate", "emulate a device, byte for byte, on a port of its own"),
+        "emulate": Command("emulate", "emulate a device, byte for byte, on a port of its own", True),
     },
 }
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}

@@ -17,6 +17,7 @@ from shearloop.estimation import Calibration, Estimate, FrameSeries, Physics, Se
 from shearloop.estimation.bank_match import ElectrodeNumbering
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.fingertip_validator import channel_noise
+from shearloop.estimation.twists import LOADED_FRACTION
 from shearloop.studies.charts.chart_data import Split, fitted
 from shearloop.studies.slices.calibration import SliceCalibration
 from shearloop.studies.slices.reader import SliceReader
@@ -151,7 +152,6 @@ BROKEN_FRACTION = 0.2
 # Judged frames of a stream: enough for a twist and a half.
 _MAX_FRAMES = 180
 _DRAWS = 3
-_LOADED_FRACTION = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,7 +232,7 @@ def balanced(truth_nm: FloatArray) -> FloatArray:
 
     Most of a stream is free of load: an estimator that always says zero would look stable.
     """
-    loaded = np.abs(truth_nm) > _LOADED_FRACTION * np.nanmax(np.abs(truth_nm))
+    loaded = np.abs(truth_nm) > LOADED_FRACTION * np.nanmax(np.abs(truth_nm))
     free = np.flatnonzero(np.isfinite(truth_nm) & ~loaded)
     kept = free[np.linspace(0, len(free) - 1, min(len(free), int(loaded.sum()))).astype(int)] if len(free) else free
     return np.where(loaded | np.isin(np.arange(len(truth_nm)), kept), truth_nm, np.nan)

@@ -11,6 +11,7 @@ from shearloop.drivers.ur.messages import SAFETY_EMERGENCY_STOPS, SAFETY_MODES
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context
+from shearloop.tools.commission.limits import MODE_AFTER_S, RESTS_WITHIN_S
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.operator import NOTHING_TO_DO, Played
 from shearloop.tools.commission.report import judged
@@ -18,12 +19,9 @@ from shearloop.tools.commission.report import judged
 # The wrist turns back at this angle from the pose.
 _TURNS_ROUND_RAD: Final = 0.5 * LARGEST_RAD
 _STARTS_WITHIN_S: Final = 5.0
-_RESTS_WITHIN_S: Final = 5.0
 # The longest time until a stop is seen, and until the controller is connected again after a pulled cable.
 _SEEN_WITHIN_S: Final = 5.0
 _CONNECTED_WITHIN_S: Final = 20.0
-# The longest time until the safety mode that follows a stop.
-_MODE_AFTER_S: Final = 0.5
 # After this time without a sample the connection was interrupted; the wrist has stopped long before.
 INTERRUPTED_NS: Final = 500_000_000
 # The wrist turned at the stop if it had half of its speed within this time before; at each end of its way it stands.
@@ -82,7 +80,7 @@ def _found_since(context: Context, asked_ns: int, stopped: Callable[[Seen], bool
     before = observer.since(asked_ns, first.made_ns) if first is not None else []
     if first is None or not before:
         return None
-    return Found(before[-1], observer.rest_since(first.made_ns, context.settings.rest_rad_per_s, _RESTS_WITHIN_S))
+    return Found(before[-1], observer.rest_since(first.made_ns, context.settings.rest_rad_per_s, RESTS_WITHIN_S))
 
 
 def _emergency_stop(context: Context, asked_ns: int) -> Found | None:
@@ -100,7 +98,7 @@ def _outage(context: Context, asked_ns: int) -> Found | None:
     if gap is None:
         return None
     before, _ = gap
-    rest = observer.rest_since(before.made_ns, context.settings.rest_rad_per_s, _RESTS_WITHIN_S)
+    rest = observer.rest_since(before.made_ns, context.settings.rest_rad_per_s, RESTS_WITHIN_S)
     return Found(before, rest, whole=rest is not None and _is_whole(observer, before, rest))
 
 
@@ -177,7 +175,7 @@ def _stop(context: Context, layer: Layer, speed: float, which: str, then: str) -
         asked_ns = _swing(context, speed)
         context.operator.act(f"Now {layer.action} ({which}){'' if layer.after else then}", layer.played)
         found = layer.find(context, asked_ns)
-        context.observer.listen(_MODE_AFTER_S)
+        context.observer.listen(MODE_AFTER_S)
         mode = context.observer.latest().outputs.safety_mode
         if layer.after and mode in SAFETY_EMERGENCY_STOPS:
             context.operator.act(f"{layer.after}{then}", layer.played_after or NOTHING_TO_DO)

@@ -7,6 +7,10 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.patience import is_patient
 from shearloop.drivers.ur.settings import PROMISED_S, UrSettings
 
+# The longest time until the arm rests after a stop, and until the safety mode that follows it has come.
+RESTS_WITHIN_S: Final = 5.0
+MODE_AFTER_S: Final = 0.5
+
 
 @dataclass(frozen=True, slots=True)
 class TimeLimits:

@@ -14,6 +14,7 @@ from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S, LARGEST_RAD
 from shearloop.tools.commission.context import STOPS_NEEDED, Context
 from shearloop.tools.commission.hand_stops import mode_name, stops_by_hand
+from shearloop.tools.commission.limits import MODE_AFTER_S, RESTS_WITHIN_S
 from shearloop.tools.commission.mover import WATCHDOG_WORKER
 from shearloop.tools.commission.mover_process import CAUSES, WORKERS
 from shearloop.tools.commission.observer import Seen
@@ -29,9 +30,6 @@ _WATCHED_M_PER_S: Final = 0.02
 # The arm is at the pose within these.
 _AT_POSE_M: Final = 0.0005
 _AT_POSE_RAD: Final = 0.02
-_RESTS_WITHIN_S: Final = 5.0
-# A mode that follows a stop has come by then.
-_MODE_AFTER_S: Final = 0.5
 # Two samples of the controller, which may not be the first of their kind.
 _RESOLUTION_S: Final = 0.016
 _SAFE: Final = (SAFETY_NORMAL, SAFETY_REDUCED)
@@ -203,17 +201,17 @@ def _stop(context: Context, layer: str, motion: Motion) -> Stop:
     observer, mover = context.observer, context.mover
     motion.prepare()
     observer.forget()
-    context.comes_to_rest(_RESTS_WITHIN_S)
+    context.comes_to_rest(RESTS_WITHIN_S)
     asked_ns = motion.begin(layer)
-    cause = mover.event("cause", asked_ns, _RESTS_WITHIN_S)
+    cause = mover.event("cause", asked_ns, RESTS_WITHIN_S)
     if cause is None:
         raise UserError(f"the arm did not reach its speed {motion.at}: {mover.ended(asked_ns)}")
-    rest = observer.rest_since(cause["t_ns"], context.settings.rest_rad_per_s, _RESTS_WITHIN_S)
+    rest = observer.rest_since(cause["t_ns"], context.settings.rest_rad_per_s, RESTS_WITHIN_S)
     if rest is None:
         raise UserError(f"the arm did not come to rest after: {layer}. Look at the teach pendant")
     before = observer.since(asked_ns, cause["t_ns"])
     way = abs(motion.place(rest) - motion.place(before[-1])) if before else 0.0
-    observer.listen(_MODE_AFTER_S)
+    observer.listen(MODE_AFTER_S)
     mode = observer.latest().outputs.safety_mode
     mover.restart()
     return Stop(layer, (rest.made_ns - cause["t_ns"]) / 1e9, way, mode, mover.unlock())
@@ -266,7 +264,7 @@ def _watchdog_s(context: Context) -> float:
 
 
 def _program_end(context: Context, stopped_ns: int) -> Seen | None:
-    return context.observer.wait_for(lambda seen: not seen.plays, stopped_ns, _RESTS_WITHIN_S)
+    return context.observer.wait_for(lambda seen: not seen.plays, stopped_ns, RESTS_WITHIN_S)
 
 
 def _watchdog_at_rest(context: Context) -> Line:
@@ -297,15 +295,15 @@ def _watchdog_in_motion(context: Context) -> Line:
     times_s = []
     for _ in range(count):
         motion.prepare()
-        context.comes_to_rest(_RESTS_WITHIN_S)
+        context.comes_to_rest(RESTS_WITHIN_S)
         context.mover.restart(worker=WATCHDOG_WORKER)
         mover = context.ready()
         asked_ns = motion.begin("worker stopped")
-        cause = mover.event("cause", asked_ns, _RESTS_WITHIN_S)
+        cause = mover.event("cause", asked_ns, RESTS_WITHIN_S)
         if cause is None:
             raise UserError(f"the arm did not reach {_WATCHED_M_PER_S:g} m/s: {mover.ended(asked_ns)}")
         ended = _program_end(context, cause["t_ns"])
-        rest = context.observer.rest_since(cause["t_ns"], context.settings.rest_rad_per_s, _RESTS_WITHIN_S)
+        rest = context.observer.rest_since(cause["t_ns"], context.settings.rest_rad_per_s, RESTS_WITHIN_S)
         end_ns, rest_ns = ((seen.made_ns if seen is not None else math.inf) for seen in (ended, rest))
         times_s.append(((end_ns - cause["t_ns"]) / 1e9, (rest_ns - end_ns) / 1e9))
         mover.restart(worker=WORKER)

@@ -4,6 +4,7 @@ from contextlib import suppress
 from typing import Final
 
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
+from shearloop.daemon.running_rig import whose_daemon
 from shearloop.errors import UserError
 
 # A daemon on a busy computer answers within it.
@@ -17,10 +18,9 @@ def refuse_second_daemon(commands: str, page: str = "") -> None:
         reply = send_to_stop_socket(commands, {"command": "status"}, STATUS_S)
     if reply is None:
         return
-    running = reply.get("daemon", {})
     shown = f", its page is {page}" if page else ""
     raise UserError(
-        f"a daemon runs already at {commands}: process {running.get('process')} ({running.get('rig')}) in "
-        f"{running.get('folder')}{shown}; `shearloop command stop --connect {commands}` stops its experiment, and a "
+        f"a daemon runs already at {commands}: {whose_daemon(reply)}{shown}; "
+        f"`shearloop command stop --connect {commands}` stops its experiment, and a "
         "second time ends it. To run beside it, give `publish` and `commands` other addresses in your configuration"
     )

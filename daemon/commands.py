@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
+from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sensors import Sensors
 from shearloop.daemon.supervisor import HealthReporter, error_text
 from shearloop.errors import UserError
@@ -68,6 +69,7 @@ class Commands:
     tare_refusal: TareRefusal
     # Receives each answered command, except questions.
     report: Callable[["Answered"], None] = lambda _: None
+    running_rig: RunningRig = field(default_factory=RunningRig)
     # Random for each process, because every process in a container has the same number.
     instance: str = field(default_factory=lambda: secrets.token_hex(8))
 
@@ -217,7 +219,7 @@ class Commands:
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()
-        daemon = {"process": os.getpid(), "instance": self.instance, "folder": os.getcwd(), "rig": self.health.rig}
+        daemon = {"process": os.getpid(), "instance": self.instance, "folder": os.getcwd(), **self.running_rig.facts()}
         if self.rig is None:
             return {"tasks": tasks, "daemon": daemon}
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}

@@ -4,6 +4,7 @@ import asyncio
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -12,7 +13,9 @@ from shearloop.cli.emulator_processes import check_emulators
 from shearloop.daemon.config import CurveConfig, SerialDevice, load_daemon_config
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
+from shearloop.daemon.running_rig import RunningRig
 from shearloop.tools import doctor, serial_ports
+from shearloop.tools.doctor import devices
 from shearloop.tools.doctor.boards import check_port
 from shearloop.tools.doctor.devices import check_task
 from shearloop.tools.doctor.findings import from_error
@@ -45,13 +48,44 @@ async def examined(path: Path, seconds: float) -> dict[str, doctor.Finding]:
     return {finding.subject: finding for finding in findings}
 
 
-async def test_a_daemon_of_another_configuration_at_the_same_address_is_named(rig_config, monkeypatch):
-    others = {"left": {}, "robot": {}, "loop": {}}
-    monkeypatch.setattr(doctor, "daemon_tasks", lambda _: others)
+def answering(monkeypatch, config, **changes):
+    """Let a daemon answer with this configuration's rig, and some facts of it changed."""
+    facts = {"process": 4711, "folder": "/home/ann", **RunningRig.of(config, HOST).facts(), **changes}
+    tasks = {name: {"alive": True} for name in ("right", "load_cell", "robot", "gripper")}
+    reply = {"ok": True, "tasks": tasks, "daemon": facts}
+    monkeypatch.setattr(devices, "send_to_stop_socket", lambda *_: reply)
+
+
+@pytest.mark.parametrize(
+    ("changes", "differs"),
+    [
+        ({"rig": "bench", "emulated": True}, "`name`, `emulated`"),
+        ({"devices": {"load_cell.device": "/tmp/load"}}, "`load_cell.device`, `robot`"),
+        ({"publish": "tcp://127.0.0.1:9"}, "`publish`"),
+    ],
+)
+async def test_another_rigs_daemon_is_named_and_the_devices_are_examined(rig_config, monkeypatch, changes, differs):
+    answering(monkeypatch, load_daemon_config(rig_config), **changes)
     found = await examined(rig_config, 0.1)
     assert found["daemon"].state == "trouble"
-    assert found["daemon"].found.endswith("it has no gripper and load_cell and right")
+    label = "EMULATED, " if "emulated" in changes else ""
+    assert f": {label}process 4711 ({changes.get('rig', 'config')}) in /home/ann" in found["daemon"].found
+    assert differs in found["daemon"].means
     assert "task robot" not in found
+    assert found["port of right"].state == "trouble"
+
+
+async def test_this_configurations_daemon_reports_on_its_devices(rig_config, monkeypatch):
+    answering(monkeypatch, load_daemon_config(rig_config))
+    found = await examined(rig_config, 0.1)
+    assert found["daemon"].state == found["task robot"].state == "good"
+    assert "port of right" not in found
+
+
+async def test_a_daemon_that_hangs_is_not_taken_for_none(rig_config, monkeypatch):
+    monkeypatch.setattr(devices, "send_to_stop_socket", Mock(side_effect=TimeoutError))
+    found = await examined(rig_config, 0.1)
+    assert "does not answer within 1 s" in found["daemon"].found
 
 
 @pytest.mark.real_time

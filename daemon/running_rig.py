@@ -1,0 +1,53 @@
+"""Which rig a daemon drives: what it says in its reply to `status`, and how that differs from a configuration."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Final, Self
+
+if TYPE_CHECKING:
+    # `shearloop command stop` imports little.
+    from shearloop.daemon.config import DaemonConfig
+
+EMULATED: Final = "EMULATED"
+# The facts of a rig, with their keys in the configuration.
+_KEYS: Final = {"rig": "name", "emulated": "emulated", "publish": "publish"}
+
+
+@dataclass(frozen=True, slots=True)
+class RunningRig:
+    """The rig of a daemon: its name, whether it is emulated, its address of messages, and its devices."""
+
+    rig: str = ""
+    emulated: bool = False
+    publish: str = ""
+    # The address of each device, by its key in the configuration.
+    devices: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, config: "DaemonConfig", robot_host: str | None) -> Self:
+        """Return the rig of a configuration, whose robot has this address."""
+        robot = {"robot": robot_host} if robot_host is not None else {}
+        return cls(config.name, config.emulated, config.publish, {**config.device_addresses, **robot})
+
+    def facts(self) -> dict[str, Any]:
+        """Return the rig for a reply to `status`."""
+        return asdict(self)
+
+    def differences(self, said: Mapping[str, Any]) -> Iterator[str]:
+        """Yield the keys of the configuration whose values in a daemon's reply to `status` are others."""
+        for fact, key in _KEYS.items():
+            if said.get(fact) != getattr(self, fact):
+                yield key
+        theirs = said.get("devices")
+        if not isinstance(theirs, Mapping):
+            theirs = {}
+        for key in sorted({*self.devices, *theirs}):
+            if self.devices.get(key) != theirs.get(key):
+                yield key
+
+
+def whose_daemon(reply: Mapping[str, Any]) -> str:
+    """Return whose daemon gave this reply to `status`: EMULATED, process, name of the rig, and folder."""
+    daemon = reply.get("daemon", {})
+    label = f"{EMULATED}, " if daemon.get("emulated") else ""
+    return f"{label}process {daemon.get('process')} ({daemon.get('rig')}) in {daemon.get('folder')}"

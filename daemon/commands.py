@@ -232,7 +232,7 @@ class Commands:
         """Stop a motion or the beginning of one, else the daemon; return what was stopped."""
         # An unknown argument may be a misspelt `spare_daemon`.
         spare_daemon = bool(request.get("spare_daemon") or request.keys() - {"command", "by", "spare_daemon"})
-        held = self.rig.control_loop.tool.may_still_hold if self.rig is not None else None
+        held = self.rig.control_loop.tool.held_or_unknown if self.rig is not None else None
         stopped = None
         if self.rig is not None:
             # If the gripper may hold something, a stop keeps the daemon, and the next start waits.

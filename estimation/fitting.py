@@ -285,7 +285,7 @@ def _replay(
     """Return the frames that an estimate would be made of, processed as in a session; None without any."""
     estimator, rows, grip = calibration.estimator, [], 0
     for recording, series in enumerate(recordings):
-        session = Session(calibration, matcher=matcher)
+        session = Session(calibration, matcher=matcher, period_s=series.period_s)
         grip, before = grip + 1, GripState.NONE
         truths = zip(series.torque_at_frames(), series.diameter_mm, strict=True)
         for i, (frame, truth) in enumerate(zip(series.frames(), truths, strict=True)):

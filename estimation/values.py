@@ -39,7 +39,8 @@ class FrameSeries:
     gripper's width, if there was a gripper. Diameters are not fitted to gripper_mm. first_frame is the first frame's
     number in the whole recording. load_doubt says why the torque's times may be wrong. left_out names frames and
     torques that were left out, with their number. emulated says that every device was emulated. fingers_moved (n, m)
-    says during which frames the gripper's fingers opened or closed; it is None if that is not known.
+    says during which frames the gripper's fingers opened or closed; it is None if that is not known. period_s is the
+    frame period of the daemon's configuration, infinite without one.
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 
@@ -56,6 +57,7 @@ class FrameSeries:
     left_out: tuple[str, ...] = ()
     emulated: bool = False
     fingers_moved: BoolArray | None = None
+    period_s: float = np.inf
 
     def __post_init__(self) -> None:
         """Check shapes and times."""

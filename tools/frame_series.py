@@ -79,6 +79,7 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
         left_out=(*recording.left_out, *unpaired),
         emulated=recording.emulated,
         fingers_moved=np.stack(moved, axis=1),
+        period_s=recording.periods_s.get(wanted[0], np.inf),
     )
 
 

@@ -96,3 +96,5 @@ def test_the_period_of_a_recorded_daemon_counts_and_not_that_of_boards_that_lose
     recording = recording_of(**sides)
     recording = replace(recording, periods_s={"right": PERIOD_NS / 1e9})
     assert len(series_of(recording).t_s) == 0
+    assert series_of(recording, ("left",)).period_s == np.inf
+    assert series_of(recording, ("right",)).period_s == PERIOD_NS / 1e9

@@ -1,5 +1,6 @@
 """The frames, torques and tools of a recording as arrays, to fit or judge an estimator."""
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -178,9 +179,15 @@ def read_recording(path: str | Path) -> Recording:
 
 
 def _configured_periods_s(configuration: bytes | None) -> dict[str, float]:
-    """Return the frame period of each fingertip by an attached configuration, none without one."""
-    fingertips = from_json(configuration).get("fingertips", {}) if configuration is not None else {}
-    return {side: float(own["frame_period_s"]) for side, own in fingertips.items()}
+    """Return the frame period of each fingertip by an attached configuration, where it has one."""
+    found: dict[str, float] = {}
+    content = from_json(configuration) if configuration is not None else {}
+    fingertips = content.get("fingertips") if isinstance(content, dict) else None
+    for side, own in fingertips.items() if isinstance(fingertips, dict) else ():
+        period_s = own.get("frame_period_s") if isinstance(own, dict) else None
+        if isinstance(period_s, int | float) and 0.0 < period_s < math.inf:
+            found[side] = float(period_s)
+    return found
 
 
 def _side_frames(rows: list[_Row], moved: Collection[int]) -> SideFrames:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, with_connection
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.callers import caller
+from shearloop.daemon.running_rig import EMULATED, HEADING
 
 if TYPE_CHECKING:
     from shearloop.daemon.messaging.keys import ClientKeys
@@ -27,6 +28,8 @@ DAEMON_COMMANDS = {
 }
 # `stop` is never refused, and the others change nothing.
 _ACTS_ON_NOTHING_SHOWN = ("stop", "status", "experiments")
+# Their replies are shown as tables.
+_TABLES = ("status", "experiments")
 
 EPILOG = """
 examples:
@@ -125,16 +128,21 @@ def _acknowledged(loop: Mapping[str, Any]) -> dict[str, int]:
 def _told(args: argparse.Namespace, reply: dict[str, Any]) -> int:
     """Print a reply; return the exit status."""
     accepted = bool(reply.pop("ok", False))
+    label = f"{EMULATED}: " if reply.get("emulated") else ""
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
     elif accepted:
-        print(with_connection("\n".join(_lines(args.name, reply)), args, addresses.COMMAND_ADDRESS))
+        shown = {key: value for key, value in reply.items() if key != "emulated"}
+        lines = _lines(args.name, shown)
+        # A table keeps its columns.
+        lines = [HEADING, *lines] if label and args.name in _TABLES else [f"{label}{lines[0]}", *lines[1:]]
+        print(with_connection("\n".join(lines), args, addresses.COMMAND_ADDRESS))
     else:
         reason = with_connection(str(reply.get("reason")), args, addresses.COMMAND_ADDRESS)
         if args.experiment is not None and not (addresses.needs_keys(args.connect) or args.experiment.exists()):
             # The daemon does not say it: it may see more than this user.
             reason = f"there is no file {args.experiment} on this computer; {reason}"
-        print(f"shearloop command: {args.name} was refused: {reason}", file=sys.stderr)
+        print(f"shearloop command: {label}{args.name} was refused: {reason}", file=sys.stderr)
         if reply.get("invalid") and args.experiment is not None:
             for line in mistakes_of(args.experiment.resolve()).splitlines():
                 # The reason has the first one already.

@@ -76,7 +76,16 @@ class Commands:
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
         asking = {STATUS: self._status, EXPERIMENTS: self._experiments}
-        return asking | {name: partial(self._reported, name, handler) for name, handler in self._acting().items()}
+        acting = {name: partial(self._reported, name, handler) for name, handler in self._acting().items()}
+        return {name: partial(self._labelled, handler) for name, handler in (asking | acting).items()}
+
+    async def _labelled(self, handler: Handler, request: Request) -> Reply:
+        """Carry out a command; of an emulated rig, reply and refusal say so."""
+        label = {"emulated": True} if self.running_rig.emulated else {}
+        try:
+            return {**await handler(request), **label}
+        except CommandRefusedError as error:
+            raise CommandRefusedError(str(error), **{**error.facts, **label}) from error
 
     def _acting(self) -> Mapping[str, Handler]:
         return {

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
 
 EMULATED: Final = "EMULATED"
+HEADING: Final = f"{EMULATED}: every device of this rig is emulated."
 # The facts of a rig, with their keys in the configuration.
 _KEYS: Final = {"rig": "name", "emulated": "emulated", "publish": "publish"}
 

@@ -16,7 +16,7 @@ from shearloop.bank.errors import BankError
 from shearloop.daemon.commissioning import commissioning_of
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
 from shearloop.daemon.rig import configured_settings
-from shearloop.daemon.running_rig import whose_daemon
+from shearloop.daemon.running_rig import EMULATED, whose_daemon
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import missing_library
 from shearloop.errors import UserError
@@ -80,6 +80,8 @@ def examine(
         yield from_file("configuration", str(error), "the daemon does not start")
         return
     yield good("configuration", f"{config_path} is in order")
+    if config.emulated:
+        yield good(EMULATED, "every device of this configuration is emulated: nothing here is said of real ones")
     yield check_disk(Path() if config.recording is None else config.recording.folder)
     yield from check_files(config, config_path, check_emulators, own)
     if config.robot is not None and not config.emulated:

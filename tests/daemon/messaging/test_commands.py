@@ -21,6 +21,7 @@ from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefus
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.daemon.running_rig import RunningRig
 from shearloop.errors import UserError
 from tests.running import running
 
@@ -255,6 +256,21 @@ async def test_an_argument_that_a_command_does_not_have_moves_nothing(name, requ
     )
     with pytest.raises(CommandRefusedError, match=re.escape(why)):
         await commands.handlers()[name]({"command": name, "by": "ann", **request_})
+
+
+@pytest.mark.parametrize("emulated", [False, True])
+async def test_replies_and_refusals_of_an_emulated_rig_say_so(emulated):
+    health, ending = SimpleNamespace(tasks=dict), asyncio.Event()
+    rig = RunningRig("bench", emulated)
+    sensors = SimpleNamespace(tareable={})
+    handlers = Commands(None, sensors, None, health, ending, lambda **_: None, running_rig=rig).handlers()
+    for name in (STATUS, STOP):
+        assert (await handlers[name]({})).get("emulated", False) is emulated
+    assert (await handlers[STATUS]({}))["daemon"]["emulated"] is emulated
+    for name in ("start", "tare", "release", EXPERIMENTS):
+        with pytest.raises(CommandRefusedError) as refused:
+            await handlers[name]({})
+        assert refused.value.facts.get("emulated", False) is emulated
 
 
 async def test_tare_is_refused_during_an_experiment():

@@ -1,6 +1,7 @@
 """`shearloop doctor` and `ports`: every finding says what was found, what it means, and the next step."""
 
 import asyncio
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -136,6 +137,15 @@ def test_doctor_stops_at_an_invalid_configuration(tmp_path, ran, result_of, mist
     assert "the configuration cannot be read: No such file" in mistake("doctor", tmp_path / "no.yaml")
     assert "the mesh cannot be read: No such file" in mistake("doctor", path, "--geometry", tmp_path / "no.npz")
     assert main(["doctor", "--seconds", "nan"]) == 2
+
+
+@pytest.mark.parametrize("emulated", [False, True])
+def test_doctor_says_that_the_rig_is_emulated(config, emulated, ran):
+    path = config(emulated=emulated, load_cell={"device": {"path": "load"}})
+    told = ran("doctor", path, "--seconds", "0.1", status=1).out
+    assert ("EMULATED" in told) is emulated
+    found = json.loads(ran("doctor", path, "--seconds", "0.1", "--json", status=1).out)
+    assert {finding["emulated"] for finding in found} == {emulated}
 
 
 def test_the_clock_is_judged_by_its_year_and_its_synchronisation():

@@ -32,10 +32,11 @@ from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import LearnedFrames
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.ridge import CensoredRidge, sign_of_loads
+from shearloop.estimation.series import FrameSeries, check_finite, distinct
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.twists import LOADED_FRACTION, first_twists, loaded_log_gain
-from shearloop.estimation.values import FrameSeries, GripState, Measured, check_finite, distinct
+from shearloop.estimation.values import GripState, Measured
 from shearloop.words import counted
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.

@@ -9,7 +9,8 @@ import pytest
 
 from shearloop.errors import UserError
 from shearloop.estimation.grips import find_grips
-from shearloop.estimation.values import Estimate, FrameSeries
+from shearloop.estimation.series import FrameSeries
+from shearloop.estimation.values import Estimate
 from shearloop.studies.slices.evaluate import no_better_than_place
 from shearloop.studies.slices.leave_out import SliceRecipe, find_levels, plan_levels
 from shearloop.studies.slices.series import SliceSeries

@@ -1,6 +1,6 @@
-"""Which rig a daemon drives: what it says in its reply to `status`, and how that differs from a configuration."""
+"""Which rig a daemon drives, as it says in its reply to `status`."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -10,8 +10,6 @@ if TYPE_CHECKING:
 
 EMULATED: Final = "EMULATED"
 HEADING: Final = f"{EMULATED}: every device of this rig is emulated."
-# The facts of a rig, with their keys in the configuration.
-_KEYS: Final = {"rig": "name", "emulated": "emulated", "publish": "publish"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,18 +31,6 @@ class RunningRig:
     def facts(self) -> dict[str, Any]:
         """Return the rig for a reply to `status`."""
         return asdict(self)
-
-    def differences(self, said: Mapping[str, Any]) -> Iterator[str]:
-        """Yield the keys of the configuration whose values in a daemon's reply to `status` are others."""
-        for fact, key in _KEYS.items():
-            if said.get(fact) != getattr(self, fact):
-                yield key
-        theirs = said.get("devices")
-        if not isinstance(theirs, Mapping):
-            theirs = {}
-        for key in sorted({*self.devices, *theirs}):
-            if self.devices.get(key) != theirs.get(key):
-                yield key
 
 
 def whose_daemon(reply: Mapping[str, Any]) -> str:

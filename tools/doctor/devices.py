@@ -40,6 +40,8 @@ from shearloop.tools.task_row import task_row
 
 ROBOT_TIMEOUT_S = 2.0
 DAEMON_TIMEOUT_S = 1.0
+# What a daemon's rig is compared by, beside its devices, with the keys in the configuration.
+_COMPARED = {"rig": "name", "emulated": "emulated", "publish": "publish"}
 
 
 async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
@@ -173,7 +175,11 @@ def another_rig(config: DaemonConfig, reply: Mapping[str, Any]) -> str:
         # The mistakes in the settings are among the findings on files.
         with contextlib.suppress(DriverError):
             host = read_settings(config.robot).host
-    return ", ".join(f"`{key}`" for key in RunningRig.of(config, host).differences(reply.get("daemon", {})))
+    own, theirs = RunningRig.of(config, host).facts(), dict(reply.get("daemon", {}))
+    keys = [key for fact, key in _COMPARED.items() if own[fact] != theirs.get(fact)]
+    devices, others = own["devices"], theirs.get("devices") or {}
+    keys += [key for key in sorted({*devices, *others}) if devices.get(key) != others.get(key)]
+    return ", ".join(f"`{key}`" for key in keys)
 
 
 def listen_for_frames(address: str, seconds: float) -> dict[str, list[Mapping[str, Any]]]:

@@ -11,13 +11,12 @@ from typing import TypeAlias
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
+from shearloop.daemon.control.known_tool import TORQUE_TOLERANCE
 from shearloop.daemon.control.step_demands import demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
 
 # An angle counts as reached within this; the wrist's resolution is ten times finer.
 ANGLE_TOLERANCE_RAD = 0.002
-# A torque counts as reached within this fraction of the set point: the closed loop's accuracy.
-TORQUE_TOLERANCE = 0.10
 
 
 @dataclass(frozen=True, slots=True)

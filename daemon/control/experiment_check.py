@@ -1,15 +1,12 @@
-"""Checks of an experiment: the steps that turn the tool, and the steps that limits or devices do not allow. No I/O."""
+"""Checks of an experiment: the steps that limits, devices or the steps before do not allow. No I/O."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from itertools import pairwise
-from typing import NamedTuple
 
 from shearloop.daemon.commissioning import Commissioning, MotionCap
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_schema import (
-    SIGNS,
     AdaptStep,
     ApproachStep,
     Direction,
@@ -29,177 +26,13 @@ from shearloop.daemon.control.experiment_schema import (
     direction_of,
     outline,
 )
-from shearloop.daemon.control.step_demands import demand, wrist_after
+from shearloop.daemon.control.step_demands import demand
 from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
 # Numbers of a file may differ from a cap by rounding.
 _ROUNDING = 1e-9
-
-
-class Turn(NamedTuple):
-    """What a step turns: the direction of its first turn, and of its last one; None for none, or unknown.
-
-    `loads` is the direction of the torque or the angle that it leaves, None where that is as before. `low_rad` and
-    `high_rad` bound the angle since the grip at the end of the step, and during an identification; infinite where it
-    is unknown. `turns_tool`: it turns a tool that is held, or may be. `by_angle`: it does so by an angle, with a torque
-    that is not known before. `way_unknown`: a tool may be held, and is turned to an angle of the wrist joint from one
-    that is not known before.
-    """
-
-    begins: Direction | None
-    leaves: Direction | None
-    loads: Direction | None
-    low_rad: float
-    high_rad: float
-    turns_tool: bool
-    by_angle: bool
-    way_unknown: bool
-
-
-class _Bounds(NamedTuple):
-    """The least and the largest value that an angle or a torque of the tool may have; counterclockwise is positive."""
-
-    low: float
-    high: float
-
-    def way_to(self, value: float) -> Direction | None:
-        """Return the direction of the turn to another value; None where nothing turns, or the direction is unknown."""
-        if self.low < value < self.high:
-            return None
-        return direction_of((value - self.low) + (value - self.high))
-
-    def turned(self, direction: Direction | None) -> "_Bounds":
-        """Return the bounds after a turn of unknown extent: a turn raises or lowers angle and torque alike."""
-        match direction:
-            case "clockwise":
-                return _Bounds(-math.inf, self.high)
-            case "counterclockwise":
-                return _Bounds(self.low, math.inf)
-        return _UNKNOWN
-
-
-_UNTURNED, _UNKNOWN = _Bounds(0.0, 0.0), _Bounds(-math.inf, math.inf)
-
-
-def turns(file: ExperimentFile) -> Iterator[Turn]:
-    """Yield what each step turns."""
-    angle_rad = torque_nm = _UNTURNED
-    # Whether a tool may be held, by a clamp or by the fingers. A `grip` then closes tighter, and the angle goes on.
-    held = True
-    # The angle of the wrist joint.
-    wrist_rad: float | None = None
-    for step in file.steps:
-        begins: Direction | None = None
-        leaves: Direction | None = None
-        loads: Direction | None = None
-        around_rad = 0.0
-        target_rad = _wrist_target(step) if held else None
-        way_unknown = target_rad is not None and wrist_rad is None
-        to_target = None if target_rad is None or wrist_rad is None else direction_of(target_rad - wrist_rad)
-        match step:
-            case GripStep() if held:
-                pass
-            case GripStep() | ReleaseStep():
-                angle_rad = torque_nm = _UNTURNED
-            case TightenStep(direction=direction):
-                begins = leaves = loads = direction
-                sign = SIGNS[direction]
-                turned_rad = sign * step.until_angle_rad
-                angle_rad = _Bounds(angle_rad.low + min(0.0, turned_rad), angle_rad.high + max(0.0, turned_rad))
-                # As it is meant to end.
-                torque_nm = _Bounds(sign * step.until_torque_nm, sign * step.until_torque_nm)
-            case HoldTorqueStep(signed_torque_nm=asked_nm):
-                begins = leaves = torque_nm.way_to(asked_nm)
-                loads = direction_of(asked_nm)
-                if torque_nm != (asked_nm, asked_nm):
-                    angle_rad = angle_rad.turned(begins)
-                torque_nm = _Bounds(asked_nm, asked_nm)
-            case TwistStep(absolute=False, angles_rad=angles_rad):
-                begins = angle_rad.way_to(angles_rad[0])
-                if not step.return_to_start:
-                    leaves = _last_way(angles_rad) or begins
-                    loads = direction_of(angles_rad[-1])
-                    if angle_rad != (angles_rad[-1], angles_rad[-1]):
-                        torque_nm = torque_nm.turned(begins if len(angles_rad) == 1 else None)
-                    angle_rad = _Bounds(angles_rad[-1], angles_rad[-1])
-            case TwistStep(return_to_start=True):
-                begins = to_target
-            case TwistStep(angles_rad=angles_rad):
-                begins, leaves = to_target, _last_way(angles_rad) or to_target
-                angle_rad = torque_nm = _UNKNOWN
-            case TurnToStep():
-                begins = leaves = to_target
-                angle_rad = torque_nm = _UNKNOWN
-            case IdentifyStep(amplitude_rad=around_rad):
-                pass
-        turns_tool = isinstance(step, TwistingStep) or target_rad is not None
-        by_angle = isinstance(step, TwistStep | IdentifyStep) or target_rad is not None
-        low_rad, high_rad = angle_rad.low - around_rad, angle_rad.high + around_rad
-        yield Turn(begins, leaves, loads, low_rad, high_rad, turns_tool, by_angle, way_unknown)
-        held = _may_hold_after(step, held=held)
-        wrist_rad = wrist_after(step, wrist_rad)
-
-
-def _may_hold_after(step: Step, *, held: bool) -> bool:
-    """Return whether a tool may be held after a step."""
-    if isinstance(step, GripStep | TwistingStep):
-        return True
-    return held and not isinstance(step, ReleaseStep)
-
-
-def _wrist_target(step: Step) -> float | None:
-    """Return the first angle of the wrist joint that a step turns to, None where its angles are not the joint's."""
-    match step:
-        case TurnToStep(angle_rad=angle_rad):
-            return angle_rad
-        case TwistStep(absolute=True, angles_rad=angles_rad):
-            return angles_rad[0]
-    return None
-
-
-def _last_way(angles_rad: Sequence[float]) -> Direction | None:
-    """Return the direction of the last turn from angle to angle; None where all are one."""
-    ways = [direction_of(later - earlier) for earlier, later in pairwise(angles_rad)]
-    return next((way for way in reversed(ways) if way is not None), None)
-
-
-class Reversal(NamedTuple):
-    """A step that turns a held tool back: the numbers, from 1, of it and of the step before, and both directions."""
-
-    number: int
-    direction: Direction
-    before: int
-    direction_before: Direction
-
-    def sentence(self, file: ExperimentFile) -> str:
-        """Return what turns back what."""
-        step, before = file.steps[self.number - 1], file.steps[self.before - 1]
-        return (
-            f"reversal: {step.do} turns {self.direction}, against step {self.before} "
-            f"({before.do}), which turned {self.direction_before}"
-        )
-
-
-def reversals(file: ExperimentFile) -> Iterator[Reversal]:
-    """Yield each step that turns the tool back in its grip: against the last turn, or to the other side.
-
-    With torques of 0.1, 0 and -0.1 N·m the second and the third step do.
-    """
-    # The last turn, and the last one that loaded the tool further.
-    turned: tuple[int, Direction] | None = None
-    loaded: tuple[int, Direction] | None = None
-    for number, (step, turn) in enumerate(zip(file.steps, turns(file), strict=True), 1):
-        if isinstance(step, ReleaseStep):
-            turned = loaded = None
-        if turn.begins is not None and turned is not None and turn.begins != turned[1]:
-            yield Reversal(number, turn.begins, *turned)
-        elif turn.begins is not None and loaded is not None and turn.begins == turn.loads != loaded[1]:
-            yield Reversal(number, turn.begins, *loaded)
-        if turn.leaves is not None:
-            turned = number, turn.leaves
-            loaded = turned if turn.leaves == turn.loads else loaded
 
 
 def too_noisy(source: str, noise_nm: float, limit_nm: float) -> str:

@@ -8,12 +8,11 @@ from shearloop.daemon.control.experiment_check import not_measured, too_noisy
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, TareStep
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
+from shearloop.daemon.control.known_tool import UNTURNED_RAD, KnownTool, known_at_start
 from shearloop.daemon.control.safety import SafetyMonitor
 from shearloop.daemon.control.step_motions import first_gripper_step, first_motion_before_grip, first_turn_before_tare
 from shearloop.daemon.torques import CONFIRM_TARE, TorqueSource, loaded_sentence
 
-# A clamped tool that was turned by less is back at the angle of its zero.
-UNTURNED_RAD = 0.02
 # The way out for a clamped tool, also without a known zero.
 CLAMPED_CURE = (
     "turn it back (a step `turn_to` needs no zero; if a limit stops it, at the pendant), or loosen its clamp; once "
@@ -182,6 +181,10 @@ class OperatorView:
             return ""
         angle = f" The grip is not known ({unknown}): its angle counts from the start." if unknown else ""
         return f" At present {held}.{angle}"
+
+    def known_at_start(self) -> KnownTool:
+        """Return what is known of the tool's angle and torque at a start."""
+        return known_at_start(loaded=self.tool.may_be_loaded(), twisted_rad=self.tool.twisted_rad)
 
     def _clamped_turn(self) -> str:
         """Return how far a clamped tool is turned, as a sentence; empty if no angle counts."""

@@ -4,13 +4,14 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 from shearloop.daemon.control import experiment_schema as steps
-from shearloop.daemon.control.experiment_check import Turn, reversals, turns
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
+from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool
 from shearloop.daemon.control.step_demands import Demand, demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare, opens_to
+from shearloop.daemon.control.turns import Turn, reversals, turns
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
@@ -24,8 +25,8 @@ class StepPlan:
     """One step: its action in words, its largest values, and its limits, reversals and refusals.
 
     `torque_nm` is None if the step turns the tool by an angle, because its torque is not known before. `reverses` says
-    whether the step turns a held tool against the previous turn, `turns_back` whether it turns both ways, `way_unknown`
-    whether it may turn a held tool in a direction that is not known before.
+    whether the step turns a held tool against the previous turn, `may_reverse` whether it may do so, `turns_back`
+    whether it turns both ways, `way_unknown` whether it turns a tool in a direction that is not known before.
     """
 
     number: int
@@ -38,6 +39,7 @@ class StepPlan:
     force_n: float = 0.0
     timeout_s: float | None = None
     reverses: bool = False
+    may_reverse: bool = False
     turns_back: bool = False
     way_unknown: bool = False
     notes: tuple[str, ...] = ()
@@ -53,7 +55,7 @@ class StepPlan:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """An experiment's steps in order, its largest values, and its unknown values."""
+    """An experiment's steps in order, its largest values, and what it assumes or does not know."""
 
     name: str
     torque_source: str
@@ -61,6 +63,7 @@ class Plan:
     limit_rad: float
     steps: tuple[StepPlan, ...]
     unknown: str = ""
+    assumed: str = ""
 
     @property
     def duration_s(self) -> float:
@@ -111,15 +114,23 @@ class Plan:
             f"{self.force_n:g} N; its limits stop it at {self.limit_nm:g} N·m and {_angle(self.limit_rad)} from "
             "the grip"
         )
-        turned_back = sum(step.reverses for step in self.steps)
-        yield f"  {turned_back or 'no'} reversal{'s' if turned_back != 1 else ''} of a held tool between steps"
+        yield f"  {self._reversals()}"
         if either_way := _listed(step for step in self.steps if step.way_unknown):
             yield f"  turning a held tool in a direction that is not known before: step {either_way}"
         if both_ways := _listed(step for step in self.steps if step.turns_back):
             yield f"  turning back within themselves: step {both_ways}"
         yield "  clockwise and counterclockwise are for an eye that faces the gripper"
-        if self.unknown:
-            yield f"  {self.unknown}"
+        for sentence in (self.assumed, self.unknown):
+            if sentence:
+                yield f"  {sentence}"
+
+    def _reversals(self) -> str:
+        """Return how many steps turn a held tool back, and which ones may."""
+        count = sum(step.reverses for step in self.steps)
+        possible = _listed(step for step in self.steps if step.may_reverse)
+        none = "no certain" if possible else "no"
+        certain = f"{count or none} reversal{'s' if count != 1 else ''} of a held tool between steps"
+        return f"{certain}; it is not known whether these turn it back: step {possible}" if possible else certain
 
 
 def _listed(some: Iterable[StepPlan]) -> str:
@@ -140,66 +151,123 @@ def plan_of(
     gripper: GripperModel | None = None,
     refused: Mapping[int, tuple[str, ...]] | None = None,
     warm_up_s: float = 0.0,
+    start: KnownTool | None = None,
 ) -> Plan:
     """Return the plan of an experiment within the limits of the robot and the gripper, where they are known.
 
     `refused` has the reasons against each step by its index. `warm_up_s` passes after a grip or a tare until the first
-    torque.
+    torque. `start` is what is known of the tool at the start; None: it is assumed to be neither turned nor loaded.
     """
     speeds = speeds_of(robot)
-    back = {one.number: one.sentence(file) for one in reversals(file)}
+    known = AT_REST if start is None else start
+    ways = _ways_of(file, known)
     planned: list[StepPlan] = []
     # The latest grip or tare, with its number: the next step that turns a tool waits for the first torques after it.
     awaited = ""
     opened = False
     untared = first_turn_before_tare(file) if file.torque_source in (LOAD_CELL, WRENCH) else None
-    expected = zip(file.steps, turns(file), demands(file.steps, speeds), strict=True)
+    expected = zip(file.steps, turns(file, known), demands(file.steps, speeds, known), strict=True)
     for number, (step, turn, needs) in enumerate(expected, 1):
         duration_s = needs.takes_s
-        notes = list(_notes(file, step, turn, robot))
+        notes = [*ways.notes(number, step, turn), *_notes(file, step, turn, robot)]
         if isinstance(step, steps.GripStep | steps.TareStep):
             awaited = f"step {number} ({step.do})"
         elif awaited and warm_up_s > 0 and turn.turns_tool:
             notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques after {awaited}")
             duration_s += warm_up_s
             awaited = ""
-        if turn.way_unknown:
-            notes.append("a tool may be held, and turns too: which way, and how far, depends on where wrist 3 stands")
         if needs.begins_anywhere:
             notes.append("how long it takes depends on where the arm stands, and is a guess here")
         if step.timeout_s is not None and needs.takes_s > step.timeout_s:
             notes.append(f"its timeout_s of {step.timeout_s:g} s may stop it before its end")
         if number == untared:
             notes.append("no `tare` comes before it: the start is refused unless a zero is known")
-        if number in back:
-            notes.insert(0, back[number])
         opened = opened or isinstance(step, steps.ReleaseStep)
         if gripper is not None and isinstance(step, steps.TareStep) and not opened:
             notes.append("it is refused unless the gripper knows that it holds nothing: put a `release` before it")
         planned.append(
             StepPlan(
-                number,
-                step.do,
-                _words(step, gripper),
-                duration_s,
-                turn.begins or "",
-                None if turn.by_angle else needs.torque_nm,
-                _largest_angle(step, needs),
-                step.force_n if isinstance(step, steps.GripStep) else 0.0,
-                step.timeout_s,
-                number in back,
-                _turns_back(step, turn.begins),
-                turn.way_unknown,
-                tuple(notes),
-                (refused or {}).get(number - 1, ()),
+                number=number,
+                do=step.do,
+                text=_words(step, turn, gripper),
+                duration_s=duration_s,
+                direction=turn.direction or "",
+                torque_nm=None if turn.by_angle else needs.torque_nm,
+                angle_rad=_largest_angle(step, needs),
+                force_n=step.force_n if isinstance(step, steps.GripStep) else 0.0,
+                timeout_s=step.timeout_s,
+                reverses=number in ways.back,
+                may_reverse=number in ways.possible,
+                turns_back=_turns_back(step, turn.direction),
+                way_unknown=turn.way_unknown,
+                notes=tuple(notes),
+                refused=(refused or {}).get(number - 1, ()),
             )
         )
     unknown = "" if robot is not None else "the robot's limits are not known: give `--config RIG` to check against them"
+    assumed = _assumed(file) if start is None else ""
     limits = file.limits
-    return Plan(file.name, file.torque_source, limits.torque_nm, limits.angle_rad, tuple(planned), unknown)
+    return Plan(file.name, file.torque_source, limits.torque_nm, limits.angle_rad, tuple(planned), unknown, assumed)
 
 
-def _words(step: Step, gripper: GripperModel | None) -> str:
+class _Ways(NamedTuple):
+    """The steps, by their numbers, that turn the tool back, that may, and whose direction is that after a `tighten`.
+
+    Such a direction is another one if the `tighten` ends at its angle.
+    """
+
+    back: Mapping[int, str]
+    possible: frozenset[int]
+    if_tightened: frozenset[int]
+
+    def notes(self, number: int, step: Step, turn: Turn) -> Iterator[str]:
+        """Yield what is to be said about a step's direction."""
+        if number in self.back:
+            yield self.back[number]
+        if turn.way_unknown:
+            yield _why_way_unknown(step)
+        elif number in self.possible:
+            yield "it may be a reversal: which way the tool turned last before it is not known"
+        if number in self.if_tightened:
+            yield "its direction may be the other one if the `tighten` before it ends at its angle, below its torque"
+
+
+def _ways_of(file: ExperimentFile, start: KnownTool) -> _Ways:
+    found = reversals(file, start)
+    assumed, certain = turns(file, start), turns(file, start, reaches=False)
+    differing = enumerate(map(_is_less_certain, assumed, certain), 1)
+    return _Ways(
+        {one.number: one.sentence(file) for one in found.known},
+        frozenset(found.possible),
+        frozenset(number for number, differs in differing if differs),
+    )
+
+
+def _is_less_certain(assumed: Turn, certain: Turn) -> bool:
+    """Return whether a direction that an assumption gives is not known without it."""
+    return assumed.direction is not None and certain.direction != assumed.direction
+
+
+def _why_way_unknown(step: Step) -> str:
+    match step:
+        case steps.TurnToStep() | steps.TwistStep(absolute=True):
+            return "a tool may be held, and turns too: which way, and how far, depends on where wrist 3 stands"
+        case steps.TwistStep():
+            return "which way it turns first is not known: the steps before it leave the tool at an unknown angle"
+    return "which way it turns is not known: the steps before it leave an unknown torque"
+
+
+def _assumed(file: ExperimentFile) -> str:
+    """Return what the directions assume of a tool that may be held at the start; empty if none depends on it."""
+    if any(map(_is_less_certain, turns(file), turns(file, NOTHING_KNOWN))):
+        return (
+            "the directions assume that a tool that is held at the start is neither turned nor loaded then; the plan "
+            "before a start counts with its angle"
+        )
+    return ""
+
+
+def _words(step: Step, turn: Turn, gripper: GripperModel | None) -> str:
     match step:
         case steps.ApproachStep(pose_m_rad=pose) if pose is not None:
             x, y, z = pose[:3]
@@ -222,7 +290,7 @@ def _words(step: Step, gripper: GripperModel | None) -> str:
         case steps.TurnToStep():
             return f"turns wrist 3 to {_angle(step.angle_rad)} at {step.speed_rad_per_s:g} rad/s"
         case steps.TwistStep():
-            return _twist(step)
+            return _twist(step, turn)
         case steps.HoldTorqueStep():
             way = steps.direction_of(step.signed_torque_nm) or "to rest"
             return f"brings the torque to {abs(step.torque_nm):g} N·m {way} and holds it for {step.hold_s:g} s"
@@ -233,15 +301,17 @@ def _words(step: Step, gripper: GripperModel | None) -> str:
             return f"stands still for {step.wait_s:g} s"
 
 
-def _twist(step: steps.TwistStep) -> str:
+def _twist(step: steps.TwistStep, turn: Turn) -> str:
     angles_rad = step.angles_rad
     count, low_rad, high_rad = len(angles_rad), min(angles_rad), max(angles_rad)
     places = _angle(angles_rad[0]) if count == 1 else f"{count} angles from {_angle(low_rad)} to {_angle(high_rad)}"
     since = "of wrist 3" if step.absolute else "from the grip"
-    way = "" if step.absolute else f", {' and '.join(_ways(angles_rad)) or 'not turned'}"
+    way = "in a direction that is not known" if turn.way_unknown else turn.direction
+    turns_once = count == step.repeats == 1 and not step.return_to_start
+    first = f", {'' if turns_once else 'first '}{way}" if way is not None else ""
     then = f"holds each for {step.hold_s:g} s" + (" and returns" if step.return_to_start else "")
     times = f", {step.repeats} times" if step.repeats > 1 else ""
-    return f"twists to {places} {since}{way}, {then}{times}, at {step.speed_rad_per_s:g} rad/s"
+    return f"twists to {places} {since}{first}, {then}{times}, at {step.speed_rad_per_s:g} rad/s"
 
 
 def _turns_back(step: Step, begins: steps.Direction | None) -> bool:
@@ -261,22 +331,17 @@ def _turns_back(step: Step, begins: steps.Direction | None) -> bool:
     return False
 
 
-def _ways(angles_rad: tuple[float, ...]) -> list[str]:
-    """Return the directions of angles, each once, in order."""
-    return list(dict.fromkeys(way for angle_rad in angles_rad if (way := steps.direction_of(angle_rad)) is not None))
-
-
 def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None) -> Iterator[str]:
     """Yield what a step's limits and the robot's change."""
     if isinstance(step, steps.GripStep) and file.tool_mm is not None and step.width_mm > file.tool_mm - FELT_MM:
         most_mm = max(0.0, file.tool_mm - FELT_MM)
         cure = f": make `width_mm` at most {most_mm:g}" if step.width_mm > most_mm else ""
         yield f"the gripper may not feel the tool of {file.tool_mm:g} mm{cure}"
-    if isinstance(step, steps.TwistingStep):
+    if turn.turns_tool:
         limits = file.limits_of(step)
         if step.limits is not None:
             yield f"its limits stop it at {limits.torque_nm:g} N·m and {_angle(limits.angle_rad)} from the grip"
-        reach_rad = max(-turn.low_rad, turn.high_rad)
+        reach_rad = max(-turn.reach_rad.low, turn.reach_rad.high)
         if math.isfinite(reach_rad) and reach_rad >= limits.angle_rad:
             asks = f"with the steps before it may be {_angle(reach_rad)} from the grip"
             yield f"{asks}: the limit stops it at {_angle(limits.angle_rad)}"

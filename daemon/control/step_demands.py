@@ -1,4 +1,4 @@
-"""What each step demands: its largest torque and angle, its times, and where the wrist is after it."""
+"""What each step demands: its largest torque and angle, and its times."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,6 +19,7 @@ from shearloop.daemon.control.experiment_schema import (
     TwistStep,
     WaitStep,
 )
+from shearloop.daemon.control.known_tool import AT_REST, KnownTool, known_after
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
 from shearloop.drivers.ur.poses import ONLY_TURNS_M, along_tool, turn_between
 
@@ -53,36 +54,21 @@ def _travel_rad(angles_rad: Sequence[float]) -> float:
 
 
 class Before(NamedTuple):
-    """What a step begins at: the torque, the wrist joint's angle, and the tool's pose; None for unknown ones."""
+    """What a step begins at: what is known of the tool, and the tool's pose; None for an unknown one."""
 
-    torque_nm: float = 0.0
-    wrist_rad: float | None = None
+    tool: KnownTool = AT_REST
     pose_m_rad: Sequence[float] | None = None
 
 
 NOTHING_BEFORE: Final = Before()
 
 
-def demands(planned: Iterable[Step], speeds: Speeds = AS_ASKED) -> Iterator[Demand]:
+def demands(planned: Iterable[Step], speeds: Speeds = AS_ASKED, start: KnownTool = AT_REST) -> Iterator[Demand]:
     """Yield the demand of each step after those before it."""
-    before = NOTHING_BEFORE
+    before = Before(start)
     for step in planned:
         yield demand(step, speeds, before)
-        before = Before(
-            _torque_after(step, before.torque_nm),
-            wrist_after(step, before.wrist_rad),
-            _pose_after(step, before.pose_m_rad),
-        )
-
-
-def _torque_after(step: Step, torque_nm: float) -> float:
-    """Return the torque after a step, from the one before; 0 where it is not known."""
-    match step:
-        case HoldTorqueStep():
-            return step.signed_torque_nm
-        case GripStep() | ReleaseStep() | TurnToStep() | TwistStep() | TightenStep() | IdentifyStep():
-            return 0.0
-    return torque_nm
+        before = Before(known_after(step, before.tool), _pose_after(step, before.pose_m_rad))
 
 
 def _pose_after(step: Step, pose_m_rad: Sequence[float] | None) -> Sequence[float] | None:
@@ -99,23 +85,6 @@ def _pose_after(step: Step, pose_m_rad: Sequence[float] | None) -> Sequence[floa
     return pose_m_rad
 
 
-def wrist_after(step: Step, wrist_rad: float | None) -> float | None:
-    """Return the angle of the wrist joint after a step, from the one before; None where it is not known."""
-    match step:
-        case TurnToStep(angle_rad=angle_rad):
-            return angle_rad
-        case TwistStep(return_to_start=True):
-            return wrist_rad
-        case TwistStep(absolute=True, angles_rad=angles_rad):
-            return angles_rad[-1]
-        case TwistStep() | TightenStep() | HoldTorqueStep() | IdentifyStep():
-            return None
-        case ApproachStep():
-            # Most straight lines turn wrist 3 as well.
-            return None
-    return wrist_rad
-
-
 def _line_s(step: ApproachStep, start: Sequence[float], end: Sequence[float], speeds: Speeds) -> float:
     """Return how long a straight move between two poses takes: the tool turns evenly, no faster than the wrist may."""
     speed = min(step.speed_m_per_s, speeds.linear_m_per_s)
@@ -130,7 +99,8 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
     """Return the demand of a step; unknown values, as in an outline, are 0."""
     match step:
         case HoldTorqueStep(torque_nm=torque_nm):
-            ramped_nm = abs(step.signed_torque_nm - before.torque_nm)
+            # An unknown torque counts as none.
+            ramped_nm = abs(step.signed_torque_nm - (before.tool.torque_nm.exact or 0.0))
             return Demand(abs(torque_nm), stands_s=step.hold_s, moves_s=ramped_nm / step.ramp_nm_per_s)
         case TightenStep(until_torque_nm=torque_nm, until_angle_rad=angle_rad):
             speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
@@ -139,21 +109,7 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
             # Two cycles at least; the first of their five rests is twice as long.
             return Demand(angle_rad=angle_rad, stands_s=6.0 * hold_s, moves_s=5.0)
         case TwistStep(angles_rad=angles_rad):
-            stands_s = step.hold_s * len(angles_rad) * step.repeats
-            reach = [abs(angle_rad) for angle_rad in angles_rad]
-            if step.absolute:
-                # How far an absolute angle is from the grip is known only there, unless the wrist was turned to one.
-                reach = [0.2 if before.wrist_rad is None else abs(one - before.wrist_rad) for one in angles_rad]
-            moves = step.repeats * len(angles_rad)
-            if step.return_to_start:
-                moves, travel_rad = 2 * moves, step.repeats * 2.0 * sum(reach)
-            else:
-                # Each round begins at the last angle of the one before, the first one at the grip.
-                between_rounds_rad = abs(angles_rad[0] - angles_rad[-1])
-                travel_rad = reach[0] + step.repeats * _travel_rad(angles_rad)
-                travel_rad += (step.repeats - 1) * between_rounds_rad
-            moves_s = travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s) + SETTLES_S * moves
-            return Demand(0.0, 0.0 if step.absolute else max(reach), stands_s, moves_s)
+            return _twist_demand(step, angles_rad, speeds, before.tool)
         case WaitStep(wait_s=wait_s):
             return Demand(stands_s=wait_s)
         case TareStep():
@@ -162,7 +118,8 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
             return Demand(moves_s=1.0 + abs(distance_m) / min(step.speed_m_per_s, speeds.linear_m_per_s))
         case TurnToStep(angle_rad=angle_rad):
             # Where the wrist is, is known only there.
-            travel_rad = 1.0 if before.wrist_rad is None else abs(angle_rad - before.wrist_rad)
+            wrist_rad = before.tool.wrist_rad.exact
+            travel_rad = 1.0 if wrist_rad is None else abs(angle_rad - wrist_rad)
             return Demand(moves_s=SETTLES_S + travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s))
         case ApproachStep(pose_m_rad=tuple() as pose) if before.pose_m_rad is not None:
             return Demand(moves_s=1.0 + _line_s(step, before.pose_m_rad, pose, speeds))
@@ -172,3 +129,25 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
             return Demand(moves_s=3.0)
         case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | TurnToStep() | WaitStep():
             return Demand()
+
+
+def _twist_demand(step: TwistStep, angles_rad: Sequence[float], speeds: Speeds, tool: KnownTool) -> Demand:
+    stands_s = step.hold_s * len(angles_rad) * step.repeats
+    if step.absolute:
+        # How far an absolute angle is from the grip is known only there, unless the wrist was turned to one.
+        start_rad = tool.wrist_rad.exact
+        reach = [0.2 if start_rad is None else abs(one - start_rad) for one in angles_rad]
+    else:
+        # An unknown angle counts as that of the grip.
+        start_rad = tool.angle_rad.exact
+        reach = [abs(one - (start_rad or 0.0)) for one in angles_rad]
+    moves = step.repeats * len(angles_rad)
+    if step.return_to_start:
+        moves, travel_rad = 2 * moves, step.repeats * 2.0 * sum(reach)
+    else:
+        # Each round begins at the last angle of the one before.
+        between_rounds_rad = abs(angles_rad[0] - angles_rad[-1])
+        travel_rad = reach[0] + step.repeats * _travel_rad(angles_rad)
+        travel_rad += (step.repeats - 1) * between_rounds_rad
+    moves_s = travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s) + SETTLES_S * moves
+    return Demand(0.0, 0.0 if step.absolute else max(map(abs, angles_rad)), stands_s, moves_s)

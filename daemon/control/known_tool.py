@@ -1,0 +1,284 @@
+"""What is known of a tool's angle and torque after each step of an experiment, before it runs.
+
+An angle or a torque is known exactly, within an interval, or not at all. Of the tool these facts are used, and no more:
+
+- A turn in one direction does not turn the torque to the other one. How much the torque rises is not known: the tool
+  springs with an unknown stiffness, slips, or breaks loose.
+- To raise a torque (counterclockwise is positive), the wrist turns counterclockwise; to lower it, clockwise.
+- While the wrist stands, the torque may fall towards 0. Under a held torque, the tool may creep on in its direction.
+- `identify` turns counterclockwise, ends where it began, and refuses a tool that slips.
+- A straight line may turn wrist 3, by which the angle from the grip counts.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Final, NamedTuple, TypeAlias
+
+from shearloop.daemon.control.experiment_schema import (
+    SIGNS,
+    AdaptStep,
+    ApproachStep,
+    Direction,
+    GripStep,
+    HoldTorqueStep,
+    IdentifyStep,
+    ReleaseStep,
+    Step,
+    TareStep,
+    TightenStep,
+    TurnToStep,
+    TwistingStep,
+    TwistStep,
+    WaitStep,
+    direction_of,
+)
+
+# A clamped tool that was turned by less is back at the angle of its zero.
+UNTURNED_RAD: Final = 0.02
+# A torque counts as reached within this fraction of the set point: the closed loop's accuracy.
+TORQUE_TOLERANCE: Final = 0.10
+# Smaller differences are of rounding.
+_ROUNDING: Final = 1e-9
+
+# The directions in which something may turn; None: it may not turn at all.
+Ways: TypeAlias = frozenset[Direction | None]
+STILL: Final[Ways] = frozenset({None})
+
+
+def only_way(ways: Ways) -> Direction | None:
+    """Return the one direction of a turn, if there is a turn; None if both are possible, or none is."""
+    directions = ways - STILL
+    return next(iter(directions)) if len(directions) == 1 else None
+
+
+def either_way(ways: Ways) -> bool:
+    """Return whether both directions are possible."""
+    return len(ways - STILL) > 1
+
+
+def way_from(start: float, end: float) -> Direction | None:
+    """Return the direction from an angle or a torque to another; None if they differ by rounding only."""
+    return None if abs(end - start) <= _ROUNDING else direction_of(end - start)
+
+
+class Interval(NamedTuple):
+    """The smallest and the largest value that an angle or a torque may have; counterclockwise is positive."""
+
+    low: float
+    high: float
+
+    @property
+    def exact(self) -> float | None:
+        """The value, or None where it is not known exactly."""
+        return self.low if self.low == self.high else None
+
+    def ways_to(self, value: float) -> Ways:
+        """Return in which directions another value may lie."""
+        ends = {way_from(self.low, value), way_from(self.high, value)}
+        return frozenset(ends | STILL) if len(ends) > 1 else frozenset(ends)
+
+    def plus(self, other: "Interval") -> "Interval":
+        """Return the sum of a value of each."""
+        return Interval(self.low + other.low, self.high + other.high)
+
+    def up_to(self, value: float) -> "Interval":
+        """Return the smallest interval that has these values and another one."""
+        return Interval(min(self.low, value), max(self.high, value))
+
+    def beyond(self, ways: Ways) -> "Interval":
+        """Return the values after changes of unknown extent in these directions."""
+        low = -math.inf if "clockwise" in ways else self.low
+        high = math.inf if "counterclockwise" in ways else self.high
+        return Interval(low, high)
+
+    def within(self, most: float) -> "Interval":
+        """Return the values that are at most `most` in magnitude; all such values if none of these is."""
+        low, high = max(self.low, -most), min(self.high, most)
+        return Interval(low, high) if low <= high else Interval(-most, most)
+
+
+def exactly(value: float) -> Interval:
+    """Return a value that is known exactly."""
+    return Interval(value, value)
+
+
+NONE: Final = exactly(0.0)
+UNKNOWN: Final = Interval(-math.inf, math.inf)
+
+
+class Held(Enum):
+    """Whether a tool is held, by the fingers or by a clamp."""
+
+    NO = "no"
+    MAYBE = "maybe"
+    YES = "yes"
+
+
+@dataclass(frozen=True, slots=True)
+class KnownTool:
+    """What is known between two steps; `origin_rad` is the wrist joint's angle at which the tool's angle is 0."""
+
+    angle_rad: Interval = NONE
+    torque_nm: Interval = NONE
+    wrist_rad: Interval = UNKNOWN
+    origin_rad: float | None = None
+    held: Held = Held.MAYBE
+
+    def turned_to(self, angle_rad: float) -> "KnownTool":
+        """Return what is known after a turn to an angle from the grip."""
+        ways = self.angle_rad.ways_to(angle_rad)
+        by_rad = Interval(angle_rad - self.angle_rad.high, angle_rad - self.angle_rad.low)
+        wrist_rad = self.wrist_rad.plus(by_rad)
+        return self._turned(exactly(angle_rad), wrist_rad, self._loaded(ways))
+
+    def wrist_turned_to(self, wrist_rad: float) -> "KnownTool":
+        """Return what is known after a turn to an angle of the wrist joint."""
+        ways = self.ways_of_wrist(wrist_rad)
+        by_rad = Interval(wrist_rad - self.wrist_rad.high, wrist_rad - self.wrist_rad.low)
+        origin_rad = self.origin_rad
+        angle_rad = self.angle_rad.plus(by_rad) if origin_rad is None else exactly(wrist_rad - origin_rad)
+        return self._turned(angle_rad, exactly(wrist_rad), self._loaded(ways))
+
+    def ways_of_wrist(self, wrist_rad: float) -> Ways:
+        """Return in which directions an angle of the wrist joint may lie."""
+        if self.origin_rad is not None:
+            return self.angle_rad.ways_to(wrist_rad - self.origin_rad)
+        return self.wrist_rad.ways_to(wrist_rad)
+
+    def returned(self, ways: Ways) -> "KnownTool":
+        """Return what is known after a turn in one of these directions, and back: slip may turn the torque back."""
+        other_ways: Ways = frozenset(_OPPOSITE[way] for way in ways if way is not None)
+        return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(other_ways))
+
+    def torque_brought_to(self, torque_nm: float) -> "KnownTool":
+        """Return what is known after a turn until the torque has a value, and while it was held."""
+        turns = self.torque_nm.ways_to(torque_nm)
+        creeps: Ways = frozenset({direction_of(torque_nm)})
+        return self._turned_beyond(turns | creeps, exactly(torque_nm))
+
+    def tightened(self, step: TightenStep, *, reaches: bool) -> "KnownTool":
+        """Return what is known after a `tighten`; `reaches`: it ends near its torque or beyond, not at its angle."""
+        sign, ways = SIGNS[step.direction], frozenset({step.direction})
+        until_nm = sign * (1.0 - TORQUE_TOLERANCE) * step.until_torque_nm
+        torque_nm = exactly(until_nm).beyond(ways) if reaches else self._loaded(ways)
+        by_rad = NONE.up_to(sign * step.until_angle_rad)
+        return self._turned(self.angle_rad.plus(by_rad), self.wrist_rad.plus(by_rad), torque_nm)
+
+    def gripped(self, step: GripStep) -> "KnownTool":
+        """Return what is known after the fingers have closed; they close tighter on a held tool: its angle goes on."""
+        held = Held.YES if step.expect_object else Held.MAYBE
+        anew = KnownTool(wrist_rad=self.wrist_rad, origin_rad=self.wrist_rad.exact, held=held)
+        if self.held is Held.NO:
+            return anew
+        # A sensor may read another torque in a tighter grip.
+        tighter = replace(self.rescaled(), held=held)
+        if self.held is Held.YES:
+            return replace(tighter, held=Held.YES)
+        angle_rad = self.angle_rad.up_to(0.0)
+        origin_rad = self.origin_rad if angle_rad == self.angle_rad == NONE else None
+        return replace(tighter, angle_rad=angle_rad, origin_rad=origin_rad)
+
+    def released(self) -> "KnownTool":
+        """Return what is known after the fingers have opened: the angle counts anew."""
+        return KnownTool(wrist_rad=self.wrist_rad, origin_rad=self.wrist_rad.exact, held=Held.NO)
+
+    def tared(self) -> "KnownTool":
+        """Return what is known after a tare, which is refused unless a tool is not held, or clamped and not turned."""
+        angle_rad = self.angle_rad if self.held is Held.NO else self.angle_rad.within(UNTURNED_RAD)
+        return replace(self, angle_rad=angle_rad, torque_nm=NONE)
+
+    def moved(self) -> "KnownTool":
+        """Return what is known after a straight line, which may turn wrist 3 and load a held tool."""
+        torque_nm = self.torque_nm if self.held is Held.NO else UNKNOWN
+        return replace(self, angle_rad=UNKNOWN, wrist_rad=UNKNOWN, torque_nm=torque_nm)
+
+    def relaxed(self) -> "KnownTool":
+        """Return what is known after a rest, in which the torque may fall towards 0."""
+        return replace(self, torque_nm=self.torque_nm.up_to(0.0))
+
+    def rescaled(self) -> "KnownTool":
+        """Return what is known after a change of the measured torque's scale: only its direction stays."""
+        directions = self.torque_nm.ways_to(0.0)
+        opposite: Ways = frozenset(_OPPOSITE[way] for way in directions if way is not None)
+        return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(opposite))
+
+    def _loaded(self, ways: Ways) -> Interval:
+        """Return the torque after a turn in one of these directions; a tool that breaks loose may lose all of it."""
+        return self.torque_nm.up_to(0.0).beyond(ways)
+
+    def _turned_beyond(self, ways: Ways, torque_nm: Interval) -> "KnownTool":
+        return self._turned(self.angle_rad.beyond(ways), self.wrist_rad.beyond(ways), torque_nm)
+
+    def _turned(self, angle_rad: Interval, wrist_rad: Interval, torque_nm: Interval) -> "KnownTool":
+        """Return what is known with another angle: the wrist joint's angle and the tool's differ by the origin."""
+        origin_rad = self.origin_rad
+        if origin_rad is not None:
+            wrist_rad = angle_rad.plus(exactly(origin_rad))
+        elif angle_rad.exact is not None and wrist_rad.exact is not None:
+            origin_rad = wrist_rad.exact - angle_rad.exact
+        return replace(self, angle_rad=angle_rad, wrist_rad=wrist_rad, torque_nm=torque_nm, origin_rad=origin_rad)
+
+
+_OPPOSITE: Final[dict[Direction, Direction]] = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
+
+# A tool as a fresh grip leaves it, and one of which nothing is known.
+AT_REST: Final = KnownTool()
+NOTHING_KNOWN: Final = KnownTool(angle_rad=UNKNOWN, torque_nm=UNKNOWN)
+
+
+def known_at_start(*, loaded: bool, twisted_rad: float) -> KnownTool:
+    """Return what is known at a start; `loaded`: a tool may be held, turned by about `twisted_rad` since its grip."""
+    if not loaded:
+        return AT_REST
+    if abs(twisted_rad) > UNTURNED_RAD:
+        return NOTHING_KNOWN
+    return replace(NOTHING_KNOWN, angle_rad=UNKNOWN.within(UNTURNED_RAD))
+
+
+def knowledge(planned: Iterable[Step], start: KnownTool = AT_REST, *, reaches: bool = True) -> Iterator[KnownTool]:
+    """Yield what is known before each step; `reaches`: each `tighten` ends near its torque or beyond."""
+    known = start
+    for step in planned:
+        yield known
+        known = known_after(step, known, reaches=reaches)
+
+
+def known_after(step: Step, known: KnownTool, *, reaches: bool = True) -> KnownTool:
+    """Return what is known after a step, from what is known before."""
+    if isinstance(step, TwistingStep) and known.held is Held.NO:
+        # Something else than the fingers may hold it.
+        known = replace(known, held=Held.MAYBE)
+    match step:
+        case TurnToStep(angle_rad=angle_rad):
+            return known.wrist_turned_to(angle_rad)
+        case TwistStep():
+            return _twisted(step, known)
+        case HoldTorqueStep(signed_torque_nm=torque_nm):
+            return known.torque_brought_to(torque_nm)
+        case TightenStep():
+            return known.tightened(step, reaches=reaches)
+        case GripStep():
+            return known.gripped(step)
+        case ReleaseStep():
+            return known.released()
+        case TareStep():
+            return known.tared()
+        case ApproachStep():
+            return known.moved()
+        case AdaptStep():
+            return known.rescaled()
+        case IdentifyStep() | WaitStep():
+            return known.relaxed()
+
+
+def _twisted(step: TwistStep, known: KnownTool) -> KnownTool:
+    # A second round may turn back to the first angle, and a third one does the same.
+    for target_rad in step.angles_rad * min(step.repeats, 2):
+        if step.return_to_start:
+            ways = known.ways_of_wrist(target_rad) if step.absolute else known.angle_rad.ways_to(target_rad)
+            known = known.returned(ways)
+        else:
+            known = known.wrist_turned_to(target_rad) if step.absolute else known.turned_to(target_rad)
+    return known

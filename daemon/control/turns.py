@@ -1,0 +1,201 @@
+"""Which way each step of an experiment turns the tool, and which steps turn it back."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+from shearloop.daemon.control.experiment_schema import (
+    Direction,
+    ExperimentFile,
+    HoldTorqueStep,
+    IdentifyStep,
+    ReleaseStep,
+    Step,
+    TightenStep,
+    TurnToStep,
+    TwistingStep,
+    TwistStep,
+    direction_of,
+)
+from shearloop.daemon.control.known_tool import (
+    AT_REST,
+    STILL,
+    Held,
+    Interval,
+    KnownTool,
+    Ways,
+    either_way,
+    known_after,
+    only_way,
+    way_from,
+)
+
+
+class Turn(NamedTuple):
+    """What a step turns: in which directions its first turn may be, and the last one of those that it leaves.
+
+    A step that returns to where it began leaves no turn. `loads` is the direction of the torque or the angle that it
+    leaves, None where that is as before. `reach_rad` bounds the angle since the grip; infinite where it is unknown.
+    `turns_tool`: it turns a tool that is held, or may be. `by_angle`: it does so by an angle, with a torque that is not
+    known before.
+    """
+
+    begins: Ways
+    leaves: Ways
+    loads: Direction | None
+    reach_rad: Interval
+    turns_tool: bool
+    by_angle: bool
+
+    @property
+    def direction(self) -> Direction | None:
+        """The direction of its first turn; None for none, or unknown."""
+        return only_way(self.begins)
+
+    @property
+    def way_unknown(self) -> bool:
+        """Whether it may turn the tool in either direction."""
+        return either_way(self.begins)
+
+
+def turns(file: ExperimentFile, start: KnownTool = AT_REST, *, reaches: bool = True) -> Iterator[Turn]:
+    """Yield what each step turns; `reaches`: each `tighten` ends at its torque or beyond, not at its angle."""
+    known = start
+    for step in file.steps:
+        after = known_after(step, known, reaches=reaches)
+        yield _turn_of(step, known, after)
+        known = after
+
+
+def _turn_of(step: Step, before: KnownTool, after: KnownTool) -> Turn:
+    turns_tool = isinstance(step, TwistingStep) or (isinstance(step, TurnToStep) and before.held is not Held.NO)
+    by_angle = turns_tool and isinstance(step, TwistStep | IdentifyStep | TurnToStep)
+    begins = _begins(step, before) if turns_tool else STILL
+    leaves, loads = begins, None
+    reach_rad = after.angle_rad
+    match step:
+        case HoldTorqueStep(signed_torque_nm=torque_nm):
+            loads = direction_of(torque_nm)
+        case TightenStep(direction=direction):
+            loads = direction
+        case TwistStep(angles_rad=angles_rad, absolute=absolute):
+            reach_rad = _reach(step, before, after)
+            if step.return_to_start:
+                leaves = STILL
+            else:
+                last = _last_way(angles_rad)
+                leaves = begins if last is None else frozenset({last})
+                loads = None if absolute else direction_of(angles_rad[-1])
+        case IdentifyStep(amplitude_rad=amplitude_rad):
+            leaves = STILL
+            reach_rad = Interval(reach_rad.low, reach_rad.high + amplitude_rad)
+    return Turn(begins, leaves, loads, reach_rad, turns_tool, by_angle)
+
+
+def _begins(step: Step, before: KnownTool) -> Ways:
+    """Return in which directions the first turn of a step may be."""
+    match step:
+        case TurnToStep(angle_rad=angle_rad):
+            return before.ways_of_wrist(angle_rad)
+        case TwistStep(absolute=True, angles_rad=angles_rad):
+            return _first_ways(before.ways_of_wrist(angles_rad[0]), angles_rad)
+        case TwistStep(angles_rad=angles_rad):
+            return _first_ways(before.angle_rad.ways_to(angles_rad[0]), angles_rad)
+        case HoldTorqueStep(signed_torque_nm=torque_nm):
+            return before.torque_nm.ways_to(torque_nm)
+        case TightenStep(direction=direction, until_torque_nm=until_nm):
+            return _tightens(direction, until_nm, before.torque_nm)
+        case IdentifyStep():
+            return frozenset({"counterclockwise"})
+    return STILL
+
+
+def _first_ways(to_first: Ways, angles_rad: tuple[float, ...]) -> Ways:
+    """Return the directions of a twist's first turn; it is to a later angle if the tool stands at the first one."""
+    if None not in to_first:
+        return to_first
+    ways = [way_from(earlier, later) for earlier, later in pairwise(angles_rad)]
+    later = next((way for way in ways if way is not None), None)
+    return (to_first - STILL) | {later}
+
+
+def _tightens(direction: Direction, until_nm: float, torque_nm: Interval) -> Ways:
+    """Return whether a `tighten` turns: it does not where its torque is reached already."""
+    weakest_nm, strongest_nm = torque_nm.low, torque_nm.high
+    if direction == "clockwise":
+        weakest_nm, strongest_nm = -torque_nm.high, -torque_nm.low
+    if weakest_nm >= until_nm:
+        return STILL
+    return frozenset({direction, None}) if strongest_nm >= until_nm else frozenset({direction})
+
+
+def _reach(step: TwistStep, before: KnownTool, after: KnownTool) -> Interval:
+    """Return the bounds of the angle since the grip in a twist."""
+    angles_rad = step.angles_rad
+    if step.absolute:
+        if before.origin_rad is None:
+            return after.angle_rad
+        angles_rad = tuple(angle_rad - before.origin_rad for angle_rad in angles_rad)
+    return after.angle_rad.up_to(min(angles_rad)).up_to(max(angles_rad))
+
+
+def _last_way(angles_rad: tuple[float, ...]) -> Direction | None:
+    """Return the direction of the last turn from angle to angle; None where all are one."""
+    ways = [way_from(earlier, later) for earlier, later in pairwise(angles_rad)]
+    return next((way for way in reversed(ways) if way is not None), None)
+
+
+class Reversal(NamedTuple):
+    """A step that turns a held tool back: the numbers, from 1, of it and of the step before, and both directions."""
+
+    number: int
+    direction: Direction
+    before: int
+    direction_before: Direction
+
+    def sentence(self, file: ExperimentFile) -> str:
+        """Return what turns back what."""
+        step, before = file.steps[self.number - 1], file.steps[self.before - 1]
+        return (
+            f"reversal: {step.do} turns {self.direction}, against step {self.before} "
+            f"({before.do}), which turned {self.direction_before}"
+        )
+
+
+class Reversals(NamedTuple):
+    """The steps that turn the tool back in its grip, and the numbers, from 1, of those that may."""
+
+    known: tuple[Reversal, ...]
+    possible: tuple[int, ...]
+
+
+def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
+    """Return the steps that turn the tool back in its grip: against the last turn, or to the other side.
+
+    With torques of 0.1, 0 and -0.1 N·m the second and the third step do. A step that returns to where it began does not
+    count as the last turn.
+    """
+    known: list[Reversal] = []
+    possible: list[int] = []
+    # The possible directions of the last turn, each with its latest step.
+    last: dict[Direction, int] = {}
+    # The last turn that loaded the tool further.
+    loaded: tuple[int, Direction] | None = None
+    for number, (step, turn) in enumerate(zip(file.steps, turns(file, start), strict=True), 1):
+        if isinstance(step, ReleaseStep):
+            last, loaded = {}, None
+        way = turn.direction
+        against = [(before, other) for other, before in last.items() if turn.begins - STILL - {other}]
+        if way is not None and len(last) == 1 and against:
+            known.append(Reversal(number, way, *against[0]))
+        elif way is not None and loaded is not None and way == turn.loads != loaded[1]:
+            known.append(Reversal(number, way, *loaded))
+        elif against:
+            possible.append(number)
+        if None not in turn.leaves:
+            last = {}
+        last |= {left: number for left in turn.leaves if left is not None}
+        left_way = only_way(turn.leaves)
+        if left_way is not None and left_way == turn.loads:
+            loaded = number, left_way
+    return Reversals(tuple(known), tuple(possible))

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.cli.options import add_option, path_of
-from shearloop.daemon.running_rig import EMULATED
 from shearloop.errors import UserError
 from shearloop.printable import printable
 
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.messaging.publisher import Listener
 
 
+EMULATED = "EMULATED"
 HEADING = f"{EMULATED}: every device was emulated on this computer."
 
 

@@ -63,7 +63,7 @@ class FaultCode(Enum):
 
     ESTIMATE_STALE = Rule(
         _HOLD,
-        "a sensor has sent nothing new: {detail}.",
+        "no new torque has arrived: {detail}.",
         "Check the sensor's cable and its task in `shearloop listen health`. If the wrist stopped, send "
         "`shearloop command unlock`.",
         hold_at_most_s=5.0,
@@ -72,7 +72,7 @@ class FaultCode(Enum):
     )
     SENSOR_LOST = Rule(
         _HOLD,
-        "a sensor is not connected: {detail}.",
+        "a torque sensor is not connected: {detail}.",
         "Connect it again; the daemon finds it by itself. If the wrist stopped, send `shearloop command unlock`.",
         hold_at_most_s=5.0,
         timer="torque source",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, with_connection
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.callers import caller
-from shearloop.daemon.messaging.deadlines import NEVER_LATE, TYPED_WITHIN_S, boot_ns
+from shearloop.daemon.running_rig import EMULATED, HEADING
 
 if TYPE_CHECKING:
     from shearloop.daemon.messaging.keys import ClientKeys
@@ -28,6 +28,8 @@ DAEMON_COMMANDS = {
 }
 # `stop` is never refused, and the others change nothing.
 _ACTS_ON_NOTHING_SHOWN = ("stop", "status", "experiments")
+# Their replies are shown as tables.
+_TABLES = ("status", "experiments")
 
 EPILOG = """
 examples:
@@ -96,8 +98,7 @@ def _request(args: argparse.Namespace) -> dict[str, Any]:
 def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys | None") -> dict[str, Any]:
     """Send a request to the command address and return the reply; raises UserError without one.
 
-    One that acts is meant for the daemon that runs now, and for a short time. An unlock is meant for the stop that now
-    waits there.
+    One that acts is meant for the daemon that runs now, and an unlock for the stop that waits there now.
     """
     # It imports too much for a `stop` on a busy computer.
     from shearloop.daemon.messaging.client import meant_for, send_command
@@ -111,9 +112,7 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
         status = send_command(args.connect, {"command": "status"}, short_s, keys)
         if not status.get("ok"):
             return status
-        # Ctrl-Z or a suspended computer may have held this program up.
-        age_s = 0.0 if args.name in NEVER_LATE else (boot_ns() - args.began_ns) / 1e9
-        request |= meant_for(status, age_s, TYPED_WITHIN_S)
+        request |= meant_for(status)
         if args.name == "unlock":
             request |= _acknowledged(status.get("loop", {}))
     return send_command(args.connect, request, timeout_s, keys)
@@ -129,16 +128,21 @@ def _acknowledged(loop: Mapping[str, Any]) -> dict[str, int]:
 def _told(args: argparse.Namespace, reply: dict[str, Any]) -> int:
     """Print a reply; return the exit status."""
     accepted = bool(reply.pop("ok", False))
+    label = f"{EMULATED}: " if reply.get("emulated") else ""
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
     elif accepted:
-        print(with_connection("\n".join(_lines(args.name, reply)), args, addresses.COMMAND_ADDRESS))
+        shown = {key: value for key, value in reply.items() if key != "emulated"}
+        lines = _lines(args.name, shown)
+        # A table keeps its columns.
+        lines = [HEADING, *lines] if label and args.name in _TABLES else [f"{label}{lines[0]}", *lines[1:]]
+        print(with_connection("\n".join(lines), args, addresses.COMMAND_ADDRESS))
     else:
         reason = with_connection(str(reply.get("reason")), args, addresses.COMMAND_ADDRESS)
         if args.experiment is not None and not (addresses.needs_keys(args.connect) or args.experiment.exists()):
             # The daemon does not say it: it may see more than this user.
             reason = f"there is no file {args.experiment} on this computer; {reason}"
-        print(f"shearloop command: {args.name} was refused: {reason}", file=sys.stderr)
+        print(f"shearloop command: {label}{args.name} was refused: {reason}", file=sys.stderr)
         if reply.get("invalid") and args.experiment is not None:
             for line in mistakes_of(args.experiment.resolve()).splitlines():
                 # The reason has the first one already.
@@ -181,7 +185,7 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
             (experiment["path"], experiment["name"], "configured" if experiment["path"] == own else "")
             for experiment in reply["experiments"]
         ]
-        return [reply["unread"]] if reply.get("unread") else table(("file", "name", ""), known)
+        return table(("file", "name", ""), known)
     if name == "tare":
         end = "`shearloop command status` shows its end, and `start` is refused until then"
         lost = reply.get("not_connected", ())

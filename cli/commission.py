@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from shearloop.cli.options import add_option
-from shearloop.cli.run import EMULATED
+from shearloop.daemon.running_rig import EMULATED
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:

@@ -15,12 +15,11 @@ from urllib.parse import urlsplit
 from shearloop.cli import bank, init
 from shearloop.cli import run as run_command
 from shearloop.cli.emulator_processes import SHEARLOOP, running
-from shearloop.cli.free_ports import is_free
+from shearloop.cli.free_ports import free_loopback, is_free, plays_no_robot
 from shearloop.cli.options import PORT, add_option, path_of
 from shearloop.cli.other_daemon import refuse_second_daemon
 from shearloop.cli.view import PAGE_PORT
 from shearloop.daemon.process import interrupt_status
-from shearloop.drivers.defaults import RTDE_PORT
 from shearloop.errors import UserError, missing
 from shearloop.tools.outputs import writing
 
@@ -67,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     if not (folder / name).exists():
         with TemporaryDirectory() as temporary:
             init.write_files(Path(temporary), init.packaged_files())
-            _config_of_free_ports(Path(temporary) / name)
+            _config_of_free_ports(Path(temporary) / name, folder / name)
     _write_missing(folder)
     config = _config_of_free_ports(folder / name)
     if args.play is None and not config.autostart:
@@ -83,8 +82,8 @@ def run(args: argparse.Namespace) -> int:
         return status
     # Half a minute has passed.
     _config_of_free_ports(folder / name)
-    with page(config, port):
-        return _call(run_command, str(folder / name), "--show", *played)
+    with page(config, port), elsewhere(config) as moved:
+        return _call(run_command, str(folder / name), "--show", *played, *moved)
 
 
 def _write_missing(folder: Path) -> None:
@@ -102,26 +101,54 @@ def _page_port(asked: int | None) -> int:
     return asked
 
 
-def _config_of_free_ports(path: Path) -> "DaemonConfig":
-    """Return the configuration of a file; raises UserError if its addresses are taken."""
+def _config_of_free_ports(path: Path, kept: Path | None = None) -> "DaemonConfig":
+    """Return the configuration of a file, which is kept at `kept`; raises UserError if its addresses are taken."""
     from shearloop.daemon.config import load_daemon_config
     from shearloop.daemon.rig import open_settings
 
     config = load_daemon_config(path)
-    settings = open_settings(config)
-    check_ports(config, settings.host if settings is not None else None)
+    open_settings(config)
+    check_ports(config, kept or path)
     return config
 
 
-def check_ports(config: "DaemonConfig", robot: str | None) -> None:
-    """Raise UserError if another daemon, or another emulated rig, has the addresses of this configuration."""
-    refuse_second_daemon(config.commands, "" if is_free(HOST, PAGE_PORT) else f"http://{HOST}:{PAGE_PORT}/")
+def check_ports(config: "DaemonConfig", path: Path) -> None:
+    """Raise UserError if another daemon, or another program, has the sockets of the configuration in this file."""
+    page = "" if is_free(HOST, PAGE_PORT) else f"http://{HOST}:{PAGE_PORT}/"
+    made = "" if path.exists() else f", which `shearloop demo --prepare --folder {path.parents[1]}` writes"
+    cure = f"give `publish` and `commands` other addresses in {path}{made}; --port is the page's port"
+    refuse_second_daemon(config.commands, page, cure)
     ours = [urlsplit(address) for address in (config.publish, config.commands) if address.startswith("tcp://")]
-    places = [(str(url.hostname), url.port) for url in ours if url.port]
-    places += [(robot, RTDE_PORT)] if robot is not None and config.emulators else []
-    for host, port in places:
-        if not is_free(host, port):
-            raise UserError(f"{host}:{port} is taken by another program; `ss -ltnp` names it: end it first")
+    for url in ours:
+        if url.port and not is_free(str(url.hostname), url.port):
+            place = f"{url.hostname}:{url.port}"
+            raise UserError(f"{place} is taken by another program; `ss -ltnp` names it: end it first, or {cure}")
+
+
+@contextmanager
+def elsewhere(config: "DaemonConfig") -> Iterator[list[str]]:
+    """Yield the options of `run` that let robot and gripper be played at another address, if theirs is taken."""
+    import yaml
+
+    from shearloop.daemon.rig import configured_settings
+    from shearloop.yaml_files import read_yaml
+
+    settings = configured_settings(config)
+    players = [number for number, emulator in enumerate(config.emulators) if emulator.device == "rig"]
+    if settings is None or config.robot is None or not players or plays_no_robot(settings.host):
+        yield []
+        return
+    host = free_loopback()
+    print(f"{settings.host} plays another robot: this one is played at {host}.", flush=True)
+    # The last `--host` counts.
+    arguments = [*config.emulators[players[0]].arguments, "--host", host]
+    with TemporaryDirectory(prefix="shearloop-") as folder:
+        robot = Path(folder) / config.robot.name
+        robot.write_text(yaml.safe_dump({**read_yaml(config.robot, UserError), "host": host}), encoding="utf-8")
+        values = {"robot": str(robot), f"emulators.{players[0]}.arguments": json.dumps(arguments)}
+        if config.gripper is not None and config.gripper.socket is not None:
+            values["gripper.socket.host"] = host
+        yield [part for key, value in values.items() for part in ("--set", f"{key}={value}")]
 
 
 def _prepare(config: Path, data: Path, *, calibrated: bool) -> None:

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from shearloop.cli.options import add_option, positive
+from shearloop.daemon.running_rig import EMULATED
 from shearloop.words import counted
 
 MARKS = {"good": "ok   ", "note": "note ", "trouble": "WRONG"}
@@ -43,7 +44,9 @@ def run(args: argparse.Namespace) -> int:
                 print(f"        next: {finding.next_step}", flush=True)
     wrong = sum(finding.state == "trouble" for finding in findings)
     if args.json:
-        print(json.dumps([asdict(finding) for finding in findings], ensure_ascii=False))
+        emulated = any(finding.subject == EMULATED for finding in findings)
+        said = [{**asdict(finding), "emulated": emulated} for finding in findings]
+        print(json.dumps(said, ensure_ascii=False))
     else:
         notes = sum(finding.state == "note" for finding in findings)
         print(f"{counted(len(findings), 'check')}: {wrong} wrong, {notes} to note")

@@ -3,10 +3,18 @@
 import argparse
 import sys
 from difflib import get_close_matches
+from typing import TYPE_CHECKING, Final
 
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, positive
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.daemon.running_rig import HEADING
 from shearloop.errors import UserError
+
+if TYPE_CHECKING:
+    from shearloop.daemon.messaging.client import Subscriber
+
+# A daemon sends `health` every second.
+HEALTH_WITHIN_S: Final = 1.2
 
 EPILOG = """
 examples:
@@ -32,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print messages until Ctrl-C, or up to `--count`."""
     from shearloop.cli.terminal import message_json, message_line
-    from shearloop.daemon.messaging.client import QUIET_S, receive_messages
+    from shearloop.daemon.messaging.client import QUIET_S, Subscriber, receive_messages
     from shearloop.daemon.messaging.messages import TOPICS
 
     known = {*TOPICS, *(topic.partition(".")[0] for topic in TOPICS)}
@@ -47,9 +55,22 @@ def run(args: argparse.Namespace) -> int:
         asked = f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?"
         print(f"{nothing}. Is a daemon running {asked}", file=sys.stderr, flush=True)
 
-    received = receive_messages(args.connect, args.topics, args.timeout, client_keys(args), print_hint)
-    for number, (topic, content) in enumerate(received, start=1):
-        print(write(topic, content), flush=True)
-        if number == args.count:
-            break
+    keys = client_keys(args)
+    received = receive_messages(args.connect, args.topics, args.timeout, keys, print_hint)
+    with Subscriber(args.connect, ("health",), keys=keys) as health:
+        for number, (topic, content) in enumerate(received, start=1):
+            if number == 1 and _is_emulated(health):
+                # `health` says it in JSON.
+                print(HEADING, file=sys.stderr if args.json else sys.stdout, flush=True)
+            print(write(topic, content), flush=True)
+            if number == args.count:
+                break
     return 0
+
+
+def _is_emulated(health: "Subscriber") -> bool:
+    """Return whether a daemon that has just published says in `health` that its rig is emulated."""
+    if not health.wait(HEALTH_WITHIN_S):
+        return False
+    _, content = next(health)
+    return bool(content.get("emulated"))

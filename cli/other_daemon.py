@@ -4,23 +4,27 @@ from contextlib import suppress
 from typing import Final
 
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
+from shearloop.daemon.running_rig import whose_daemon
 from shearloop.errors import UserError
 
 # A daemon on a busy computer answers within it.
 STATUS_S: Final = 2.0
+OTHER_ADDRESSES: Final = "give `publish` and `commands` other addresses in your configuration"
 
 
-def refuse_second_daemon(commands: str, page: str = "") -> None:
-    """Raise UserError if a daemon answers at this address of `commands`, with its process, its folder and its page."""
+def refuse_second_daemon(commands: str, page: str = "", cure: str = OTHER_ADDRESSES) -> None:
+    """Raise UserError if a daemon answers at this address of `commands`, with its process, its folder and its page.
+
+    `cure` says how to run beside it.
+    """
     reply = None
     with suppress(TimeoutError):
         reply = send_to_stop_socket(commands, {"command": "status"}, STATUS_S)
     if reply is None:
         return
-    running = reply.get("daemon", {})
     shown = f", its page is {page}" if page else ""
     raise UserError(
-        f"a daemon runs already at {commands}: process {running.get('process')} ({running.get('rig')}) in "
-        f"{running.get('folder')}{shown}; `shearloop command stop --connect {commands}` stops its experiment, and a "
-        "second time ends it. To run beside it, give `publish` and `commands` other addresses in your configuration"
+        f"a daemon runs already at {commands}: {whose_daemon(reply)}{shown}; "
+        f"`shearloop command stop --connect {commands}` stops its experiment, and a "
+        f"second time ends it. To run beside it, {cure}"
     )

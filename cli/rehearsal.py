@@ -7,17 +7,15 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shearloop.cli.free_ports import free_port, is_free
+from shearloop.cli.free_ports import LOOPBACKS, free_loopback, free_port
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS
-from shearloop.drivers.defaults import DASHBOARD_PORT, PRIMARY_PORT, RTDE_PORT, SCRIPT_PORT, URCAP_PORT
+from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig, FingertipConfig, LoadCellConfig, SkinConfig
     from shearloop.drivers.ur.settings import UrSettings
 
-# Robot and gripper are emulated on the first of these local addresses with free ports.
-LOOPBACKS = tuple(f"127.0.0.{number}" for number in range(1, 255))
 # Control cycles per second: twice the states that the daemon asks for, and gentle to this computer.
 EMULATED_RATE_HZ = "250"
 # Of the emulated tool, where no experiment of the configuration has a `tool_mm`.
@@ -79,7 +77,7 @@ class _DeviceReplacer:
         self._content["loop"] = config.loop.model_dump(exclude_unset=True)
         self._emulators: list[dict[str, Any]] = []
         self._sentences = ["every device is played on this computer; none of the real ones is opened"]
-        self._host = _free_loopback() if config.robot is not None else LOOPBACKS[0]
+        self._host = free_loopback() if config.robot is not None else LOOPBACKS[0]
 
     def rehearsal(self) -> Rehearsal:
         """Replace all devices."""
@@ -264,11 +262,3 @@ def _bank(name: str, fingertip: "FingertipConfig", path: Path) -> str:
             "built with `shearloop bank build`"
         )
     return str(fingertip.bank)
-
-
-def _free_loopback() -> str:
-    """Return an address of this computer with free ports for robot and gripper."""
-    for host in LOOPBACKS:
-        if all(is_free(host, port) for port in (RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT, PRIMARY_PORT, URCAP_PORT)):
-            return host
-    raise UserError("every loopback address plays a robot already: end one of the other rigs")

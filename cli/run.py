@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.cli.options import add_option, path_of
+from shearloop.daemon.running_rig import EMULATED
 from shearloop.errors import UserError
 from shearloop.printable import printable
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from shearloop.daemon.messaging.publisher import Listener
 
 
-EMULATED = "EMULATED"
 HEADING = f"{EMULATED}: every device was emulated on this computer."
 
 

@@ -24,6 +24,7 @@ from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.run_summary import RunSummary
+from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sd_notify import notify
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.sensors import build_sensors, open_sessions
@@ -96,8 +97,9 @@ class Daemon:
             tare_refusal = torques.tare_refusal if self.rig is None else self.rig.tare_refusal
             self.health.refusals["tare"] = tare_refusal
             report = partial(self._report, clock)
+            running_rig = RunningRig.of(config, robot[0].host if robot is not None else None)
             self.commands = Commands(
-                self.rig, self.sensors, self._experiment, self.health, self.ending, tare_refusal, report
+                self.rig, self.sensors, self._experiment, self.health, self.ending, tare_refusal, report, running_rig
             )
             server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
             opened.callback(server.close)

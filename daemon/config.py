@@ -411,6 +411,18 @@ class DaemonConfig(ConfigModel):
                 case InstrumentSocket(host=host) | GripperSocket(host=host) if not is_loopback_host(host):
                     yield f"{key}.host", host
 
+    @property
+    def device_addresses(self) -> dict[str, str]:
+        """The serial number, path or socket of each device, by its key; the robot's is in its own settings."""
+        found: dict[str, str] = {}
+        for key, section in self.walk():
+            match section:
+                case SerialDevice():
+                    found[key] = section.serial_number or str(section.path)
+                case InstrumentSocket() | GripperSocket():
+                    found[key] = f"{section.host}:{section.port}"
+        return found
+
     def _ports(self) -> dict[str, list[str]]:
         """Return the configuration keys of each serial port and socket."""
         found: dict[str, list[str]] = {}

@@ -26,7 +26,8 @@ class TorqueSample:
     """One torque of one source, with the time of its measurement (`t_mid_ns`) and of its arrival (`t_ns`).
 
     `torque_nm` is None if it is not valid, for `reason`. `low_nm` and `high_nm` bound the friction band that
-    hides the torque. A torque beyond `loaded_nm` is a load; a smaller one may be drift of the zero.
+    hides the torque. A torque beyond `loaded_nm` is a load; a smaller one may be drift of the zero. `load` says by what
+    else a source knows that it is loaded, for instance where the load is too large for a torque; empty if it is not.
     """
 
     source: str
@@ -37,6 +38,7 @@ class TorqueSample:
     low_nm: float | None = None
     high_nm: float | None = None
     loaded_nm: float = LARGEST_DRIFT_NM
+    load: str = ""
 
     def __post_init__(self) -> None:
         """Treat NaN and infinity as no torque."""
@@ -162,6 +164,8 @@ def loaded_sentence(torques: Iterable[TorqueSample]) -> str:
     for torque in torques:
         if torque.torque_nm is not None and abs(torque.torque_nm) > torque.loaded_nm:
             return f"{torque.source} measures {torque.torque_nm:+.3f} N·m"
+        if torque.load:
+            return f"{torque.source} is loaded: {torque.load}"
     return ""
 
 

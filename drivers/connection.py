@@ -31,6 +31,10 @@ READS_PER_TURN = 8
 SHORT_READ_BYTES = 4_000
 WRITE_TIMEOUT_S, WRITE_PAUSE_S = 1.0, 0.01
 CONNECT_TIMEOUT_S = 2.0
+# A reader that waits looks at its port at this interval. If it has not found the port empty for longer than `AWAY_NS`,
+# something kept it from reading, and what it finds may have waited. So may what the kernel delivers within that time
+# afterwards.
+LOOK_INTERVAL_S, AWAY_NS = 0.1, 200_000_000
 
 # The values that a device reports in `health`, by name.
 Diagnostics: TypeAlias = Mapping[str, bool | int | float | str | Mapping[str, int] | None]
@@ -38,10 +42,14 @@ Diagnostics: TypeAlias = Mapping[str, bool | int | float | str | Mapping[str, in
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """Bytes, and the time when all of them had arrived (monotonic, ns)."""
+    """Bytes, and the time when all of them had arrived (monotonic, ns).
+
+    `waited_since_ns`: the reader was away, and any of them may have arrived since this time; None if it was not away.
+    """
 
     data: bytes
     t_arrival_ns: int
+    waited_since_ns: int | None = None
 
 
 def find_port(*, serial_number: str | None = None, path: str | os.PathLike[str] | None = None) -> str:
@@ -93,6 +101,10 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         self._reader = ThreadPoolExecutor(1, f"read {path}")
         # What the thread's read will bring; None for nothing in time.
         self._arrival: asyncio.Future[Received | DeviceLostError | None] | None = None
+        # When the thread last found the port empty, or opened it.
+        self._empty_ns = time.monotonic_ns()
+        # Since when bytes that arrive until `_waited_until_ns` may have waited.
+        self._waited_since_ns, self._waited_until_ns = 0, -1
 
     def __exit__(self, *_: object) -> None:
         """Close the port."""
@@ -130,25 +142,44 @@ class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
         ready.register(self._descriptor, select.POLLIN)
         ready.register(self._closing, select.POLLIN)
         result = None
-        # A late thread finds what has arrived meanwhile.
-        while result is None and (found := ready.poll(max(0.0, 1e3 * (until_s - time.monotonic())))):
+        while result is None:
+            now_ns = time.monotonic_ns()
+            found = ready.poll(0)
+            if not found:
+                self._empty_ns = now_ns
+                left_s = until_s - time.monotonic()
+                # A late thread has looked once more.
+                if left_s <= 0:
+                    break
+                found = ready.poll(1e3 * min(left_s, LOOK_INTERVAL_S))
             if any(descriptor == self._closing for descriptor, _ in found):
                 break
-            result = self._drain()
+            if found:
+                result = self._drain()
         return result
 
     def _drain(self) -> Received | DeviceLostError | None:
         """Return what has arrived, or the loss; None for neither."""
         parts: list[bytes] = []
+        now_ns = empty_ns = self._empty_ns
         try:
             while len(parts) < READS_PER_TURN and (not parts or len(parts[-1]) >= SHORT_READ_BYTES):
+                now_ns = time.monotonic_ns()
                 parts.append(os.read(self._descriptor, READ_BYTES))
         except OSError as error:
             # Bytes before a hang-up come first; the next read meets the hang-up again.
             if not parts:
                 return None if isinstance(error, BlockingIOError) else self._lost(error.strerror)
         data = b"".join(parts)
-        return Received(data, time.monotonic_ns()) if data else self._lost("hung up")
+        if not data:
+            return self._lost("hung up")
+        if len(parts[-1]) < SHORT_READ_BYTES:
+            self._empty_ns = now_ns
+        arrival_ns = time.monotonic_ns()
+        if arrival_ns - empty_ns > AWAY_NS:
+            self._waited_since_ns, self._waited_until_ns = empty_ns, arrival_ns + AWAY_NS
+        waited = arrival_ns <= self._waited_until_ns
+        return Received(data, arrival_ns, self._waited_since_ns if waited else None)
 
     async def write(self, data: bytes) -> None:
         """Write all of `data`; DeviceLostError if the port is gone or accepts nothing for a second."""

@@ -7,7 +7,6 @@ where the measuring pair touches a driven electrode, and where a channel has les
 dead in this frame. Values are below 10 V, so a line has cells of eight bytes.
 """
 
-import math
 import re
 from collections import Counter, deque
 from collections.abc import Iterable
@@ -168,7 +167,8 @@ class FrameClock:
     edge of their lower convex hull that spans the middle (Moon, Skelly and Towsley 1999, "Estimation and removal of
     clock skew from network delay measurements"). Its slope is the period; its height over the last few frames is the
     phase. All times are integer nanoseconds of one monotonic clock. The nominal period applies until the real one is
-    `learned`. After a pause of more than `longest_gap` periods the board counts as stopped; before, a frame is late.
+    `learned`. After a pause of more than `longest_gap` periods the board counts as stopped; before, a frame is late. A
+    frame that may have waited for its reader says nothing of a pause: it came in time if it can have.
     """
 
     def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:
@@ -177,47 +177,67 @@ class FrameClock:
         self.period_ns = nominal_period_ns
         self.learned = False
         self._exact_period_ns = float(nominal_period_ns)
-        # (frame number, arrival) of the last frames across restarts, and the last spacings.
+        # The number of the last frame.
+        self._number = 0
+        # (frame number, arrival) of the last frames that did not wait, across restarts, and the last spacings.
         self._latest: deque[tuple[int, int]] = deque(maxlen=SPACING_FRAMES + 1)
         self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
-        # (frame number, arrival) since the last restart.
+        # (frame number, arrival) of the frames that did not wait, since the last restart.
         self._seen: deque[tuple[int, int]] = deque(maxlen=PERIOD_WINDOW)
+        # When the last frame may have arrived at the earliest, and when it would have at a reader that is never late.
+        self._earliest_ns = 0
         self._straight_ns = 0
 
     def restart(self) -> None:
         """Forget the phase and keep the period: the board was restarted."""
         self._seen.clear()
 
-    def arrived(self, arrival_ns: int, missed: bool = False) -> int:
+    def arrived(self, arrival_ns: int, rejected: int = 0, waited_since_ns: int | None = None) -> int:
         """Return when the next frame would have arrived at a reader that is never late.
 
-        After a rejected line (`missed`) the number of periods follows from the time; otherwise a late frame is the
-        next one.
+        `rejected` lines came before it. Then the number of periods follows from the time; otherwise a late frame is the
+        next one. `waited_since_ns`: its reader was away, and it may have arrived since then.
         """
-        number, steps = 0, 1
+        earliest_ns = arrival_ns if waited_since_ns is None else min(waited_since_ns, arrival_ns)
+        waited = earliest_ns < arrival_ns
         if self._seen:
-            number, last_ns = self._seen[-1]
-            elapsed = (arrival_ns - self._straight_ns) / self._exact_period_ns
-            steps = max(1, round(elapsed)) if missed and self.learned else 1
-            number += steps
-            late = elapsed - steps
-            late_before = (last_ns - self._straight_ns) / self._exact_period_ns
-            # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
-            # board. Half a period early means that the last one was counted as two.
-            paused = min(late, late_before) > 0.5 and late > late_before - 0.5
-            if elapsed > self._longest_gap or late < -0.5 or paused:
-                self.restart()
-        self._seen.append((number, arrival_ns))
-        self._latest.append((self._latest[-1][0] + steps if self._latest else 0, arrival_ns))
-        if len(self._latest) > SPACING_FRAMES:
-            (n, before_ns), (m, _) = self._latest[0], self._latest[-1]
-            self._spacings.append((arrival_ns - before_ns) / (m - n))
-        self._learn()
-        straight_ns = math.inf
-        for n, arrival in islice(reversed(self._seen), PHASE_WINDOW):
-            straight_ns = min(straight_ns, arrival + (number - n) * self._exact_period_ns)
+            self._count(arrival_ns, earliest_ns, rejected)
+        self._earliest_ns = earliest_ns
+        if waited and self._seen:
+            # It tells nothing of the board's pace.
+            self._latest.clear()
+        else:
+            self._seen.append((self._number, arrival_ns))
+            self._latest.append((self._number, arrival_ns))
+            if len(self._latest) > SPACING_FRAMES:
+                (n, before_ns), (m, _) = self._latest[0], self._latest[-1]
+                self._spacings.append((arrival_ns - before_ns) / (m - n))
+            self._learn()
+        straight_ns = float(arrival_ns)
+        for n, seen_ns in islice(reversed(self._seen), PHASE_WINDOW):
+            straight_ns = min(straight_ns, seen_ns + (self._number - n) * self._exact_period_ns)
         self._straight_ns = round(straight_ns)
         return self._straight_ns
+
+    def _count(self, arrival_ns: int, earliest_ns: int, rejected: int) -> None:
+        """Count the periods until a frame that arrived between two times; restart where the board has paused."""
+        elapsed, elapsed_at_least = (
+            (t_ns - self._straight_ns) / self._exact_period_ns for t_ns in (arrival_ns, earliest_ns)
+        )
+        steps = 1
+        if rejected and self.learned:
+            steps = max(1, round(elapsed))
+            if earliest_ns < arrival_ns:
+                # Of frames that waited, the time tells only how many there can have been.
+                steps = min(steps, 1 + rejected)
+        self._number += steps
+        late = elapsed_at_least - steps
+        late_before = (self._earliest_ns - self._straight_ns) / self._exact_period_ns
+        # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
+        # board. Half a period early means that the last one was counted as two.
+        paused = min(late, late_before) > 0.5 and late > late_before - 0.5
+        if elapsed_at_least > self._longest_gap or elapsed - steps < -0.5 or paused:
+            self.restart()
 
     def _learn(self) -> None:
         if len(self._spacings) < LEARN_FROM:
@@ -268,7 +288,9 @@ class FrameParser:
         self._zero_slots = zero_slots
         self._lines = LineSplitter(MAX_LINE_BYTES)
         self._first_line = True
-        self._rejected_since_frame = False
+        self._rejected_since_frame = 0
+        # Since when the next bytes may have waited for their reader; None if it was not away.
+        self._waited_since_ns: int | None = None
         self._last_mid_ns = -(2**63)
         self._last_channels = np.full(np.count_nonzero(~zero_slots), np.nan)
         self._equal_readings = np.zeros(len(self._last_channels), np.int64)
@@ -293,10 +315,14 @@ class FrameParser:
         match event.kind:
             case InputKind.OPENED:
                 self._lines.restart()
-                self._first_line, self._rejected_since_frame = True, False
+                self._first_line, self._rejected_since_frame, self._waited_since_ns = True, 0, None
                 self.clock.restart()
+            case InputKind.WAITED:
+                self._waited_since_ns = int(event.data)
             case InputKind.DATA:
-                return self.feed(event.data, event.t_ns)
+                frames = self.feed(event.data, event.t_ns)
+                self._waited_since_ns = None
+                return frames
         return []
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[Frame]:
@@ -307,12 +333,12 @@ class FrameParser:
             self._first_line = False
             if values is not None:
                 complete.append((values, self._rejected_since_frame))
-                self._rejected_since_frame = False
+                self._rejected_since_frame = 0
         frames = []
-        for number, (values, missed) in enumerate(complete, 1):
+        for number, (values, rejected) in enumerate(complete, 1):
             # Frames that waited together were sent one period apart, the last one by now.
             waited_ns = (len(complete) - number) * self.clock.period_ns if self.clock.learned else 0
-            sent_ns = self.clock.arrived(t_arrival_ns - waited_ns, missed)
+            sent_ns = self.clock.arrived(t_arrival_ns - waited_ns, rejected, self._waited_since_ns)
             frames.append(self._frame(values, sent_ns, t_arrival_ns))
         return frames
 
@@ -332,7 +358,7 @@ class FrameParser:
     def _reject(self, error: FrameError) -> None:
         self.errors[error.kind] += 1
         self.last_error = error
-        self._rejected_since_frame = True
+        self._rejected_since_frame += 1
 
     def _frame(self, values: NDArray[np.float64], sent_ns: int, t_arrival_ns: int) -> Frame:
         channels = values[~self._zero_slots]

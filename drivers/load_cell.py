@@ -118,6 +118,12 @@ class LoadSample:
         """Whether no flag is set."""
         return not (self.saturated or self.spike or self.stuck or self.partial or self.other_unit)
 
+    @property
+    def overloaded(self) -> bool:
+        """Whether the load is too large for a torque: at an end of the range, or beyond the cell's capacity."""
+        beyond = abs(self.torque_nm) > CAPACITY_NM and not (self.partial or self.other_unit)
+        return self.saturated or beyond
+
 
 class LoadParser(serial_sensor.LineParser[LoadSample]):
     """Turns the board's bytes into samples."""

@@ -34,6 +34,7 @@ class InputKind(Enum):
     # To a parser.
     OPENED = "opened"  # the port was opened, a half-received line is void
     ASKED = "asked"  # an instrument was sent the query in `data`; its reply follows
+    WAITED = "waited"  # the next bytes may have waited since the time in `data`: their reader was away
     DATA = "data"  # bytes arrived
     # To a load cell's parser, with the zero, or to an estimator.
     TARE = "tare"  # a new zero was asked for, or found
@@ -309,6 +310,9 @@ class SerialSensor(Generic[ValueT]):
                         )
                     if self._inputs is not None and self._inputs.wants_state:
                         yield ()
+                    if received.waited_since_ns is not None:
+                        since = str(received.waited_since_ns).encode()
+                        self._dispatch(InputKind.WAITED, received.t_arrival_ns, since)
                     values = self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data)
                     self._check_use(port, received.t_arrival_ns, useful=bool(values))
                 except DriverError as error:

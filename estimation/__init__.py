@@ -10,11 +10,11 @@ if TYPE_CHECKING:
     from shearloop.estimation.estimator import Estimator, Physics
     from shearloop.estimation.fitting import adapt, fit
     from shearloop.estimation.load_delay import TRUSTED, LoadTiming, measure_timing
+    from shearloop.estimation.series import FrameSeries
     from shearloop.estimation.session import Session
     from shearloop.estimation.values import (
         BeforeFrame,
         Estimate,
-        FrameSeries,
         HeldTool,
         KnownTorques,
         Measured,
@@ -51,7 +51,7 @@ _HOMES = {
     "Calibration": "shearloop.estimation.calibration:Calibration",
     "Estimate": "shearloop.estimation.values:Estimate",
     "Estimator": "shearloop.estimation.estimator:Estimator",
-    "FrameSeries": "shearloop.estimation.values:FrameSeries",
+    "FrameSeries": "shearloop.estimation.series:FrameSeries",
     "HeldTool": "shearloop.estimation.values:HeldTool",
     "KnownTorques": "shearloop.estimation.values:KnownTorques",
     "LoadTiming": "shearloop.estimation.load_delay:LoadTiming",

@@ -32,10 +32,11 @@ from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import LearnedFrames
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.ridge import CensoredRidge, sign_of_loads
+from shearloop.estimation.series import FrameSeries, check_finite, distinct
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.twists import LOADED_FRACTION, first_twists, loaded_log_gain
-from shearloop.estimation.values import FrameSeries, GripState, Measured, check_finite, distinct
+from shearloop.estimation.values import GripState, Measured
 from shearloop.words import counted
 
 # With more variance left on a tool of another diameter, the tools have no torque in common.
@@ -285,7 +286,7 @@ def _replay(
     """Return the frames that an estimate would be made of, processed as in a session; None without any."""
     estimator, rows, grip = calibration.estimator, [], 0
     for recording, series in enumerate(recordings):
-        session = Session(calibration, matcher=matcher)
+        session = Session(calibration, matcher=matcher, period_s=series.period_s)
         grip, before = grip + 1, GripState.NONE
         truths = zip(series.torque_at_frames(), series.diameter_mm, strict=True)
         for i, (frame, truth) in enumerate(zip(series.frames(), truths, strict=True)):

@@ -13,7 +13,7 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.fingertip_validator import STEP_FRAMES, channel_noise, frame_steps
-from shearloop.estimation.values import FrameSeries
+from shearloop.estimation.series import FrameSeries
 
 # Torques above this fraction of the largest one count as a load.
 _LOADED_FRACTION = 0.1

@@ -10,7 +10,8 @@ from shearloop.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, 
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.gain import GainCorrection
 from shearloop.estimation.interval_regressor import IntervalRegressor
-from shearloop.estimation.values import Measured, distinct
+from shearloop.estimation.series import distinct
+from shearloop.estimation.values import Measured
 from shearloop.tools.frame_series import check_no_copies, check_paths_differ, part_of, read_series, series_of
 from shearloop.tools.recordings.frames import read_recording
 

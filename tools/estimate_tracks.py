@@ -56,7 +56,7 @@ class EstimateTrack:
 def estimate_series(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> EstimateTrack:
     """Estimate every frame of a series in order, as live; raises CalibrationError for a series of other sides."""
     chosen = series.select_sides(calibration.sides)
-    session = Session(calibration, bank)
+    session = Session(calibration, bank, period_s=chosen.period_s)
     session.set_tool(chosen.tool_mm)
     estimates, latency = [], []
     for frame in chosen.frames():

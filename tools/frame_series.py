@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from shearloop.bank.arrays import BoolArray, IntArray
+from shearloop.bank.arrays import IntArray
 from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, LOAD_DOUBT_NOTE, SIDES
+from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
 from shearloop.estimation.calibration import LARGEST_TOOL_FRACTION
@@ -17,8 +18,6 @@ from shearloop.words import counted
 
 Series = TypeVar("Series", bound=FrameSeries)
 
-# Largest distance in time of a pair of frames, as a fraction of the period.
-_LARGEST_APART = 0.75
 # Fraction of the time with another grip that does not count as another tool: the fingers met something or gripped
 # again.
 _MOMENTARY = 0.05
@@ -44,7 +43,7 @@ def read_series(
 
 
 def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> FrameSeries:
-    """Return a recording's frames, several sides paired by time at their mean time.
+    """Return a recording's frames, several sides paired as in the daemon, at their mean time.
 
     Times are in seconds since the middle of the recording's first frame of the right side, or of the left one without
     a right side. This does not depend on `sides`.
@@ -60,16 +59,13 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
         raise UserError(
             f"{recording.path} has frames of {' and '.join(recording.sides)}, not of {' and '.join(missing)}; {cure}"
         )
-    first = recording.sides[wanted[0]]
-    rows = [_nearest(first.t_mid_ns, recording.sides[side].t_mid_ns) for side in wanted]
-    period_ns = float(np.median(np.diff(first.t_mid_ns))) if len(first.t_mid_ns) > 1 else 1.0
+    rows, unpaired = _pairs(recording, wanted)
     times = np.array([recording.sides[side].t_mid_ns[row] for side, row in zip(wanted, rows, strict=True)])
-    paired = np.ptp(times, axis=0) <= _LARGEST_APART * period_ns
-    lines = [recording.sides[side].lines[row][paired] for side, row in zip(wanted, rows, strict=True)]
-    moved = [recording.sides[side].fingers_moved[row][paired] for side, row in zip(wanted, rows, strict=True)]
+    lines = [recording.sides[side].lines[row] for side, row in zip(wanted, rows, strict=True)]
+    moved = [recording.sides[side].fingers_moved[row] for side, row in zip(wanted, rows, strict=True)]
     start = int(recording.sides[known[0]].t_mid_ns[0])
-    t_s = (times[:, paired] - start).mean(axis=0) / 1e9
-    diameter_mm, gripper_mm = tool_of(recording, first.t_mid_ns, tool_mm)
+    t_s = (times - start).mean(axis=0) / 1e9
+    diameter_mm, gripper_mm = tool_of(recording, recording.sides[wanted[0]].t_mid_ns, tool_mm)
     return FrameSeries(
         wanted,
         t_s,
@@ -80,14 +76,46 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
         gripper_mm,
         recording.table,
         load_doubt=recording.notes.get(LOAD_DOUBT_NOTE, ""),
-        left_out=recording.left_out + (() if paired.all() else (_unpaired(wanted[0], ~paired),)),
+        left_out=(*recording.left_out, *unpaired),
         emulated=recording.emulated,
         fingers_moved=np.stack(moved, axis=1),
+        period_s=recording.periods_s.get(wanted[0], np.inf),
     )
 
 
-def _unpaired(side: str, apart: BoolArray) -> str:
-    return f"{counted(int(apart.sum()), 'frame')} of the {side} side, without one of the others at that time"
+class _FrameOfSide(NamedTuple):
+    """A frame by its time and its row among the frames of its side."""
+
+    t_mid_ns: int
+    row: int
+
+
+def _pairs(recording: Recording, sides: tuple[str, ...]) -> tuple[list[IntArray], list[str]]:
+    """Return the rows of each side's frames that belong together, and how many frames of each side have no partner."""
+    frames = [
+        (side, _FrameOfSide(t_mid_ns, row))
+        for side in sides
+        for row, t_mid_ns in enumerate(recording.sides[side].t_mid_ns.tolist())
+    ]
+    pairing: FramePairing[_FrameOfSide] = FramePairing(sides, _period_s(recording, sides))
+    by_time = sorted(frames, key=lambda one: one[1].t_mid_ns)
+    found = [pair for side, frame in by_time if (pair := pairing.add(side, frame)) is not None]
+    pairing.end()
+    rows = np.array([[frame.row for frame in pair] for pair in found], dtype=np.int64).reshape(-1, len(sides))
+    unpaired = [
+        f"{counted(number, 'frame')} of the {side} side, without one of the others at that time"
+        for side, number in pairing.unpaired.items()
+        if number
+    ]
+    return list(rows.T), unpaired
+
+
+def _period_s(recording: Recording, sides: tuple[str, ...]) -> float:
+    """Return the frame period that the daemon paired by; without a daemon, of the fastest side."""
+    if sides[0] in recording.periods_s:
+        return recording.periods_s[sides[0]]
+    steps_ns = [np.diff(recording.sides[side].t_mid_ns) for side in sides]
+    return min((float(np.median(steps)) for steps in steps_ns if len(steps)), default=1.0) / 1e9
 
 
 def part_of(series: Series, start: float, stop: float) -> Series:
@@ -97,11 +125,6 @@ def part_of(series: Series, start: float, stop: float) -> Series:
     if first == end:
         raise UserError(f"none of {n} frames lies between the fractions {start:g} and {stop:g}; use a longer part")
     return series.between(first, end)
-
-
-def _nearest(wanted: IntArray, times: IntArray) -> IntArray:
-    """Return the places of the nearest of rising times, the earlier of two that are equally near."""
-    return np.searchsorted(times[:-1] + np.diff(times) // 2, wanted)
 
 
 def tool_of(recording: Recording, t_ns: IntArray, given_mm: float | None = None) -> tuple[float, Measured | None]:

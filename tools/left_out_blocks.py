@@ -11,8 +11,9 @@ from shearloop.bank.arrays import BoolArray
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.grips import Grip, find_grips
+from shearloop.estimation.series import distinct
 from shearloop.estimation.twists import find_twists
-from shearloop.estimation.values import Measured, distinct
+from shearloop.estimation.values import Measured
 from shearloop.tools.frame_series import Series
 from shearloop.words import counted
 

@@ -63,7 +63,7 @@ class FaultCode(Enum):
 
     ESTIMATE_STALE = Rule(
         _HOLD,
-        "no new torque has arrived: {detail}.",
+        "a sensor has sent nothing new: {detail}.",
         "Check the sensor's cable and its task in `shearloop listen health`. If the wrist stopped, send "
         "`shearloop command unlock`.",
         hold_at_most_s=5.0,
@@ -72,7 +72,7 @@ class FaultCode(Enum):
     )
     SENSOR_LOST = Rule(
         _HOLD,
-        "a torque sensor is not connected: {detail}.",
+        "a sensor is not connected: {detail}.",
         "Connect it again; the daemon finds it by itself. If the wrist stopped, send `shearloop command unlock`.",
         hold_at_most_s=5.0,
         timer="torque source",

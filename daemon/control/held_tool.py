@@ -45,6 +45,8 @@ class HeldTool:
     _tightens: bool = False
     # The state before the present `grip` step, for the case that the step is refused.
     _before_closing: _KnownGrip | None = None
+    # Whether the daemon has moved the fingers since the gripper was last known to hold nothing.
+    _moved: bool = False
     # Called when the gripper first shows whether it still has the grip of an earlier process.
     _on_judged: OnJudged | None = None
 
@@ -58,6 +60,7 @@ class HeldTool:
 
     def on_gripper(self, gripper: GripperStatus, *, judges: bool) -> None:
         """Take the gripper's latest state; `judges`: decide whether it still has the grip, as between experiments."""
+        self._moved = self._moved and gripper.may_hold
         if self._tightens:
             self.grip = self.grip.pressed(gripper)
         if judges:
@@ -103,6 +106,7 @@ class HeldTool:
 
     def begin_grip(self, action: GripStep, origin_rad: float) -> None:
         """Store the state of the tool before the fingers move, and begin a new grip."""
+        self._moved = True
         # If this process dies while the fingers close, the next process finds this force.
         force_n = max(self.grip.force_n or 0.0, action.force_n)
         self._before_closing = _KnownGrip(self.grip, self.is_earlier, self.another)
@@ -199,6 +203,18 @@ class HeldTool:
         if self.held is not None or self.grip.force_n is None:
             return self.held
         return self.uncertain
+
+    @property
+    def held_or_unknown(self) -> str | None:
+        """The object between the fingers, or why one may be there, also if no grip is known; None without both.
+
+        A gripper that was not activated since its power came may hold a tool too. Before it first moves, only a known
+        grip speaks for a tool.
+        """
+        gripper = self.inputs.gripper
+        if gripper is None or (gripper.inactive and not self._moved):
+            return self.may_still_hold
+        return self.held or self.uncertain
 
     def may_hold(self) -> bool:
         """Return whether the gripper holds something or does not know; a grip of an earlier process counts too."""

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -17,6 +17,7 @@ from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.supervisor import TaskFacts
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputRecorder
+from shearloop.words import counted
 
 
 @dataclass(slots=True, kw_only=True)
@@ -27,16 +28,38 @@ class CombinedTask(FingertipTask):
     """
 
     period_s: float
-    pairing: FramePairing
+    pairing: FramePairing[Frame]
     sides: Sequence[InputRecorder | None] = ()
     _pairs: deque[tuple[Frame, ...]] = field(default_factory=deque)
     _in_order: asyncio.Lock = field(default_factory=asyncio.Lock)
+    # The frames without a partner since the last pair.
+    _unpaired: Counter[str] = field(default_factory=Counter)
 
     def add(self, side: str, frames: Sequence[Frame]) -> None:
-        """Take the frames of one read; call this at once, because the order of arrival decides the pairs."""
+        """Take the frames of one read; a side's frames come in order."""
         for frame in frames:
-            if (pair := self.pairing.add(side, frame)) is not None:
+            before = self.pairing.unpaired.copy()
+            pair = self.pairing.add(side, frame)
+            self._name_unpaired(self.pairing.unpaired - before)
+            if pair is not None:
+                self._unpaired.clear()
                 self._pairs.append(pair)
+
+    def _name_unpaired(self, found: Counter[str]) -> None:
+        """Log frames without a partner, once until the next pair; health counts them all."""
+        is_first = bool(found) and not self._unpaired
+        self._unpaired += found
+        # Boards do not begin together.
+        if is_first and self.count:
+            structlog.get_logger().bind(device=self.name).warning(self._unpaired_sentence)
+
+    @property
+    def _unpaired_sentence(self) -> str:
+        """Which frames since the last pair have no partner; empty without any."""
+        if not self._unpaired:
+            return ""
+        frames = " and ".join(f"{counted(number, 'frame')} of {side}" for side, number in self._unpaired.items())
+        return f"{frames}, without a frame of the other fingertip at that time: no combined estimate"
 
     async def process_pairs(self) -> None:
         """Estimate from the pairs that wait, in order."""
@@ -57,7 +80,12 @@ class CombinedTask(FingertipTask):
 
     def diagnostics(self) -> TaskFacts:
         """Return the values for the health message."""
-        return {"expected_hz": 1.0 / self.period_s, "estimates": self.count}
+        return {
+            "expected_hz": 1.0 / self.period_s,
+            "estimates": self.count,
+            "unpaired": dict(self.pairing.unpaired),
+            "error": self._unpaired_sentence,
+        }
 
 
 class DeadElectrodes:

@@ -64,7 +64,8 @@ class LoadCellTask:
         self._latest = sample
         if self._loop is not None:
             torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
-            self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, message.reason, sample.t_mid_ns, now_ns))
+            load = "" if not sample.overloaded else "the reading is beyond what it can measure"
+            self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, message.reason, sample.t_mid_ns, now_ns, load=load))
         self._take_zero(sample)
 
     def tare(self, *, confirmed: bool = False) -> None:

@@ -29,6 +29,9 @@ MIN_NOISE = 2e-5
 MAX_COMMON_CHANGE = 0.015
 # A skin that changed more since its calibration is refused: a quarter of a newton.
 MAX_CHANGE = 0.02
+# Gauges that are swapped after the zero, without a load, differ from its resistances by noise and drift, and deviate by
+# more than this from any load.
+EXCHANGED_TOLERANCE, EXCHANGED_DEVIATION = 5e-3, 1e-2
 _NOT_IN_TIME = "it took too long; tare again with nothing on the skin"
 
 
@@ -86,17 +89,25 @@ class SkinZeroTaker:
         return None
 
     def _check_calibration(self, r1_ohm: float, r2_ohm: float) -> str | None:
-        """Compare the ratio of both with the calibration's: current and temperature cancel."""
-        known, found = _log_ratio(*self.rest_ohm), _log_ratio(r1_ohm, r2_ohm)
-        if abs(found - known) <= MAX_CHANGE:
-            return None
+        deviation = self.why_not_at_rest(r1_ohm, r2_ohm)
+        if not deviation or are_exchanged(self.rest_ohm, r1_ohm, r2_ohm):
+            return deviation or None
+        return f"{deviation}; take the load off, or calibrate again"
+
+    def why_not_at_rest(self, r1_ohm: float, r2_ohm: float) -> str:
+        """Return why these are not the resistances of the calibrated skin at rest, empty where they may be.
+
+        It compares the ratio of both with the calibration's: current and temperature cancel.
+        """
+        change = _log_ratio(r1_ohm, r2_ohm) - _log_ratio(*self.rest_ohm)
+        if abs(change) <= MAX_CHANGE:
+            return ""
         seen = f"R₁ {r1_ohm:.2f} Ω and R₂ {r2_ohm:.2f} Ω"
-        common = 0.5 * math.log(r1_ohm * r2_ohm / math.prod(self.rest_ohm))
-        if abs(found + known) < min(MAX_CHANGE, abs(found - known)) and abs(common) < MAX_COMMON_CHANGE:
+        if are_exchanged(self.rest_ohm, r1_ohm, r2_ohm):
             return f"{seen} are the calibration's, but exchanged: the wires of the gauges are swapped"
         return (
-            f"{seen} are not the skin's values at rest: a shear force of about "
-            f"{(found - known) / self.slope_per_n:+.2f} N would look like that; take the load off, or calibrate again"
+            f"{seen} are not the skin's values at rest: a shear force of about {change / self.slope_per_n:+.2f} N "
+            "would look like that"
         )
 
     def _zero(self, ohm: NDArray[np.float64]) -> SkinZero:
@@ -106,6 +117,17 @@ class SkinZeroTaker:
         noise = max(bound * float(np.std(ohm[:, 0] / r1_ohm - ohm[:, 1] / r2_ohm, ddof=1)), MIN_NOISE)
         change = abs(_log_ratio(r1_ohm, r2_ohm) - _log_ratio(*self.rest_ohm))
         return SkinZero(r1_ohm, r2_ohm, noise, change + 2.0 * noise / math.sqrt(len(ohm)))
+
+
+def are_exchanged(rest_ohm: tuple[float, float], r1_ohm: float, r2_ohm: float, tolerance: float = MAX_CHANGE) -> bool:
+    """Return whether these are the resistances at rest of the other gauge each, where the two differ enough to tell.
+
+    `tolerance` is of the ratio of both.
+    """
+    known, found = _log_ratio(*rest_ohm), _log_ratio(r1_ohm, r2_ohm)
+    common = 0.5 * math.log(r1_ohm * r2_ohm / math.prod(rest_ohm))
+    apart = abs(found - known)
+    return apart > MAX_CHANGE and abs(found + known) < min(tolerance, apart) and abs(common) < MAX_COMMON_CHANGE
 
 
 def _log_ratio(r1_ohm: float, r2_ohm: float) -> float:
@@ -188,6 +210,12 @@ class SkinEstimator:
         """The shear force (N) that no drift explains: a zero that differs so from the calibration is refused."""
         return MAX_CHANGE / self._calibration.slope_per_n
 
+    def why_not_at_rest(self, sample: SkinSample) -> str:
+        """Return why a zero of such samples would be refused by the calibration; empty for one without resistances."""
+        if sample.r1_ohm is None or sample.r2_ohm is None:
+            return ""
+        return self._taker.why_not_at_rest(sample.r1_ohm, sample.r2_ohm)
+
     @property
     def fixed(self) -> dict[str, object]:
         """What follows from the configuration, and is no state."""
@@ -221,7 +249,9 @@ class SkinEstimator:
         response = response_1 - response_2
         time_s = sample.t_mid_ns / 1e9
         direction = self._finder.update(time_s, response)
-        deviation, reasons = _deviation(self._calibration, response_1, response_2)
+        rest_ohm = self.zero.r1_ohm, self.zero.r2_ohm
+        exchanged = are_exchanged(rest_ohm, sample.r1_ohm, sample.r2_ohm, EXCHANGED_TOLERANCE)
+        deviation, reasons = _deviation(self._calibration, response_1, response_2, exchanged=exchanged)
         wider = self.zero.uncertainty + self._drift_per_s * (time_s - self._zero_s) + deviation
         interval = self._calibration.shear_from_response(response, self._normal_n, direction, wider)
         if math.isinf(interval.low_n) or math.isinf(interval.high_n):
@@ -258,12 +288,16 @@ class SkinEstimator:
             self._finder.restart()
 
 
-def _deviation(calibration: SkinCalibration, response_1: float, response_2: float) -> tuple[float, tuple[str, ...]]:
+def _deviation(
+    calibration: SkinCalibration, response_1: float, response_2: float, *, exchanged: bool
+) -> tuple[float, tuple[str, ...]]:
     """Return how far the gauges deviate from any load, and the reasons if that is too far.
 
-    The rest is an error of the zero or a drift.
+    The rest is an error of the zero or a drift. `exchanged`: each gauge has the other one's resistance at rest.
     """
     deviation = calibration.slack_deviation(response_1, response_2)
+    if exchanged and abs(deviation) > EXCHANGED_DEVIATION:
+        return 0.0, ("R₁ and R₂ are the zero's, but exchanged: the wires of the gauges are swapped; exchange them",)
     if abs(deviation) <= MAX_DEVIATION:
         return abs(deviation), ()
     gauge = 1 if response_1 < response_2 else 2

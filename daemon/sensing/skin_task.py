@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import structlog
@@ -15,7 +15,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest, ZeroState
-from shearloop.daemon.torques import LARGEST_DRIFT_NM, SensorListener, TorqueSample, TorqueSource
+from shearloop.daemon.torques import SensorListener, TorqueSample, TorqueSource
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
@@ -173,8 +173,9 @@ class SkinTask:
         self._reason = message.reason
         self._valid += reading.valid
         if self._radius_m is not None and self._loop is not None:
+            torque = skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns)
             loaded_nm = self._estimator.loaded_n * self._radius_m
-            self._loop.on_torque(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns, loaded_nm))
+            self._loop.on_torque(replace(torque, loaded_nm=loaded_nm, load=self._estimator.why_not_at_rest(sample)))
         self._publisher.publish(message)
 
 
@@ -204,14 +205,12 @@ def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | No
     )
 
 
-def skin_torque(
-    reading: SkinReading, radius_m: float, t_mid_ns: int, now_ns: int, loaded_nm: float = LARGEST_DRIFT_NM
-) -> TorqueSample:
-    """Return the torque of a shear force at a radius, with the band that friction leaves; `loaded_nm` as there."""
+def skin_torque(reading: SkinReading, radius_m: float, t_mid_ns: int, now_ns: int) -> TorqueSample:
+    """Return the torque of a shear force at a radius, with the band that friction leaves."""
     if reading.band is None:
         return TorqueSample(SKIN, None, "; ".join(reading.reasons), t_mid_ns, now_ns)
     force_nm, low_nm, high_nm = (force_n * radius_m for force_n in reading.band)
-    return TorqueSample(SKIN, force_nm, "", t_mid_ns, now_ns, low_nm, high_nm, loaded_nm)
+    return TorqueSample(SKIN, force_nm, "", t_mid_ns, now_ns, low_nm, high_nm)
 
 
 def skin_torque_source(config: SkinConfig) -> TorqueSource | None:

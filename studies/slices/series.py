@@ -11,7 +11,7 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
-from shearloop.estimation.values import check_finite_values
+from shearloop.estimation.series import check_finite_values
 from shearloop.tools.frame_series import check_paths_differ, part_of
 from shearloop.tools.recordings.matlab_import import (
     DIAMETER_FOLDER,

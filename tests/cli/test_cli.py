@@ -2,6 +2,7 @@
 
 import argparse
 import ctypes
+import json
 import os
 import re
 import shutil
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn
@@ -29,8 +31,7 @@ from shearloop.cli.registry import COMMANDS, GROUPS, OTHER_SPELLINGS, command_mo
 from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
-from shearloop.daemon.messaging.deadlines import boot_ns
-from shearloop.daemon.messaging.messages import EitEstimate, RobotStateMessage, decode, encode, wire_map
+from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, RobotStateMessage, decode, encode, wire_map
 from shearloop.daemon.rig import LOOP_KEYS
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.sessions import COMBINED
@@ -629,28 +630,48 @@ def test_a_command_names_the_running_daemon_and_unlock_names_the_waiting_stop(na
     assert capsys.readouterr().err == (said if name == "unlock" else "")
 
 
-@pytest.mark.parametrize(("name", "sent"), [("start", False), ("unlock", False), ("pause", True)])
-def test_a_command_that_was_held_up_is_not_sent_unless_it_lets_nothing_move(name, sent, monkeypatch, capsys):
-    """Ctrl-Z, or a suspended computer, between the person's word and the daemon."""
-    asked: list[str] = []
+@pytest.mark.parametrize("name", ["status", "start", "pause", "tare", "experiments"])
+@pytest.mark.parametrize("ok", [True, False])
+def test_a_command_to_an_emulated_rig_says_so(name, ok, monkeypatch, tmp_path, capsys):
+    reply = {"ok": ok, "reason": "not now", "taring": [], "tasks": {}, "experiments": [], "configured": ""}
+    replies = {"status": {**reply, "ok": ok or name != "status"}}
+    address = f"ipc://{tmp_path}/commands"
+    monkeypatch.setattr(
+        "shearloop.daemon.messaging.client.send_command",
+        lambda _address, asked, *_: {**replies.get(asked["command"], reply), "emulated": True},
+    )
+    assert main(["command", name, "--connect", address]) == (0 if ok else 1)
+    said = capsys.readouterr()
+    assert "EMULATED: " in (said.out if ok else said.err)
+    assert main(["command", name, "--connect", address, "--json"]) == (0 if ok else 1)
+    assert json.loads(capsys.readouterr().out)["emulated"] is True
 
-    def answers(_address: str, content: dict[str, Any], *_: object) -> dict[str, Any]:
-        asked.append(content["command"])
-        return {"ok": True, "daemon": {"instance": "a1", "now_ns": 1}}
 
-    monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", answers)
-    monkeypatch.setattr("shearloop.cli.command.boot_ns", lambda: boot_ns() + 6_000_000_000)
-    assert main(["command", name]) == (0 if sent else 2)
-    assert asked == ["status", name][: 1 + sent]
-    assert ("asked for 6.0 s ago, and nothing begins later than 5 s after that" in capsys.readouterr().err) is not sent
+@pytest.mark.parametrize("emulated", [False, True])
+@pytest.mark.parametrize("as_json", [False, True])
+def test_listen_says_first_that_the_rig_is_emulated(emulated, as_json, tmp_path, capsys):
+    address = f"ipc://{tmp_path}/publish"
+    with zmq.Context() as context, closing(context.socket(zmq.XPUB)) as daemon:
+        daemon.bind(address)
 
+        def publish() -> None:
+            # Each subscription is announced once, and `listen` has two.
+            topics = {daemon.recv(), daemon.recv()}
+            assert topics == {b"\x01loop.state", b"\x01health"}
+            for topic in ("loop.state", "health"):
+                content = wire_map(
+                    sample(TOPICS[topic], **({"emulated": emulated} if topic == "health" else {})), 1.5, 0
+                )
+                daemon.send_multipart([topic.encode(), encode(content)])
 
-def test_a_command_is_as_old_as_its_process():
-    program = "from shearloop.daemon.messaging.deadlines import process_began_ns; print(process_began_ns())"
-    before_ns = boot_ns()
-    began_ns = int(subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout)
-    tick_ns = 10_000_000
-    assert before_ns - tick_ns <= began_ns <= boot_ns()
+        sending = threading.Thread(target=publish)
+        sending.start()
+        options = ["--json"] if as_json else []
+        assert main(["listen", "loop.state", "--count", "1", "--connect", address, *options]) == 0
+        sending.join()
+    out, err = capsys.readouterr()
+    assert ("EMULATED" in (err if as_json else out.splitlines()[0])) is emulated
+    assert len(out.splitlines()) == (1 if as_json or not emulated else 2)
 
 
 @pytest.mark.parametrize("given", [(), ("--connect", "tcp://127.0.0.1:9762")])

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from shearloop.cli import demo
-from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 
 CONFIG = DaemonConfig(load_cell={"device": {"path": "load"}})
@@ -24,9 +25,27 @@ def test_a_taken_port_is_named_before_anything_is_built(monkeypatch):
         other.listen()
         port = other.getsockname()[1]
         config = CONFIG.model_copy(update={"publish": f"tcp://127.0.0.1:{port}", "commands": "ipc:///tmp/nobody"})
-        with pytest.raises(UserError, match=f"127.0.0.1:{port} is taken by another program"):
-            demo.check_ports(config, None)
-    demo.check_ports(config, None)
+        with pytest.raises(UserError, match=f"127.0.0.1:{port} is taken by another program") as refused:
+            demo.check_ports(config, Path("my/config/demo.yaml"))
+    assert "in my/config/demo.yaml, which `shearloop demo --prepare --folder my` writes; --port" in str(refused.value)
+    demo.check_ports(config, Path("my/config/demo.yaml"))
+
+
+@pytest.mark.parametrize("taken", [False, True])
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_demo_beside_another_emulated_robot_plays_its_own_elsewhere(taken, monkeypatch, capsys):
+    """`run --emulate` does so too."""
+    other = "127.0.0.1"
+    monkeypatch.setattr("shearloop.cli.free_ports.is_free", lambda host, _port: not (taken and host == other))
+    path = Path("config/demo.yaml")
+    with demo.elsewhere(load_daemon_config(path)) as options:
+        values = dict(value.split("=", 1) for value in options[1::2])
+        moved = load_daemon_config(path, values)
+        hosts = {read_settings(moved.robot).host, moved.gripper.socket.host}
+    assert hosts == {"127.0.0.2" if taken else other}
+    assert bool(options) is taken
+    assert not taken or moved.emulators[0].arguments[-2:] == ("--host", "127.0.0.2")
+    assert ("this one is played at 127.0.0.2" in capsys.readouterr().out) is taken
 
 
 def test_what_a_command_runs_ends_with_it_also_after_kill():

@@ -1,6 +1,7 @@
 """A second daemon at the addresses of one that runs: it is named before anything is built, started or bound."""
 
 from contextlib import closing
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -28,7 +29,7 @@ def answering(monkeypatch, reply):
 def test_a_second_demo_is_refused_by_name(monkeypatch):
     answering(monkeypatch, {"ok": True, "tasks": {}, "daemon": RUNNING})
     with pytest.raises(UserError, match=rf"{NAMED}.*`shearloop command stop --connect"):
-        demo.check_ports(DaemonConfig(load_cell={"device": {"path": "load"}}), None)
+        demo.check_ports(DaemonConfig(load_cell={"device": {"path": "load"}}), Path("my/config/demo.yaml"))
 
 
 def test_a_demo_that_is_refused_leaves_no_folder_behind(monkeypatch, tmp_path, mistake):

@@ -87,6 +87,37 @@ async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing():
         assert rest.data == b"kept"
 
 
+async def test_bytes_that_waited_while_the_reader_was_away_say_since_when(monkeypatch):
+    away_ns = 0
+    real_ns = time.monotonic_ns
+    monkeypatch.setattr(
+        connection, "time", SimpleNamespace(monotonic=time.monotonic, monotonic_ns=lambda: real_ns() + away_ns)
+    )
+    with PtyPort() as peer, SerialPort(peer.path) as port:
+        async with asyncio.timeout(DEADLINE_S):
+            reading = asyncio.create_task(port.read(DEADLINE_S))
+            await asyncio.sleep(0)
+            await peer.write(b"in time")
+            assert (await reading).waited_since_ns is None
+            before_ns = connection.time.monotonic_ns()
+            # Nobody reads while these bytes come.
+            await peer.write(b"waited")
+            away_ns += 2 * connection.AWAY_NS
+            received = await port.read(DEADLINE_S)
+            assert received.data == b"waited"
+            assert received.waited_since_ns <= before_ns
+            # So may bytes that the kernel delivers late.
+            await peer.write(b"too")
+            assert (await port.read(DEADLINE_S)).waited_since_ns == received.waited_since_ns
+            assert await port.read(0.0) is None
+            away_ns += 2 * connection.AWAY_NS
+            assert await port.read(0.0) is None
+            reading = asyncio.create_task(port.read(DEADLINE_S))
+            await asyncio.sleep(0)
+            await peer.write(b"in time again")
+            assert (await reading).waited_since_ns is None
+
+
 async def test_a_read_or_write_after_the_port_has_gone_raises_device_lost():
     with PtyPort() as peer, SerialPort(peer.path) as port:
         reading = asyncio.create_task(port.read(DEADLINE_S))

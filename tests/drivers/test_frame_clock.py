@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.io import loadmat
 
+from shearloop.drivers.connection import AWAY_NS
 from shearloop.drivers.eit_kit import FrameClock, slope_below
 
 PERIOD_NS = 541_200_000
@@ -43,7 +44,7 @@ def test_a_reader_that_was_away_is_late_once_and_then_on_time_again():
 def test_a_refused_line_takes_a_period_too():
     truth = sent(80)
     clock = FrameClock(PERIOD_NS)
-    errors = [clock.arrived(int(t), missed=n == 51) - t for n, t in enumerate(truth) if n != 50]
+    errors = [clock.arrived(int(t), rejected=int(n == 51)) - t for n, t in enumerate(truth) if n != 50]
     assert max(map(abs, errors)) < 1_000_000
 
 
@@ -64,6 +65,66 @@ def test_frames_that_an_emulated_board_sends_late_are_late_and_none_is_missing()
     patient = FrameClock(PERIOD_NS, longest_gap=25.0)
     assert abs(straightened(arrivals, patient) - truth).max() < 1_000_000
     assert np.diff(straightened(arrivals)).max() > 5 * PERIOD_NS, "of a real board they may be missing"
+
+
+def read_between_absences(truth: np.ndarray, absences: list[tuple[int, int]]) -> list[tuple[int, int | None]]:
+    """Return when each frame is read, one by one, and since when it may have waited, as a port says it.
+
+    An absence begins at a time in ns and lasts for so long.
+    """
+    found: list[tuple[int, int | None]] = []
+    read_ns = waited_until_ns = empty_ns = since_ns = 0
+    for sent_ns in truth.tolist():
+        if sent_ns > read_ns:
+            # The port is empty: the reader looks until the frame comes, or until it is kept from looking.
+            read_ns = sent_ns
+            empty_ns = min(
+                [sent_ns, *(begin_ns for begin_ns, for_ns in absences if begin_ns <= sent_ns < begin_ns + for_ns)]
+            )
+        for begin_ns, for_ns in absences:
+            if begin_ns <= read_ns < begin_ns + for_ns:
+                read_ns = begin_ns + for_ns
+        if read_ns - empty_ns > AWAY_NS:
+            since_ns, waited_until_ns = empty_ns, read_ns + AWAY_NS
+        found.append((read_ns, since_ns if read_ns <= waited_until_ns else None))
+        read_ns += 10_000_000
+    return found
+
+
+@given(st.lists(st.tuples(st.integers(25, 60), st.floats(0.25, 20.0)), min_size=1, max_size=4))
+def test_frames_that_waited_for_their_reader_keep_the_times_of_a_board_that_was_never_late(stalls):
+    """However long the reader was away, and however often: after 1.3 s it counted as a pause of the board."""
+    truth = sent(90)
+    absences, free_ns = [], 0
+    for after, periods in sorted(stalls):
+        begin_ns = max(free_ns, int(truth[after]) + 100_000_000)
+        free_ns = begin_ns + int(periods * PERIOD_NS)
+        absences.append((begin_ns, free_ns - begin_ns))
+    clock = FrameClock(PERIOD_NS)
+    read = read_between_absences(truth, absences)
+    errors_ns = [clock.arrived(t_ns, 0, since) - t for (t_ns, since), t in zip(read, truth.tolist(), strict=True)]
+    assert max(map(abs, errors_ns)) < 1_000_000
+
+
+def test_a_line_that_was_refused_while_the_reader_was_away_takes_one_period():
+    truth = sent(80)
+    clock = FrameClock(PERIOD_NS)
+    read = read_between_absences(truth, [(int(truth[40]) + 100_000_000, 6 * PERIOD_NS)])
+    errors_ns = [clock.arrived(t_ns, int(n == 43), since) - truth[n] for n, (t_ns, since) in enumerate(read) if n != 42]
+    assert max(map(abs, errors_ns)) < 1_000_000
+
+
+@pytest.mark.parametrize("periods", [3.3, 5.5, 30.0])
+def test_a_board_that_stopped_while_its_reader_was_away_is_followed(periods):
+    """A board whose frames nobody reads blocks once the buffers are full: it goes on when it is read again."""
+    truth, capacity = sent(80), 2
+    away_ns = int(truth[40]) + 100_000_000
+    blocked = truth[40 + capacity] + int(periods * PERIOD_NS)
+    truth[41 + capacity :] = blocked + np.arange(80 - 41 - capacity) * PERIOD_NS
+    read = read_between_absences(truth, [(away_ns, int(blocked - PERIOD_NS - away_ns))])
+    clock = FrameClock(PERIOD_NS)
+    errors_ns = [clock.arrived(t_ns, 0, since) - t for (t_ns, since), t in zip(read, truth.tolist(), strict=True)]
+    assert max(map(abs, errors_ns)) < 1_000_000
 
 
 def test_frames_queued_before_the_first_read_do_not_spoil_the_period():

@@ -174,6 +174,21 @@ def test_frames_that_waited_together_are_stamped_a_period_apart():
     assert middles == pytest.approx([29.5, 30.5, 31.5, 32.5, 33.5], abs=0.01)
 
 
+def test_frames_that_waited_and_are_read_one_by_one_are_stamped_a_period_apart():
+    parser = FrameParser(PAPER_TABLE.zero_slots)
+    for number in range(30):
+        parser.feed(LINES[number % 2], number * PERIOD_NS)
+    middles = []
+    # The reader was away from frame 30 to shortly after frame 35; then all is as before.
+    for number in range(30, 40):
+        t_ns = max(number * PERIOD_NS, 35 * PERIOD_NS + number * 1_000_000)
+        if number < 36:
+            parser.handle(RawEvent(InputKind.WAITED, t_ns, str(29 * PERIOD_NS + 1).encode()))
+        (frame,) = parser.handle(RawEvent(InputKind.DATA, t_ns, LINES[number % 2]))
+        middles.append((frame.t_mid_ns + eit_kit.TRANSFER_NS) / PERIOD_NS)
+    assert middles == pytest.approx(np.arange(29.5, 39.5), abs=0.01)
+
+
 @given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3 * PERIOD_NS)), max_size=25))
 def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts):
     parser, now_ns, middles = FrameParser(PAPER_TABLE.zero_slots), 0, []

@@ -13,7 +13,7 @@ from shearloop.drivers.connection import Link, LinkEvent, LinkMonitor, Port, Rec
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
-from shearloop.drivers.serial_sensor import BOOT_S, LONGEST_PATIENCE, SILENT_PERIODS, SerialSensor
+from shearloop.drivers.serial_sensor import BOOT_S, LONGEST_PATIENCE, SILENT_PERIODS, InputKind, RawEvent, SerialSensor
 from shearloop.drivers.shear_skin.instruments import AdcBoard
 
 # What each board sends, and a line that it accepts.
@@ -34,11 +34,11 @@ REFUSED = {
 
 @dataclass(eq=False)
 class PlayedLink(Link):
-    """A link whose ports send bytes at times after their opening, in s; None is a silence."""
+    """A link whose ports send bytes at times after their opening, in s, or what was received; None is a silence."""
 
     events: list[LinkEvent] = field(default_factory=list)
     refusals: list[str] = field(default_factory=list)
-    reads: list[tuple[float, bytes | None]] = field(default_factory=list)
+    reads: list[tuple[float, bytes | Received | None]] = field(default_factory=list)
     # How long each read would have waited.
     waits_s: list[float] = field(default_factory=list)
 
@@ -57,7 +57,9 @@ class PlayedLink(Link):
         async def read(timeout_s: float) -> Received | None:
             self.waits_s.append(timeout_s)
             after_s, data = next(reads, (0.0, None))
-            return None if data is None else Received(data, opened_ns + round(1e9 * after_s))
+            if data is None or isinstance(data, Received):
+                return data
+            return Received(data, opened_ns + round(1e9 * after_s))
 
         async def write(_data: bytes) -> None:
             pass
@@ -73,6 +75,25 @@ async def played(board: SerialSensor[object], link: PlayedLink, losses: int) -> 
         async for _ in batches:
             if len(link.losses()) >= losses:
                 break
+
+
+class Kept(list[RawEvent]):
+    """A recorder of inputs that keeps them."""
+
+    wants_state = False
+
+    def record(self, event: RawEvent) -> None:
+        self.append(event)
+
+
+async def test_that_bytes_may_have_waited_is_an_input_before_them():
+    """A replay then stamps them as the daemon did."""
+    kept = Kept()
+    link = PlayedLink(reads=[(0.0, Received(b"0.01\n", 900, 700)), (0.1, b"0.02\n")])
+    await played(LoadCell(link, LoadCalibration.of_torque_lines(), inputs=kept), link, losses=1)
+    kinds = [event.kind for event in kept]
+    assert kinds[:4] == [InputKind.OPENED, InputKind.WAITED, InputKind.DATA, InputKind.DATA]
+    assert (kept[1].t_ns, kept[1].data) == (900, b"700")
 
 
 def every(period_s: float, data: bytes, until_s: float = 30.0) -> Iterator[tuple[float, bytes]]:

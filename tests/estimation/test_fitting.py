@@ -11,7 +11,7 @@ from shearloop.estimation.bank_estimators import BankEstimator
 from shearloop.estimation.bank_match import BankMatch
 from shearloop.estimation.estimator import Estimator, OutputModel
 from shearloop.estimation.motion_regression import MotionRegression
-from tests.estimation.conftest import twisting
+from tests.estimation.conftest import kept, twisting
 
 
 def with_a_nan(series, name):
@@ -95,3 +95,12 @@ def test_a_frame_that_fits_two_positions_of_the_bank_is_not_fitted(monkeypatch, 
     (features,) = fitted
     assert len(features) > 100
     assert features[:, 0].max() < 9.0
+
+
+def test_of_a_board_that_leaves_out_half_of_its_frames_nothing_is_fitted():
+    """The daemon knows the board's period, and gives no torque there."""
+    whole = twisting(tips=(1,))
+    number = np.arange(len(whole.t_s))
+    half = kept(whole, number % 5 % 2 == 0)
+    with pytest.raises(CalibrationError, match="no frame of the recordings is gripped and undisturbed"):
+        fit("motion_regression", [replace(half, period_s=0.54)], "rig", timing=TRUSTED)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import FrameSeries, Measured, TactileFrame, combine
-from shearloop.estimation.values import distinct
+from shearloop.estimation.series import distinct
 
 measurements = st.builds(Measured, st.floats(-1e3, 1e3, allow_nan=False), st.floats(1e-3, 1e3, allow_nan=False))
 

@@ -16,7 +16,7 @@ from shearloop.cli import main
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.estimation.bank_match import NOT_TURNED, RefinedMatcher
-from shearloop.estimation.values import FrameSeries
+from shearloop.estimation.series import FrameSeries
 from shearloop.studies.slices.scene import scene_of_slices
 from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.bank_config import FingertipGeometryConfig, load_bank_plan, load_geometry

@@ -9,7 +9,8 @@ import pytest
 
 from shearloop.errors import UserError
 from shearloop.estimation.grips import find_grips
-from shearloop.estimation.values import Estimate, FrameSeries
+from shearloop.estimation.series import FrameSeries
+from shearloop.estimation.values import Estimate
 from shearloop.studies.slices.evaluate import no_better_than_place
 from shearloop.studies.slices.leave_out import SliceRecipe, find_levels, plan_levels
 from shearloop.studies.slices.series import SliceSeries
@@ -143,6 +144,20 @@ def test_the_first_twist_adapts_and_is_neither_fitted_nor_judged(kind, n_blocks)
     assert "Before adapting" in sentences_of(result)[-2]
     if kind == "grips":
         assert figures["loaded"]["rmse_nm"] < 0.8 * figures["before_adapting"]["rmse_nm"]
+
+
+@pytest.mark.parametrize("kind", ["twists", "tools"])
+def test_a_load_cell_that_reads_negative_is_judged_alike(kind):
+    recordings = [of_tool(size_mm, 1) for size_mm in (10.0, 20.0, 40.0)] if kind == "tools" else MATERIAL[kind]()
+    mirrored = [replace(one, torque_nm=-one.torque_nm) for one in recordings]
+    names = [f"{number}.mcap" for number in range(len(recordings))]
+    found, of_mirrored = (
+        plan_left_out(kind, RECIPE, one, names).judge(SerialExecutor()).figures() for one in (recordings, mirrored)
+    )
+    for same in ("n", "rmse_nm", "coverage_95", "interval_nm", "gain", "baseline_ratio"):
+        assert of_mirrored["loaded"][same] == found["loaded"][same], same
+    assert found["loaded"]["n"] > 0
+    assert of_mirrored["loaded"]["bias_nm"] == pytest.approx(-found["loaded"]["bias_nm"])
 
 
 def off_by(played, error_nm: float) -> EstimateTrack:

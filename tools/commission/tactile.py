@@ -30,7 +30,7 @@ class TactileSensor:
         self._session, self._boards, self._period_s = session, boards, period_s
         # The frames of each board from this time on were not taken.
         self._from_ns = dict.fromkeys(boards, 0)
-        self._pairing = FramePairing(tuple(boards), period_s)
+        self._pairing: FramePairing[Frame] = FramePairing(tuple(boards), period_s)
 
     def _next(self) -> list[Estimate]:
         """Wait for a frame of each board, and return the estimates of all frames since the last call."""

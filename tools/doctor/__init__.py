@@ -16,11 +16,19 @@ from shearloop.bank.errors import BankError
 from shearloop.daemon.commissioning import commissioning_of
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
 from shearloop.daemon.rig import configured_settings
+from shearloop.daemon.running_rig import EMULATED, whose_daemon
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import missing_library
 from shearloop.errors import UserError
 from shearloop.tools.check import OPEN_KEYS, CheckEmulators, check_parts
-from shearloop.tools.doctor.devices import check_daemon, check_devices, daemon_tasks, listen_for_frames
+from shearloop.tools.doctor.devices import (
+    DAEMON_TIMEOUT_S,
+    another_rig,
+    ask_status,
+    check_daemon,
+    check_devices,
+    listen_for_frames,
+)
 from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, split_cure, trouble
 from shearloop.tools.doctor.robot_values import check_robot_values
 from shearloop.tools.serial_ports import HiddenBoard, has_brltty, list_hidden_boards, list_serial_ports
@@ -72,37 +80,45 @@ def examine(
         yield from_file("configuration", str(error), "the daemon does not start")
         return
     yield good("configuration", f"{config_path} is in order")
+    if config.emulated:
+        yield good(EMULATED, "every device of this configuration is emulated: nothing here is said of real ones")
     yield check_disk(Path() if config.recording is None else config.recording.folder)
     yield from check_files(config, config_path, check_emulators, own)
     if config.robot is not None and not config.emulated:
         yield from check_robot_values(config.robot)
         yield from check_cap(config)
-    tasks = daemon_tasks(config.commands)
-    if tasks and (missing := _device_names(config) - tasks.keys()):
-        found = (
-            f"another configuration's daemon answers at {config.commands}: it has no {' and '.join(sorted(missing))}"
+    yield from check_daemon_and_devices(config, config_path, seconds)
+
+
+def check_daemon_and_devices(config: DaemonConfig, config_path: Path, seconds: float) -> Iterator[Finding]:
+    """Examine the devices, through the daemon that has them if it is this configuration's."""
+    reply = ask_status(config.commands)
+    if reply is None:
+        yield good("daemon", "not running with this configuration: the devices are free")
+    elif not reply:
+        found = f"a daemon has the address {config.commands} and does not answer within {DAEMON_TIMEOUT_S:g} s"
+        means = "it hangs, or the computer is too busy; it may be this configuration's, and have the devices"
+        yield trouble("daemon", found, means, "look at its log; end it, then run the doctor again")
+    elif differs := another_rig(config, reply):
+        means = f"this configuration's daemon cannot start while it runs; the two differ in {differs}"
+        cure = (
+            "end it, or restart it if the file has changed since its start; to run both, give one of them other "
+            "values of `publish` and `commands`"
         )
-        cure = "stop that daemon, or give one of the two other values of `publish` and `commands`"
-        yield trouble(
-            "daemon", found, "this configuration's devices were not examined, and its daemon cannot start", cure
-        )
-    elif tasks is not None:
-        yield good("daemon", f"answers at {config.commands}; it holds the devices and reports on them")
+        found = f"a daemon of another configuration answers at {config.commands}: {whose_daemon(reply)}"
+        yield trouble("daemon", found, means, cure)
+    else:
+        holds = f"answers at {config.commands}: {whose_daemon(reply)}; it holds the devices and reports on them"
+        yield good("daemon", holds)
         received = {} if "publish" in config.network_addresses else listen_for_frames(config.publish, seconds)
-        yield from check_daemon(config, tasks, received)
-    elif config.emulators:
+        yield from check_daemon(config, reply.get("tasks", {}), received)
+        return
+    if config.emulators:
         means = "they exist only while the daemon runs"
         cure = f"`shearloop run {shlex.quote(str(config_path))}`, then run the doctor again"
         yield note("devices", "the configuration emulates them", means, cure)
     else:
-        yield good("daemon", "not running with this configuration: the devices are free")
         yield from asyncio.run(check_devices(config, seconds))
-
-
-def _device_names(config: DaemonConfig) -> set[str]:
-    """Return the names in `health` of the devices of a configuration."""
-    single = ("skin", "load_cell", "robot", "gripper")
-    return {*config.fingertips, *(name for name in single if getattr(config, name) is not None)}
 
 
 def check_computer() -> Iterator[Finding]:

@@ -16,6 +16,7 @@ from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.rig_identity import why_not_emulated
+from shearloop.daemon.running_rig import RunningRig
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.ur.control_box import check_generation, check_ports, query_controller, untested_sentence
@@ -39,6 +40,8 @@ from shearloop.tools.task_row import task_row
 
 ROBOT_TIMEOUT_S = 2.0
 DAEMON_TIMEOUT_S = 1.0
+# What a daemon's rig is compared by, beside its devices, with the keys in the configuration.
+_COMPARED = {"rig": "name", "emulated": "emulated", "publish": "publish"}
 
 
 async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
@@ -150,15 +153,33 @@ def check_identity(config: DaemonConfig, settings: UrSettings, version: str, ser
         yield note("commissioned robot", what, "an experiment that asks for more is refused", cure)
 
 
-def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
-    """Return the status of a running daemon's tasks; None when no daemon answers."""
+def ask_status(address: str) -> Mapping[str, Any] | None:
+    """Return the reply of a running daemon to `status`: None without a daemon, empty from one that does not answer."""
+    request = {"command": "status"}
     try:
-        request = {"command": "status"}
         reply = send_to_stop_socket(address, request, DAEMON_TIMEOUT_S)
-        tasks = (reply or send_command(address, request, DAEMON_TIMEOUT_S)).get("tasks")
-    except (UserError, TimeoutError):
-        return None
-    return tasks if isinstance(tasks, dict) else {}
+    except TimeoutError:
+        return {}
+    except UserError:
+        # Another user's program has the name of its stop socket.
+        reply = None
+    with contextlib.suppress(UserError):
+        return reply or send_command(address, request, DAEMON_TIMEOUT_S)
+    return None
+
+
+def another_rig(config: DaemonConfig, reply: Mapping[str, Any]) -> str:
+    """Return how the rig of the daemon that gave this reply to `status` differs, or an empty string."""
+    host = None
+    if config.robot is not None:
+        # The mistakes in the settings are among the findings on files.
+        with contextlib.suppress(DriverError):
+            host = read_settings(config.robot).host
+    own, theirs = RunningRig.of(config, host).facts(), dict(reply.get("daemon", {}))
+    keys = [key for fact, key in _COMPARED.items() if own[fact] != theirs.get(fact)]
+    devices, others = own["devices"], theirs.get("devices") or {}
+    keys += [key for key in sorted({*devices, *others}) if devices.get(key) != others.get(key)]
+    return ", ".join(f"`{key}`" for key in keys)
 
 
 def listen_for_frames(address: str, seconds: float) -> dict[str, list[Mapping[str, Any]]]:

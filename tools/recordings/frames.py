@@ -1,5 +1,6 @@
 """The frames, torques and tools of a recording as arrays, to fit or judge an estimator."""
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -62,6 +63,8 @@ class Recording:
     left_out: tuple[str, ...] = ()
     # Whether every device was emulated.
     emulated: bool = False
+    # By side, the frame period that the daemon was configured with.
+    periods_s: Mapping[str, float] = field(default_factory=dict)
 
 
 class _Row(NamedTuple):
@@ -139,6 +142,7 @@ def read_recording(path: str | Path) -> Recording:
         sides = {topic: topic.removeprefix(prefix) for topic in recording.counts if topic.startswith(prefix)}
         inputs = {schema.input_topic(side): side for side in sides.values()}
         live = bool(inputs) and recording.counts.keys() >= inputs.keys()
+        periods_s = _configured_periods_s(recording.attachments().get(schema.CONFIGURATION))
         found = _Messages(table.n_line_values)
         for channel, message in recording.messages([schema.LOAD_TOPIC, *sides, *inputs]):
             topic, t_ns = channel.topic, message.log_time
@@ -170,7 +174,20 @@ def read_recording(path: str | Path) -> Recording:
         live=live,
         left_out=tuple(found.left_out()),
         emulated=schema.EMULATED in identity,
+        periods_s=periods_s,
     )
+
+
+def _configured_periods_s(configuration: bytes | None) -> dict[str, float]:
+    """Return the frame period of each fingertip by an attached configuration, where it has one."""
+    found: dict[str, float] = {}
+    content = from_json(configuration) if configuration is not None else {}
+    fingertips = content.get("fingertips") if isinstance(content, dict) else None
+    for side, own in fingertips.items() if isinstance(fingertips, dict) else ():
+        period_s = own.get("frame_period_s") if isinstance(own, dict) else None
+        if isinstance(period_s, int | float) and 0.0 < period_s < math.inf:
+            found[side] = float(period_s)
+    return found
 
 
 def _side_frames(rows: list[_Row], moved: Collection[int]) -> SideFrames:

@@ -296,7 +296,7 @@ class Replay:
             )
             for name, fingertip in config.fingertips.items()
         }
-        self._pairing: FramePairing | None = None
+        self._pairing: FramePairing[Frame] | None = None
         if config.combined is not None:
             self._sessions[COMBINED] = combined = open_combined(config.combined, config.fingertips)
             sides = combined.calibration.sides

@@ -89,6 +89,7 @@ def test_what_measures_no_torque_is_watched_for_silence_alone():
     assert found(*heard, torque(left, None, why="no calibration"), supervising=supervising) == {}
     silent = found(*heard, torque(left, None, came_s=2.0), supervising=supervising)
     assert "the last frame of left came 2.0 s ago" in silent[FaultCode.ESTIMATE_STALE]
+    assert "torque" not in silent[FaultCode.ESTIMATE_STALE], "it never had one"
 
 
 @pytest.mark.parametrize(("measured_nm", "disagree"), [(-0.2, False), (0.2, True)])

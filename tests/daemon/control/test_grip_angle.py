@@ -292,6 +292,35 @@ async def test_a_release_is_on_the_disk_before_it_is_answered():
     assert not read_memories(FILES).grip.known
 
 
+async def second_stop(rig: Rig) -> dict[str, Any]:
+    """Return the reply to a stop while nothing runs."""
+    runner = SimpleNamespace(stop=lambda **_: None, ended_unseen=lambda: None)
+    subject, ending = SimpleNamespace(control_loop=rig.control_loop, runner=runner), asyncio.Event()
+    return await Commands(subject, None, None, None, ending, None).handlers()["stop"]({})
+
+
+@pytest.mark.parametrize("step", [{"do": "release"}, {**GRIP, "force_n": 100.0}])
+@pytest.mark.parametrize("sense", [{"uncertain": True}, {"unfelt": True}, {"moving": True}])
+async def test_a_second_stop_keeps_the_daemon_while_the_gripper_does_not_know(step, sense):
+    """The fingers have left the width of the known grip: it is forgotten, and the tool may be there."""
+    rig = stopped_fingers(twisted(), step, 80.0, sense)
+    assert "the gripper does not know whether it holds a tool" in (await second_stop(rig))["held"]
+    rig.hand = replace(rig.hand, moving=False, uncertain=True, unfelt=False, inactive=True)
+    rig.run(0.1)
+    assert "held" in await second_stop(rig), "a loss of power leaves the fingers where they are"
+    rig.hand, rig.width_mm = replace(rig.hand, uncertain=False, inactive=False), 140.0
+    rig.run(0.1)
+    assert (await second_stop(rig))["ended"]
+
+
+@pytest.mark.parametrize(("sense", "key"), [({"inactive": True}, "ended"), ({}, "held")])
+async def test_a_stop_ends_the_daemon_before_the_gripper_is_first_activated(sense, key):
+    rig = Rig(new_loop())
+    rig.hand = replace(rig.hand, uncertain=True, **sense)
+    rig.run(0.1)
+    assert key in await second_stop(rig)
+
+
 async def test_the_operator_says_that_another_tool_is_clamped():
     async with driven(TWIST, cycles=60) as cell:
         cell.runner.fingers.gripper = None

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
@@ -201,6 +202,37 @@ async def test_pairs_are_estimated_in_order_by_the_first_fingertip_that_is_free(
         await combined.process_pairs()
         assert publisher.numbers("eit.estimate", COMBINED) == [1], "its partner has arrived in the same read"
         slow.go_on.set()
+
+
+def no_partner(frames: str) -> str:
+    return f"{frames}, without a frame of the other fingertip at that time: no combined estimate"
+
+
+async def test_frames_without_a_partner_are_counted_and_logged():
+    combined = pairs(RecordingPublisher())
+    with capture_logs() as logs:
+        # The left board begins two frames later, and loses three frames.
+        for number in range(10):
+            combined.add("right", [frame(number)])
+            if number not in (0, 1, 5, 6, 8):
+                combined.add("left", [frame(number)])
+            await combined.process_pairs()
+    assert combined.count == 5
+    assert combined.diagnostics()["unpaired"] == {"right": 5, "left": 0}
+    assert [one["event"] for one in logs] == [no_partner("2 frames of right"), no_partner("1 frame of right")]
+
+
+async def test_a_board_that_stays_silent_is_named_until_the_next_pair():
+    combined = pairs(RecordingPublisher())
+    for side in ("right", "left"):
+        combined.add(side, [frame(0)])
+    await combined.process_pairs()
+    with capture_logs() as logs:
+        combined.add("right", [frame(number) for number in range(1, 21)])
+    assert [one["event"] for one in logs] == [no_partner("1 frame of right")], "the row is logged once"
+    assert combined.diagnostics()["error"] == no_partner("12 frames of right")
+    combined.add("left", [frame(20)])
+    assert combined.diagnostics()["error"] == ""
 
 
 class Reads:

@@ -212,11 +212,35 @@ def test_without_a_robot_only_present_torques_count_as_loads():
     assert latest.tare_refusal() is not None
     latest.on_torque(TorqueSample("load_cell", None, "its cable is out", 3, 3, loaded_nm=0.03))
     assert latest.tare_refusal() is None
+    latest.on_torque(TorqueSample("load_cell", None, "at the end of its range", 4, 4, load="its range has ended"))
+    assert (latest.tare_refusal() or "").startswith("load_cell is loaded: its range has ended, which would become")
+    assert latest.tare_refusal(confirmed=True) is None
+    latest.on_torque(TorqueSample("load_cell", 0.0, "", 5, 5))
     # The estimate of both fingertips ends with either of them.
     latest.on_torque(TorqueSample("combined", 0.2, "", 2, 2))
     assert latest.tare_refusal() is not None
     latest.on_link("left", "its cable is out", up=False)
     assert latest.tare_refusal() is None
+
+
+@pytest.mark.parametrize(
+    ("torque_nm", "flags", "loaded"),
+    [
+        (1.0, {"saturated": True, "spike": True}, True),
+        (-1.9, {"spike": True}, True),
+        (0.5, {"spike": True}, False),
+        (1.9, {"spike": True, "partial": True}, False),
+        (1.9, {"spike": True, "other_unit": COUNTS_REASON}, False),
+        (0.0, {"stuck": True}, False),
+    ],
+)
+async def test_a_load_that_is_too_large_for_a_torque_is_a_load_all_the_same(torque_nm, flags, loaded):
+    latest = LatestTorques()
+    async with reading(loop=latest) as (_, board):
+        board.sent.put_nowait(LoadSample(5.0, torque_nm, 1, 1, **flags))
+        await board.sent.join()
+    refusal = latest.tare_refusal() or ""
+    assert refusal.startswith("load_cell is loaded: the reading is beyond what it can measure, which") is loaded
 
 
 @pytest.mark.parametrize(

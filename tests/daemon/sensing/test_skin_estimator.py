@@ -248,7 +248,48 @@ def test_an_unnoticed_zero_under_load_is_reported_when_the_load_goes(calibration
 
 def test_gauges_that_are_swapped_after_the_zero_are_not_believed(bench):
     bench.spoil = lambda r1, r2, _: (r2, r1)
-    assert not bench.at(0.0).valid
+    (reason,) = bench.at(0.0).reasons
+    assert "the wires of the gauges are swapped; exchange them" in reason
+    assert "tare" not in reason, "it would cost the zero"
+    bench.spoil = lambda r1, r2, _: (r1, r2)
+    assert bench.at(0.0).valid
+
+
+@pytest.mark.parametrize("slack_ratio", [-0.45, -0.15, 0.18])
+def test_no_load_is_taken_for_swapped_gauges(slack_ratio):
+    bench = Bench(fit_calibration(calibration_table(SyntheticSkin(slack_ratio=slack_ratio, seed=7), NOISE)))
+    bench.skin.slack_ratio = slack_ratio
+    bench.zeroed()
+    assert all(reading.valid for shear_n in (4.0, -4.0) for reading in bench.to(shear_n))
+
+
+@pytest.mark.parametrize("gauge", [1, 2])
+def test_a_gauge_that_is_too_short_is_not_taken_for_swapped_gauges_where_both_are_alike(calibration, gauge):
+    bench = Bench(calibration.model_copy(update={"rest_ohm": (25.0, 25.0)}))
+    shorter = {gauge: 0.97}
+    bench.spoil = lambda *_: (25.0, 25.0)
+    bench.zeroed()
+    bench.spoil = lambda *_: (25.0 * shorter.get(1, 1.0), 25.0 * shorter.get(2, 1.0))
+    assert f"gauge {gauge} reads" in bench.at(0.0).reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("shear_n", "is_load"), [(0.0, False), (0.1, False), (0.4, True), (-0.4, True), (4.0, True), (6.0, True)]
+)
+def test_what_would_be_refused_as_a_zero_is_known_as_a_load_with_and_without_a_force(bench, shear_n, is_load):
+    reading, sample = bench.push(shear_n), bench.sample()
+    assert reading.valid is (shear_n < 6.0)
+    why = bench.estimator.why_not_at_rest(sample)
+    assert ("would look like that" in why) is is_load
+    assert bool(why) is is_load
+    bench.estimator.tare()
+    for _ in range(25):
+        bench.at(shear_n)
+    assert (bench.estimator.zero is None) is is_load
+
+
+def test_a_sample_without_resistances_is_no_known_load(bench):
+    assert not bench.estimator.why_not_at_rest(bench.sample(r1_ohm=None, r2_ohm=None, faults=(SkinFault.OPEN_1,)))
 
 
 @pytest.mark.parametrize(("gauge", "per_s"), [(1, -2e-4), (2, 2e-4), (2, -2e-4)])

@@ -127,7 +127,7 @@ BAD = [
     ("short 2", "gauge 2 is shorted"),
     ("reversed 1", "the sense wires of gauge 1 are reversed"),
     ("leads 500", "in compliance"),
-    ("swapped", "than any load makes it"),
+    ("swapped", "the wires of the gauges are swapped"),
     ("source unplug", "the current source does not answer"),
 ]
 
@@ -161,6 +161,14 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path):
         # A working load of this skin, which another sensor would count as drift.
         refused = await bench.command("tare", source="skin")
         assert refused["reason"].startswith("skin measures +0.01")
+        await bench.until(lambda content: content["valid"] and content["torque_nm"] > 0.01)
+        # Beyond the calibrated curve there is no torque, and all the more a load.
+        bench.skin.push(6.0)
+        await bench.until(lambda content: "beyond the calibrated curve" in content["reason"])
+        refused = await bench.command("tare", source="skin")
+        assert refused["reason"].startswith("skin is loaded: R₁ ")
+        assert "would look like that, which would become the zero; take the load off" in refused["reason"]
+        bench.skin.push(0.8)
         await bench.until(lambda content: content["valid"] and content["torque_nm"] > 0.01)
         assert await bench.command("tare", source="skin", confirmed=True) == {"ok": True, "taring": ["skin"]}
         await bench.says("the zero was refused and is taken again")

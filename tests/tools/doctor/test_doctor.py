@@ -1,9 +1,11 @@
 """`shearloop doctor` and `ports`: every finding says what was found, what it means, and the next step."""
 
 import asyncio
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -12,7 +14,9 @@ from shearloop.cli.emulator_processes import check_emulators
 from shearloop.daemon.config import CurveConfig, SerialDevice, load_daemon_config
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
+from shearloop.daemon.running_rig import RunningRig
 from shearloop.tools import doctor, serial_ports
+from shearloop.tools.doctor import devices
 from shearloop.tools.doctor.boards import check_port
 from shearloop.tools.doctor.devices import check_task
 from shearloop.tools.doctor.findings import from_error
@@ -45,13 +49,44 @@ async def examined(path: Path, seconds: float) -> dict[str, doctor.Finding]:
     return {finding.subject: finding for finding in findings}
 
 
-async def test_a_daemon_of_another_configuration_at_the_same_address_is_named(rig_config, monkeypatch):
-    others = {"left": {}, "robot": {}, "loop": {}}
-    monkeypatch.setattr(doctor, "daemon_tasks", lambda _: others)
+def answering(monkeypatch, config, **changes):
+    """Let a daemon answer with this configuration's rig, and some facts of it changed."""
+    facts = {"process": 4711, "folder": "/home/ann", **RunningRig.of(config, HOST).facts(), **changes}
+    tasks = {name: {"alive": True} for name in ("right", "load_cell", "robot", "gripper")}
+    reply = {"ok": True, "tasks": tasks, "daemon": facts}
+    monkeypatch.setattr(devices, "send_to_stop_socket", lambda *_: reply)
+
+
+@pytest.mark.parametrize(
+    ("changes", "differs"),
+    [
+        ({"rig": "bench", "emulated": True}, "`name`, `emulated`"),
+        ({"devices": {"load_cell.device": "/tmp/load"}}, "`load_cell.device`, `robot`"),
+        ({"publish": "tcp://127.0.0.1:9"}, "`publish`"),
+    ],
+)
+async def test_another_rigs_daemon_is_named_and_the_devices_are_examined(rig_config, monkeypatch, changes, differs):
+    answering(monkeypatch, load_daemon_config(rig_config), **changes)
     found = await examined(rig_config, 0.1)
     assert found["daemon"].state == "trouble"
-    assert found["daemon"].found.endswith("it has no gripper and load_cell and right")
+    label = "EMULATED, " if "emulated" in changes else ""
+    assert f": {label}process 4711 ({changes.get('rig', 'config')}) in /home/ann" in found["daemon"].found
+    assert differs in found["daemon"].means
     assert "task robot" not in found
+    assert found["port of right"].state == "trouble"
+
+
+async def test_this_configurations_daemon_reports_on_its_devices(rig_config, monkeypatch):
+    answering(monkeypatch, load_daemon_config(rig_config))
+    found = await examined(rig_config, 0.1)
+    assert found["daemon"].state == found["task robot"].state == "good"
+    assert "port of right" not in found
+
+
+async def test_a_daemon_that_hangs_is_not_taken_for_none(rig_config, monkeypatch):
+    monkeypatch.setattr(devices, "send_to_stop_socket", Mock(side_effect=TimeoutError))
+    found = await examined(rig_config, 0.1)
+    assert "does not answer within 1 s" in found["daemon"].found
 
 
 @pytest.mark.real_time
@@ -102,6 +137,15 @@ def test_doctor_stops_at_an_invalid_configuration(tmp_path, ran, result_of, mist
     assert "the configuration cannot be read: No such file" in mistake("doctor", tmp_path / "no.yaml")
     assert "the mesh cannot be read: No such file" in mistake("doctor", path, "--geometry", tmp_path / "no.npz")
     assert main(["doctor", "--seconds", "nan"]) == 2
+
+
+@pytest.mark.parametrize("emulated", [False, True])
+def test_doctor_says_that_the_rig_is_emulated(config, emulated, ran):
+    path = config(emulated=emulated, load_cell={"device": {"path": "load"}})
+    told = ran("doctor", path, "--seconds", "0.1", status=1).out
+    assert ("EMULATED" in told) is emulated
+    found = json.loads(ran("doctor", path, "--seconds", "0.1", "--json", status=1).out)
+    assert {finding["emulated"] for finding in found} == {emulated}
 
 
 def test_the_clock_is_judged_by_its_year_and_its_synchronisation():

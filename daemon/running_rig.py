@@ -1,0 +1,40 @@
+"""Which rig a daemon drives, as it says in its reply to `status`."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Final, Self
+
+if TYPE_CHECKING:
+    # `shearloop command stop` imports little.
+    from shearloop.daemon.config import DaemonConfig
+
+EMULATED: Final = "EMULATED"
+HEADING: Final = f"{EMULATED}: every device of this rig is emulated."
+
+
+@dataclass(frozen=True, slots=True)
+class RunningRig:
+    """The rig of a daemon: its name, whether it is emulated, its address of messages, and its devices."""
+
+    rig: str = ""
+    emulated: bool = False
+    publish: str = ""
+    # The address of each device, by its key in the configuration.
+    devices: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, config: "DaemonConfig", robot_host: str | None) -> Self:
+        """Return the rig of a configuration, whose robot has this address."""
+        robot = {"robot": robot_host} if robot_host is not None else {}
+        return cls(config.name, config.emulated, config.publish, {**config.device_addresses, **robot})
+
+    def facts(self) -> dict[str, Any]:
+        """Return the rig for a reply to `status`."""
+        return asdict(self)
+
+
+def whose_daemon(reply: Mapping[str, Any]) -> str:
+    """Return whose daemon gave this reply to `status`: EMULATED, process, name of the rig, and folder."""
+    daemon = reply.get("daemon", {})
+    label = f"{EMULATED}, " if daemon.get("emulated") else ""
+    return f"{label}process {daemon.get('process')} ({daemon.get('rig')}) in {daemon.get('folder')}"

@@ -27,6 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Load everything that `run` loads, without opening a device."""
+    from shearloop.tools.check import OPEN_KEYS
     from shearloop.yaml_files import read_yaml
 
     content = read_yaml(args.config, UserError, "file")
@@ -37,15 +38,22 @@ def run(args: argparse.Namespace) -> int:
         )
     parts = _check_experiment(args.config, args.rig) if is_experiment else _check_configuration(args.config)
     plan_lines = [line for plan in parts.plans for line in plan.sentences()]
+    # An experiment is judged for a rehearsal too, which needs nothing that these keys say.
+    open_keys = parts.mistakes.pop(OPEN_KEYS, "") if args.rig is not None else ""
     if parts.mistakes:
         if is_experiment and plan_lines and not args.json:
             # A rehearsal shows where in the plan the refused steps are.
             print(*plan_lines, sep="\n", flush=True)
-        raise UserError("\n".join(dict.fromkeys(parts.mistakes.values())))
+            if args.rig is not None and "experiment" not in parts.mistakes:
+                print(f"{args.config} is in order, and {args.rig} is not", flush=True)
+        raise UserError("\n".join(dict.fromkeys(filter(None, (*parts.mistakes.values(), open_keys)))))
     sentences = [*(f"{name}: {text}" for name, text in parts.texts.items()), *plan_lines]
     plan = parts.plans[0].as_json() if parts.plans else None
-    result = {"config": str(args.config), "parts": parts.texts, "plan": plan}
-    return print_result(result, [*sentences, f"{args.config} is in order"], as_json=args.json)
+    result = {"config": str(args.config), "parts": parts.texts, "open": open_keys.splitlines(), "plan": plan}
+    verdict = f"{args.config} is in order"
+    if open_keys:
+        verdict = f"{open_keys}\n{verdict} for a rehearsal of {args.rig}; the real robot needs what is not filled in"
+    return print_result(result, [*sentences, verdict], as_json=args.json)
 
 
 def _is_experiment(content: object) -> bool:

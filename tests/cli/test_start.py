@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -115,6 +116,30 @@ def test_what_is_not_filled_in_hides_no_mistake_of_an_experiment(untouched, ran)
     assert "speed_rad_per_s 3 rad/s: write 0.2 or less" in said.err
     assert "limits.workspace is not filled in" in said.err
     assert "turn_to" in said.out
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_an_experiment_is_judged_for_a_rehearsal_before_the_robot_is_filled_in(untouched, ran, result_of):
+    path = untouched.parent / "experiments" / "loosen.yaml"
+    said = ran("check", path, "--config", untouched).out
+    assert f"{path} is in order for a rehearsal of {untouched}" in said
+    assert "limits.workspace is not filled in" in said
+    assert len(result_of("check", path, "--config", untouched)["open"]) == 2
+    untouched.with_name("paper.bank").unlink()
+    said = ran("check", path, "--config", untouched, status=2)
+    assert f"{path} is in order, and {untouched} is not" in said.out
+    assert "paper.bank" in said.err
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_the_parts_of_the_robot_that_are_commented_out_count_only_with_ones_own_numbers(untouched, mistake):
+    robot = untouched.with_name("ur.yaml")
+    parts = re.compile(r"^( *)# (tool:|  (payload_|tcp_)|workspace:|  (lower|upper|margin)_m)", re.MULTILINE)
+    robot.write_text(parts.sub(r"\1\2", robot.read_text()))
+    said = mistake("check", untouched)
+    for key in ("payload_kg", "payload_cog_m[2]", "tcp_offset[5]", "workspace.lower_m[0]", "workspace.upper_m[2]"):
+        assert f"{key}: " in said
+    assert said.count("is not a number") == 16
 
 
 @pytest.mark.usefixtures("ur_rtde")

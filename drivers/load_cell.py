@@ -14,6 +14,7 @@ from shearloop.drivers import serial_sensor
 from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
 from shearloop.drivers.connection import Diagnostics, Link
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
+from shearloop.drivers.line_parser import LineParser, TimedLine
 
 BAUD_RATE = 115200
 PERIOD_NS = round(1e9 / LOAD_CELL_RATE_HZ)
@@ -125,7 +126,7 @@ class LoadSample:
         return self.saturated or beyond
 
 
-class LoadParser(serial_sensor.LineParser[LoadSample]):
+class LoadParser(LineParser[LoadSample]):
     """Turns the board's bytes into samples."""
 
     board = "load cell"
@@ -153,7 +154,7 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
         self._whole_numbers, self._fits = True, False
         self._levels = serial_sensor.StepFilter[tuple[float, int]]()
 
-    def _value(self, line: serial_sensor.TimedLine) -> LoadSample:
+    def _value(self, line: TimedLine) -> LoadSample:
         raw = float(line.text)
         self._whole_numbers = self._whole_numbers and b"." not in line.text
         torque_nm = self.calibration.torque_nm(raw)
@@ -166,7 +167,7 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
             if spike:
                 self._levels.restart_step()
             else:
-                spike = self._levels.is_spike((torque_nm, line.t_mid_ns), self._is_reachable)
+                spike = self._levels.is_spike((torque_nm, line.t_arrival_ns), self._is_reachable)
         sample = LoadSample(
             raw=raw,
             torque_nm=torque_nm,
@@ -190,7 +191,7 @@ class LoadParser(serial_sensor.LineParser[LoadSample]):
         return ""
 
     def _is_reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
-        # Arrival stamps bunch on a busy host: no interval counts as shorter than a period.
+        # By the arrival: before a late line others may be missing. No interval counts as shorter than a period.
         elapsed_s = max(after[1] - before[1], self._period_ns) * 1e-9
         return abs(after[0] - before[0]) <= SLEW_NM_PER_S * elapsed_s
 

@@ -1,18 +1,15 @@
 """Sensors on serial lines: raw events, lines, and the loop that reads a board and reconnects to it."""
 
 import contextlib
-import re
 import time
-from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.errors import DeviceLostError, DriverError
-from shearloop.drivers.refused_lines import BoardKind, refusal_sentence, shown
+from shearloop.drivers.refused_lines import shown
 
 # Opening the port resets an Uno; its boot loader waits before it starts the sketch.
 BOOT_S = 4.0
@@ -127,104 +124,6 @@ class LineSplitter:
         self.too_long += 1
         self.too_long_start = line[:60]
         return None
-
-
-@dataclass(frozen=True, slots=True)
-class TimedLine:
-    """A line without its end, and when it arrived and the middle of its conversion was (monotonic, ns).
-
-    `partial`: the first one after opening, which may lack its beginning.
-    """
-
-    text: bytes
-    t_arrival_ns: int
-    t_mid_ns: int
-    partial: bool
-
-
-class LineParser(ABC, Generic[ValueT]):
-    """Turns the bytes of a board that sends a line for each conversion, in any slices, into values. No I/O."""
-
-    # The board that should send the lines.
-    board: ClassVar[BoardKind]
-
-    def __init__(self, pattern: re.Pattern[bytes], max_bytes: int, baud: int, rate_hz: float) -> None:
-        """Accept lines that match the pattern, of at most `max_bytes`; the board sends `rate_hz` lines a second."""
-        self.count = 0
-        self._pattern = pattern
-        self._lines = LineSplitter(max_bytes)
-        self._byte_ns = 10 * 10**9 // baud  # with start and stop bit
-        self._period_ns = round(1e9 / rate_hz)
-        self._last_mid_ns = -(2**63)
-        self._first = True
-        self._rejected: Counter[str] = Counter()
-        # The last refused line and its kind.
-        self._last_refused: tuple[bytes, str] | None = None
-
-    @property
-    def errors(self) -> dict[str, int]:
-        """The number of rejected lines, by kind."""
-        return dict(self._rejected)
-
-    @property
-    def refused(self) -> int:
-        """The number of refused lines since the beginning."""
-        return self._rejected.total()
-
-    @property
-    def refusal(self) -> str:
-        """The last refused line, why, who sends such lines, and the cure; empty without one."""
-        return "" if self._last_refused is None else refusal_sentence(*self._last_refused, self.board)
-
-    @property
-    def unfinished(self) -> bytes:
-        """The received beginning of the next line."""
-        return self._lines.partial
-
-    @abstractmethod
-    def _value(self, line: TimedLine) -> ValueT | None:
-        """Return the value in a line that matches the pattern, or None where that is not certain."""
-
-    def handle(self, event: RawEvent) -> list[ValueT]:
-        """Process a live or recorded event; return the values that it completes."""
-        match event.kind:
-            case InputKind.OPENED:
-                self.restart()
-            case InputKind.DATA:
-                return self.feed(event.data, event.t_ns)
-        return []
-
-    def restart(self) -> None:
-        """Drop a half-received line: the port was opened, perhaps in the middle of one."""
-        self._lines.restart()
-        self._first = True
-
-    def feed(self, data: bytes, t_arrival_ns: int) -> list[ValueT]:
-        """Return the values that `data` completes; of several lines each is a period older than the next."""
-        values = []
-        lines = self._lines.feed(data)
-        for age, text in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
-            partial, self._first = self._first, False
-            if text is None:
-                self._refuse(self._lines.too_long_start, "too long")
-                continue
-            arrived_ns = t_arrival_ns - age * self._period_ns
-            t_mid_ns = arrived_ns - (len(text) + 1) * self._byte_ns - self._period_ns // 2
-            # Time stays in order when lines arrive in bursts.
-            self._last_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
-            line = TimedLine(text.strip(b"\r"), arrived_ns, self._last_mid_ns, partial)
-            if self._pattern.fullmatch(line.text):
-                value = self._value(line)
-                if value is not None:
-                    values.append(value)
-                    self.count += 1
-            elif not partial:
-                self._refuse(line.text, "not a number" if line.text else "empty")
-        return values
-
-    def _refuse(self, line: bytes, kind: str) -> None:
-        self._rejected[kind] += 1
-        self._last_refused = line, kind
 
 
 class StepFilter(Generic[ValueT]):

@@ -158,7 +158,7 @@ class SkinShear(Message):
     valid: bool = column("", "whether the measurement can be used")
     reason: str = column("", "why it is not valid, in sentences; empty when it is")
     sample: int = column("", "number of the reading since the daemon started")
-    missed: int = column("", "missing readings right before this one")
+    missed: int = column("", "readings found missing since the message before; `health` has their sum")
     latency_s: float = column("s", "time from the reading's arrival to this message")
 
 

@@ -243,7 +243,7 @@ class SkinEstimator:
         if self.zero is None:
             refused = f"the zero was refused and is taken again: {self.refused}"
             return SkinReading(reasons=(refused if self.refused else f"taking the zero, {self._taker.progress}",))
-        if sample.missed:
+        if sample.missed or sample.paused:
             self._forget_direction()
         response_1, response_2 = self.zero.changes(sample.r1_ohm, sample.r2_ohm)
         response = response_1 - response_2

@@ -24,16 +24,9 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
 )
 from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
+from shearloop.drivers.line_parser import LineParser, TimedLine
 from shearloop.drivers.refused_lines import shown
-from shearloop.drivers.serial_sensor import (
-    InputKind,
-    InputRecorder,
-    LineParser,
-    LineSplitter,
-    RawEvent,
-    SerialSensor,
-    TimedLine,
-)
+from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
 from shearloop.timeouts import timeout
 
 # A reading of five elements is 70 characters long.
@@ -353,7 +346,8 @@ class Keithley6430(PolledInstrument[SourceReading]):
 class Voltages:
     """The voltages of gauge 1 and gauge 2, and whether each exceeds the instrument's range.
 
-    `t_mid_ns` is the middle of the conversions, `t_arrival_ns` the arrival of the numbers (both monotonic).
+    `t_mid_ns` is the middle of the conversions, `t_arrival_ns` the arrival of the numbers (both monotonic). `missed`: a
+    board's lines that are found missing by these. `t_asked_ns`: when a scanner was asked for them; None for a board.
     """
 
     v1_v: float
@@ -362,6 +356,8 @@ class Voltages:
     t_arrival_ns: int
     over_1: bool = False
     over_2: bool = False
+    missed: int = 0
+    t_asked_ns: int | None = None
 
 
 def read_scan(reply: Reply) -> Voltages:
@@ -374,7 +370,32 @@ def read_scan(reply: Reply) -> Voltages:
         t_arrival_ns=reply.t_arrival_ns,
         over_1=abs(v1_v) >= OVERLOAD,
         over_2=abs(v2_v) >= OVERLOAD,
+        t_asked_ns=reply.t_asked_ns,
     )
+
+
+class PollClock:
+    """Counts the polls that were skipped. `PolledInstrument.readings` keeps the phase, and asks late but never early.
+
+    No I/O.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        """Expect a poll every `period_s`."""
+        self._period_ns = period_s * 1e9
+        self._number = 0
+        # When the poll of number 0 was due, by the earliest poll in its period; None before the first.
+        self._due_ns: float | None = None
+
+    def skipped(self, asked_ns: int) -> int:
+        """Return how many polls were skipped before the one that asked then."""
+        if self._due_ns is None:
+            self._due_ns = float(asked_ns)
+            return 0
+        skipped = max(int((asked_ns - self._due_ns) // self._period_ns) - self._number - 1, 0)
+        self._number += 1 + skipped
+        self._due_ns = min(self._due_ns, asked_ns - self._number * self._period_ns)
+        return skipped
 
 
 @dataclass(eq=False, kw_only=True)
@@ -418,7 +439,7 @@ class PairParser(LineParser[Voltages]):
             return None
         v1_v, v2_v = map(float, line.text.split(b","))
         over_1, over_2 = abs(v1_v) >= self._end_v, abs(v2_v) >= self._end_v
-        return Voltages(v1_v, v2_v, line.t_mid_ns, line.t_arrival_ns, over_1, over_2)
+        return Voltages(v1_v, v2_v, line.t_mid_ns, line.t_arrival_ns, over_1, over_2, line.missed)
 
 
 class AdcBoard(SerialSensor[Voltages]):

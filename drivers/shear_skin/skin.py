@@ -11,7 +11,7 @@ from statistics import fmean
 
 from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.serial_sensor import StepFilter
-from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, SourceReading, Voltages
+from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, PollClock, SourceReading, Voltages
 
 # The resistance of the paper's gauges.
 GAUGE_OHM = 25.0
@@ -28,6 +28,8 @@ SUM_TOLERANCE = 0.1
 SOURCE_STALE_PERIODS = 4.0
 # Relative change of a resistance between two readings: three newtons within a tenth of a second.
 MAX_CHANGE = 0.25
+# Periods between two readings after which the skin may have been loaded and unloaded unseen.
+LONGEST_PAUSE = 2.5
 # A live converter's noise moves its last digit.
 STUCK_AFTER = 50
 
@@ -64,8 +66,9 @@ class SkinFault(StrEnum):
 class SkinSample:
     """Both gauges at one time: resistances in Ω, or None with the faults.
 
-    A reading of the voltages becomes one, or a block of them where they are averaged. `missed` readings are missing
-    right before it; `seq` counts from 0.
+    A reading of the voltages becomes one, or a block of them where they are averaged. `missed` readings are found
+    missing since the sample before. `paused`: more than `LONGEST_PAUSE` periods passed before it, or before a reading
+    since the sample before. `seq` counts from 0.
     """
 
     r1_ohm: float | None
@@ -74,6 +77,7 @@ class SkinSample:
     t_arrival_ns: int
     seq: int
     missed: int = 0
+    paused: bool = False
     faults: tuple[SkinFault, ...] = ()
 
 
@@ -91,6 +95,7 @@ class SampleValidator:
         self._gauge_v = gauge_ohm * current_a
         self._stale_ns = round(SOURCE_STALE_PERIODS * source_period_s * 1e9)
         self._period_ns = round(daq_period_s * 1e9)
+        self._polls = PollClock(daq_period_s)
         self._last: Voltages | None = None
         self._repeats = [1, 1]
         self._steps = StepFilter[tuple[float, float]]()
@@ -100,12 +105,17 @@ class SampleValidator:
 
     def sample(self, voltages: Voltages, source: SourceReading | None) -> SkinSample:
         """Return the sample of a reading of the voltages, with the latest reading of the source."""
-        missed = self._count_missed(voltages)
+        missed = voltages.missed if voltages.t_asked_ns is None else self._polls.skipped(voltages.t_asked_ns)
+        self.missed += missed
+        last, self._last = self._last or voltages, voltages
+        self._count_repeats(last, voltages)
+        # By the arrival: before a late line others may be missing.
+        periods = max(round((voltages.t_arrival_ns - last.t_arrival_ns) / self._period_ns), 1)
         faults = self._find_faults(voltages, source)
         r1_ohm = r2_ohm = None
         if not faults and source is not None:
             pair = voltages.v1_v / source.current_a, voltages.v2_v / source.current_a
-            if self._steps.is_spike(pair, partial(_is_reachable, missed=missed)):
+            if self._steps.is_spike(pair, partial(_is_reachable, periods=periods)):
                 faults = [SkinFault.SPIKE]
             else:
                 r1_ohm, r2_ohm = pair
@@ -117,20 +127,17 @@ class SampleValidator:
             t_arrival_ns=voltages.t_arrival_ns,
             seq=self.samples,
             missed=missed,
+            paused=voltages.t_mid_ns - last.t_mid_ns > LONGEST_PAUSE * self._period_ns,
             faults=tuple(faults),
         )
         self.samples += 1
         return sample
 
-    def _count_missed(self, voltages: Voltages) -> int:
-        last, self._last = self._last, voltages
-        if last is None:
-            return 0
+    def _count_repeats(self, last: Voltages, voltages: Voltages) -> None:
+        if voltages is last:
+            return
         for i, same in enumerate((voltages.v1_v == last.v1_v, voltages.v2_v == last.v2_v)):
             self._repeats[i] = self._repeats[i] + 1 if same else 1
-        missed = max(round((voltages.t_mid_ns - last.t_mid_ns) / self._period_ns) - 1, 0)
-        self.missed += missed
-        return missed
 
     def _find_faults(self, voltages: Voltages, source: SourceReading | None) -> list[SkinFault]:
         if source is None or voltages.t_arrival_ns - source.t_ns > self._stale_ns:
@@ -187,7 +194,7 @@ class SampleValidator:
 class SampleAverager:
     """Averages samples in blocks, as the paper's DAQ did over 1 s. No I/O.
 
-    A sample with faults passes at once. It and a gap end the block before them; that block's readings count as missing.
+    A sample with faults passes at once. It and a pause end the block before them, whose readings are dropped.
     """
 
     def __init__(self, size: int) -> None:
@@ -195,6 +202,7 @@ class SampleAverager:
         self._size = size
         self._block: list[SkinSample] = []
         self._missed = self._seq = 0
+        self._paused = False
 
     def restart(self) -> None:
         """Begin a new block: samples from before a tare do not belong to its zero."""
@@ -202,25 +210,26 @@ class SampleAverager:
 
     def add(self, sample: SkinSample) -> SkinSample | None:
         """Return the mean of the block that this sample completes, the sample itself if it has faults, else None."""
-        if sample.missed or sample.faults:
-            self._missed += sample.missed + len(self._block)
+        self._missed += sample.missed
+        self._paused = self._paused or sample.paused
+        if sample.paused or sample.faults:
             self._block.clear()
         self._block.append(sample)
         if len(self._block) < self._size and not sample.faults:
             return None
-        whole = replace(sample, seq=self._seq, missed=self._missed)
+        whole = replace(sample, seq=self._seq, missed=self._missed, paused=self._paused)
         if not sample.faults:
             t_mid_ns = sum(member.t_mid_ns for member in self._block) // len(self._block)
             whole = replace(whole, r1_ohm=self._mean("r1_ohm"), r2_ohm=self._mean("r2_ohm"), t_mid_ns=t_mid_ns)
-        self._block, self._missed, self._seq = [], 0, self._seq + 1
+        self._block, self._missed, self._paused, self._seq = [], 0, False, self._seq + 1
         return whole
 
     def _mean(self, name: str) -> float:
         return fmean(getattr(sample, name) for sample in self._block)
 
 
-def _is_reachable(before: tuple[float, float], after: tuple[float, float], missed: int) -> bool:
-    most = (1 + missed) * math.log1p(MAX_CHANGE)
+def _is_reachable(before: tuple[float, float], after: tuple[float, float], periods: int) -> bool:
+    most = periods * math.log1p(MAX_CHANGE)
     return all(abs(math.log(now / then)) <= most for then, now in zip(before, after, strict=True))
 
 

@@ -165,10 +165,11 @@ def test_what_the_driver_refuses_is_no_force_and_the_next_good_sample_is_one(ben
     assert holds(again, 0.8)
 
 
-def test_across_missing_samples_the_direction_is_not_assumed(bench):
+@pytest.mark.parametrize("gap", [{"missed": 3}, {"paused": True}])
+def test_across_missing_samples_and_a_pause_the_direction_is_not_assumed(bench, gap):
     assert bench.push(0.8).direction is Direction.LOADING
     bench.skin.push(0.7)
-    reading = bench.estimator.update(bench.sample(missed=3))
+    reading = bench.estimator.update(bench.sample(**gap))
     assert reading.direction is Direction.UNKNOWN
     assert holds(reading, 0.7)
 

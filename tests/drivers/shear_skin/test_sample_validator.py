@@ -3,11 +3,12 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.shear_skin.instruments import SourceReading, Voltages
+from shearloop.drivers.shear_skin.instruments import PairParser, SourceReading, Voltages
 from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator, SkinFault, SkinSample
 
 CURRENT_A, SOURCE_S, DAQ_S = 5e-3, 0.5, 0.1
@@ -18,9 +19,9 @@ def judge() -> SampleValidator:
     return SampleValidator(CURRENT_A, SOURCE_S, DAQ_S)
 
 
-def voltages(v1_v: float, v2_v: float, number: int = 0, *, over_1: bool = False, over_2: bool = False) -> Voltages:
+def voltages(v1_v: float, v2_v: float, number: int = 0, **more: bool | int) -> Voltages:
     t_ns = number * 100_000_000
-    return Voltages(v1_v, v2_v, t_ns, t_ns, over_1=over_1, over_2=over_2)
+    return Voltages(v1_v, v2_v, t_ns, t_ns, **more)
 
 
 def said(v1_v: float, v2_v: float, source: SourceReading | None = GOOD, **more: bool) -> SkinSample:
@@ -60,11 +61,11 @@ def test_beyond_the_range_is_open_only_where_nothing_is_across_the_other_gauge()
     assert list(said(0.512, 0.0, STUCK_OPEN, over_1=True).faults) == [SkinFault.COMPLIANCE, SkinFault.OPEN_1]
 
 
-def test_readings_are_averaged_in_blocks_that_faults_gaps_and_tares_begin_anew():
+def test_readings_are_averaged_in_blocks_that_faults_pauses_and_tares_begin_anew():
     validator, averager = judge(), SampleAverager(3)
 
-    def add(v1_v: float, number: int) -> SkinSample | None:
-        return averager.add(validator.sample(voltages(v1_v, 0.1265, number), GOOD))
+    def add(v1_v: float, number: int, missed: int = 0) -> SkinSample | None:
+        return averager.add(validator.sample(voltages(v1_v, 0.1265, number, missed=missed), GOOD))
 
     assert [add(v1_v, number) for number, v1_v in enumerate((0.122, 0.123))] == [None, None]
     mean = add(0.124, 2)
@@ -72,17 +73,43 @@ def test_readings_are_averaged_in_blocks_that_faults_gaps_and_tares_begin_anew()
     assert (mean.t_mid_ns, mean.t_arrival_ns, mean.seq, mean.missed) == (100_000_000, 200_000_000, 0, 0)
     assert add(0.123, 3) is None
     faulty = add(-0.123, 4)
-    assert (faulty.r1_ohm, faulty.seq, faulty.missed) == (None, 1, 1)
+    assert (faulty.r1_ohm, faulty.seq, faulty.missed) == (None, 1, 0), "3 was dropped and is not missing"
     assert faulty.faults == (SkinFault.REVERSED_1,)
-    assert [add(0.123, number) for number in (5, 8, 9)] == [None] * 3, "two readings are missing before 8"
+    assert [add(0.123, 5), add(0.123, 8, 2), add(0.123, 9)] == [None] * 3, "two readings are missing before 8"
     after = add(0.126, 10)
-    assert (after.seq, after.missed) == (2, 3)
+    assert (after.seq, after.missed, after.paused) == (2, 2, True)
     assert after.r1_ohm == pytest.approx(24.8)
     assert add(0.123, 11) is None
     averager.restart()
     assert [add(0.126, 12), add(0.126, 13)] == [None, None]
     tared = add(0.126, 14)
-    assert (tared.r1_ohm, tared.missed) == (pytest.approx(25.2), 0)
+    assert (tared.r1_ohm, tared.missed, tared.paused) == (pytest.approx(25.2), 0, False)
+    assert validator.missed == mean.missed + faulty.missed + after.missed + tared.missed
+
+
+def test_a_missing_reading_drops_no_others():
+    validator, averager = judge(), SampleAverager(4)
+    samples = [validator.sample(voltages(0.123, 0.126, n, missed=int(n == 3)), GOOD) for n in (0, 1, 3, 4)]
+    *none, whole = map(averager.add, samples)
+    assert none == [None] * 3
+    assert (whole.missed, whole.paused, whole.t_mid_ns) == (1, False, 2 * 10**8)
+
+
+@pytest.mark.parametrize("averaged", [1, 10])
+def test_a_process_that_stands_still_for_less_than_a_period_loses_no_reading_and_no_average(averaged):
+    parser, validator, averager = PairParser(1 / DAQ_S), judge(), SampleAverager(averaged)
+    found = []
+    for number in range(400):
+        sent_ns = round((10 + number) * 1e9 * DAQ_S)
+        late_ns = 85_000_000 if number % 7 == 3 else 0
+        source = replace(GOOD, t_ns=sent_ns - 10**8)
+        readings = parser.feed(f"0.1230{number % 10},0.126{number % 7}\n".encode(), sent_ns + late_ns)
+        found += [averager.add(validator.sample(reading, source)) for reading in readings]
+    samples = [sample for sample in found if sample is not None]
+    assert sum(sample.missed for sample in samples) == validator.missed == 0
+    times_ns = np.array([sample.t_mid_ns for sample in samples])
+    assert np.diff(times_ns) == pytest.approx(averaged * 1e9 * DAQ_S, rel=1e-6)
+    assert len(samples) == 399 // averaged, "the first line may lack its beginning"
 
 
 def test_a_source_that_falls_silent_is_lost_after_two_seconds():
@@ -92,11 +119,24 @@ def test_a_source_that_falls_silent_is_lost_after_two_seconds():
     assert one.faults == {"source_lost": 1}
 
 
-def test_missing_readings_are_counted_where_they_are_missing():
-    one = judge()
-    missed = [one.sample(voltages(0.123 + 1e-6 * n, 0.126, n), GOOD).missed for n in (0, 1, 2, 5, 6)]
-    assert missed == [0, 0, 0, 2, 0]
+def test_a_late_reading_of_a_board_is_none_missing_and_each_count_is_passed_on_once():
+    one, found = judge(), []
+    for number, (late_s, missed) in enumerate([(0.0, 0), (0.085, 0), (0.0, 0), (0.3, 2), (0.3, 0)]):
+        t_ns = round(1e9 * (DAQ_S * number + late_s))
+        found.append(one.sample(Voltages(0.123 + 1e-6 * number, 0.126, t_ns, t_ns, missed=missed), GOOD))
+    assert [sample.missed for sample in found] == [0, 0, 0, 2, 0]
+    assert [sample.paused for sample in found] == [False, False, False, True, False]
     assert one.missed == 2
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.floats(0.0, 0.99)), min_size=1, max_size=60))
+def test_a_scanner_that_is_asked_late_misses_nothing_and_skipped_polls_are_counted(polls):
+    one, slot = judge(), 0
+    for number, (skipped, late) in enumerate([(0, 0.0), *polls, (0, 0.0)]):
+        slot += 1 + skipped
+        t_ns = 10**9 + slot * 10**8 + round(late * 10**8)
+        one.sample(Voltages(0.123 + 1e-6 * number, 0.126, t_ns, t_ns, t_asked_ns=t_ns), GOOD)
+    assert one.missed == sum(skipped for skipped, _ in polls)
 
 
 def test_a_jump_is_a_disturbance_until_it_stays():

@@ -51,7 +51,7 @@ class GripMemory:
     """The last positions of this grip, some of them interpolated, and its mean (m, c) difference to idle."""
 
     def __init__(self, motion: Motion, shape: tuple[int, ...]) -> None:
-        """Begin without a grip; frames have the shape (m, n)."""
+        """Begin without a grip; frames have the shape (m, c)."""
         self._motion = motion
         self.positions: deque[FloatArray] = deque(maxlen=motion.n_lags + 1)
         self._bridged: deque[bool] = deque(maxlen=motion.n_lags + 1)

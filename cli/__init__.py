@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from shearloop.cli.registry import COMMANDS, GROUPS, MOVING, OTHER_SPELLINGS, command_module
 from shearloop.daemon.errors import USER_ERRORS
+from shearloop.daemon.messaging.deadlines import boot_ns, process_began_ns
 from shearloop.daemon.process import interrupt_status, raise_ending_signals
 from shearloop.errors import UserError
 from shearloop.printable import OutputError, open_closed_streams, printable_output, silence
@@ -115,6 +116,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
+    # A person typed it before this process began. Without words of its own, this is no process of its own.
+    began_ns = boot_ns() if argv is not None else process_began_ns()
     if arguments[:1] in ([], ["help"]):
         arguments = [*arguments[1:2], "--help"]
     program, interrupt_is_end = "shearloop", False
@@ -128,6 +131,7 @@ def _run(argv: Sequence[str] | None) -> int:
         program, module = f"shearloop {name}", command_module(name)
         parser = Parser(prog=program, description=COMMANDS[name].summary)
         module.configure(parser)
+        parser.set_defaults(began_ns=began_ns)
         expand = getattr(module, "expand_default_command", list)
         args = parser.parse_args(expand(arguments[1:]))
         with raise_ending_signals():

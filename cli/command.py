@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, with_connection
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.callers import caller
+from shearloop.daemon.messaging.deadlines import NEVER_LATE, TYPED_WITHIN_S, boot_ns
 from shearloop.daemon.running_rig import EMULATED, HEADING
 
 if TYPE_CHECKING:
@@ -98,7 +99,8 @@ def _request(args: argparse.Namespace) -> dict[str, Any]:
 def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys | None") -> dict[str, Any]:
     """Send a request to the command address and return the reply; raises UserError without one.
 
-    One that acts is meant for the daemon that runs now, and an unlock for the stop that waits there now.
+    One that acts is meant for the daemon that runs now, and for a short time. An unlock is meant for the stop that now
+    waits there.
     """
     # It imports too much for a `stop` on a busy computer.
     from shearloop.daemon.messaging.client import meant_for, send_command
@@ -112,7 +114,9 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
         status = send_command(args.connect, {"command": "status"}, short_s, keys)
         if not status.get("ok"):
             return status
-        request |= meant_for(status)
+        # Ctrl-Z or a suspended computer may have held this program up.
+        age_s = 0.0 if args.name in NEVER_LATE else (boot_ns() - args.began_ns) / 1e9
+        request |= meant_for(status, age_s, TYPED_WITHIN_S)
         if args.name == "unlock":
             request |= _acknowledged(status.get("loop", {}))
     return send_command(args.connect, request, timeout_s, keys)
@@ -185,7 +189,7 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
             (experiment["path"], experiment["name"], "configured" if experiment["path"] == own else "")
             for experiment in reply["experiments"]
         ]
-        return table(("file", "name", ""), known)
+        return [reply["unread"]] if reply.get("unread") else table(("file", "name", ""), known)
     if name == "tare":
         end = "`shearloop command status` shows its end, and `start` is refused until then"
         lost = reply.get("not_connected", ())

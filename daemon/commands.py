@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from shearloop.daemon.errors import InvalidExperimentError
-from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
+from shearloop.daemon.messaging.command_server import (
+    EXPERIMENTS,
+    STATUS,
+    STOP,
+    CommandRefusedError,
+    Handler,
+    Reply,
+    Request,
+)
+from shearloop.daemon.messaging.deadlines import NEVER_LATE, boot_ns
 from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sensors import Sensors
@@ -23,7 +32,6 @@ if TYPE_CHECKING:
     from shearloop.daemon.configured_experiment import ConfiguredExperiment
     from shearloop.daemon.rig import Rig
 
-EXPERIMENTS = "experiments"
 # The arguments of each command that acts, with their types.
 ARGUMENTS: Mapping[str, Mapping[str, type]] = {
     "tare": {"source": str, "confirmed": bool},
@@ -31,8 +39,8 @@ ARGUMENTS: Mapping[str, Mapping[str, type]] = {
     "unlock": {"confirmed": bool, "digest": str, "stop": int},
     "release": {"confirmed": bool, "ask": bool, "digest": str},
 }
-# An argument that each of them may have: the process that it is meant for.
-_OF_ALL: Mapping[str, type] = {"instance": str}
+# Arguments that each of them may have: the process that it is meant for, and the time until which it may begin.
+_OF_ALL: Mapping[str, type] = {"instance": str, "until_ns": int}
 _KINDS: Mapping[type, str] = {bool: "true or false", int: "a whole number", str: "text"}
 STOP_DELAY_S = 0.05
 _ANOTHER_DAEMON = "it is meant for an earlier daemon, and this one has begun since; look at the rig, and send it again"
@@ -70,6 +78,7 @@ class Commands:
     # Receives each answered command, except questions.
     report: Callable[["Answered"], None] = lambda _: None
     running_rig: RunningRig = field(default_factory=RunningRig)
+    now_ns: Callable[[], int] = boot_ns
     # Random for each process, because every process in a container has the same number.
     instance: str = field(default_factory=lambda: secrets.token_hex(8))
 
@@ -105,6 +114,8 @@ class Commands:
             check_arguments(name, request)
             if name != STOP and request.get("instance", self.instance) != self.instance:
                 raise CommandRefusedError(_ANOTHER_DAEMON)
+            if name not in NEVER_LATE:
+                _refuse_if(self._why_late(request))
             reply = await handler(request)
             refusal = None
         except CommandRefusedError as error:
@@ -118,15 +129,30 @@ class Commands:
                 self.report(Answered(name, request, refusal))
         return reply
 
+    def _why_late(self, request: Request) -> str | None:
+        """Return why it is too late to begin what a request asks for, or None; one without `until_ns` is never late."""
+        now_ns = self.now_ns()
+        late_s = (now_ns - request.get("until_ns", now_ns)) / 1e9
+        if late_s <= 0.0:
+            return None
+        return f"it came {late_s:.1f} s too late to be what the operator wants now; look at the rig, and send it again"
+
     async def _experiments(self, _request: Request) -> Reply:
-        """Return the experiments that `start` may name, and the configured one, which it runs without a name."""
+        """Return the experiments that `start` may name, and the configured one, which it runs without a name.
+
+        While something moves and none were read before, there are none, and `unread` says why.
+        """
         rig = required_rig(self.rig)
         try:
             found = await rig.experiments.list(rig.reading_refusal)
         except UserError as error:
             raise CommandRefusedError(str(error)) from error
         own = str(self.experiment.path) if self.experiment is not None else ""
-        return {"experiments": [{"path": path, "name": name} for path, name in found.items()], "configured": own}
+        known = [{"path": path, "name": name} for path, name in found.names.items()]
+        reply: dict[str, Any] = {"experiments": known, "configured": own}
+        if found.unread:
+            reply["unread"] = found.unread
+        return reply
 
     def keyless_handlers(self) -> Mapping[str, Handler]:
         """Return the handlers for users of this machine without a key: only `stop` and `status` work."""
@@ -146,7 +172,8 @@ class Commands:
             if request.get("ask"):
                 question = await rig.start_question(Path(path))
                 return dict(question.facts)
-            _refuse_if(await rig.start(Path(path), request.get("digest")))
+            why_late = partial(self._why_late, request)
+            _refuse_if(await rig.start(Path(path), request.get("digest"), why_late))
         except QuestionChangedError as error:
             raise CommandRefusedError(str(error), **error.question.facts) from error
         except InvalidExperimentError as error:
@@ -229,6 +256,7 @@ class Commands:
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()
         daemon = {"process": os.getpid(), "instance": self.instance, "folder": os.getcwd(), **self.running_rig.facts()}
+        daemon |= {"now_ns": self.now_ns()}
         if self.rig is None:
             return {"tasks": tasks, "daemon": daemon}
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}

@@ -106,6 +106,13 @@ class _Stamp(NamedTuple):
     cap: MotionCap | None
 
 
+class Listing(NamedTuple):
+    """The names of experiments by path, as they were read last, and why none were ever read; empty if they were."""
+
+    names: Mapping[str, str]
+    unread: str
+
+
 class _Listed(NamedTuple):
     """A file of the folders, and the name of its experiment; None where `start` does not accept it."""
 
@@ -145,7 +152,7 @@ class ExperimentFiles:
         async with _in_time(str(path)):
             return await self._in_thread(lambda: self._read(path))
 
-    async def list(self, reading_refusal: Callable[[], str | None] = lambda: None) -> Mapping[str, str]:
+    async def list(self, reading_refusal: Callable[[], str | None] = lambda: None) -> Listing:
         """Return the names of the experiments of `folders` that `read` accepts, by path; raises UserError.
 
         While `reading_refusal` has a reason, no file is read and the latest list is returned.
@@ -153,8 +160,8 @@ class ExperimentFiles:
         async with _in_time("the folders of experiments"):
             reason = await self._refresh(reading_refusal)
         if self._latest is None:
-            raise UserError(f"{reason}, and no folder of experiments is read during that time; ask again afterwards")
-        return self._latest
+            return Listing({}, f"{reason}, and no folder of experiments is read during that time; ask again afterwards")
+        return Listing(self._latest, "")
 
     async def _refresh(self, reading_refusal: Callable[[], str | None]) -> str | None:
         """Read the files that have changed and renew the list; return None, or why no file is read now."""

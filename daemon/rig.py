@@ -1,7 +1,7 @@
 """The rig: builds robot, gripper and control loop from the configuration."""
 
 import secrets
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -247,22 +247,24 @@ class Rig:
     def _start_under_way(self) -> str | None:
         return f"{self.starting} is being started; wait until it has begun, or stop it" if self.starting else None
 
-    async def start(self, path: Path, digest: str | None = None) -> str | None:
+    async def start(
+        self, path: Path, digest: str | None = None, why_late: Callable[[], str | None] = lambda: None
+    ) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file.
 
         `digest` is of the question that a person has confirmed, if one was asked; raises QuestionChangedError where
-        another one would be asked now.
+        another one would be asked now. `why_late` says, once the file is read, whether it is too late to begin.
         """
         # While something moves, no file is read.
         if (reason := self.start_refusal()) is not None:
             return reason
         self.starting = path.name
         try:
-            return await self._start(path, digest)
+            return await self._start(path, digest, why_late)
         finally:
             self.starting = ""
 
-    async def _start(self, path: Path, digest: str | None) -> str | None:
+    async def _start(self, path: Path, digest: str | None, why_late: Callable[[], str | None]) -> str | None:
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
         if digest is not None and digest != (question := self._question_of(experiment)).digest:
@@ -271,10 +273,12 @@ class Rig:
                 "something was stopped or run"
             )
             raise QuestionChangedError(f"{path}: {changed}; look at the plan again", question)
+        if (reason := why_late()) is not None:
+            return reason
         try:
             if self.memory is not None and (reason := await self.memory.begins(experiment.file.name)) is not None:
                 return reason
-            reason = await self.runner.start(experiment.file, stops_before)
+            reason = await self.runner.start(experiment.file, stops_before, why_late)
         finally:
             if self.memory is not None:
                 self.memory.starting = ""

@@ -1,6 +1,6 @@
 """The task that runs the control loop: it takes robot states, sends commands and publishes, 125 times a second."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 import structlog
@@ -191,10 +191,13 @@ class ControlLoopRunner:
             return "the arm is moving"
         return None
 
-    async def start(self, file: ExperimentFile, stops_before: int | None = None) -> str | None:
+    async def start(
+        self, file: ExperimentFile, stops_before: int | None = None, why_late: Callable[[], str | None] = lambda: None
+    ) -> str | None:
         """Begin an experiment; return None, or why it cannot begin.
 
-        `stops_before` is the `stop_count` at the request, if the file was read since.
+        `stops_before` is the `stop_count` at the request, if the file was read since; `why_late` says whether the
+        request has become too old.
         """
         if self._closed:
             return ENDING
@@ -203,7 +206,7 @@ class ControlLoopRunner:
         # The control loop refuses while an experiment runs or a stop waits for the operator; a stopped arm must not be
         # enabled on the way.
         if self._stop_count == stops_before and self._control_loop.operator.start_refusal() is None:
-            refusal = await self._enable()
+            refusal = await self._enable() or why_late()
         if self._stop_count != stops_before:
             if not self._closed:
                 self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))

@@ -9,6 +9,7 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, has_valid_port, needs_keys
+from shearloop.daemon.messaging.deadlines import why_late
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
 from shearloop.daemon.messaging.stop_client import foreign_reply
@@ -18,6 +19,14 @@ from shearloop.timeouts import timeout
 TopicContent: TypeAlias = tuple[str, dict[str, Any]]
 # A running daemon sends `health` every second.
 QUIET_S = 3.0
+
+
+class LateRequestError(UserError):
+    """The operator asked for it too long ago: it was not sent."""
+
+
+class UnansweredError(UserError):
+    """A request was sent and no reply came: whether it was carried out is not known."""
 
 
 class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicContent], AsyncIterator[TopicContent]):
@@ -141,10 +150,12 @@ async def ask(
                 sent = True
                 return decode(await socket.recv())
         except TimeoutError as error:
-            late = ". One that runs may still carry it out: see `shearloop command status`" if may_act and sent else ""
+            in_doubt = may_act and sent
+            late = ". One that runs may have carried it out: see `shearloop command status`" if in_doubt else ""
             if content.get("command") == "stop":
                 late = ". Nothing says that the arm stands: use the emergency stop"
-            raise UserError(
+            kind = UnansweredError if in_doubt else UserError
+            raise kind(
                 f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
                 f"or give the address of its `commands` key with --connect{keys_hint(keys)}{late}"
             ) from error
@@ -152,13 +163,22 @@ async def ask(
             raise foreign_reply(address, error) from error
 
 
-def meant_for(status: Mapping[str, Any]) -> dict[str, str]:
-    """Return what binds a request to the daemon that gave this reply to `status`: one that begins later refuses it.
+def meant_for(status: Mapping[str, Any], age_s: float, within_s: float) -> dict[str, str | int]:
+    """Return what binds a request to the daemon that gave this reply to `status`, and to the time that is left.
 
-    Nothing for a daemon that does not say which one it is.
+    A daemon that begins later refuses it. This one refuses it later than `within_s` after the operator's act, which was
+    at most `age_s` ago when the reply came. Raises LateRequestError if no time is left. Nothing binds it to a daemon
+    that does not say which one it is, or what its clock shows.
     """
-    instance = status.get("daemon", {}).get("instance")
-    return {"instance": instance} if isinstance(instance, str) else {}
+    if (reason := why_late(age_s, within_s)) is not None:
+        raise LateRequestError(reason)
+    daemon = status.get("daemon", {})
+    bound: dict[str, str | int] = {}
+    if isinstance(instance := daemon.get("instance"), str):
+        bound["instance"] = instance
+    if isinstance(now_ns := daemon.get("now_ns"), int):
+        bound["until_ns"] = now_ns + round((within_s - age_s) * 1e9)
+    return bound
 
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:

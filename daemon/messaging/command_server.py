@@ -15,6 +15,7 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.messaging.bound_sockets import bind
+from shearloop.daemon.messaging.deadlines import NEVER_LATE, boot_ns
 from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.late_requests import LateRequests
 from shearloop.daemon.messaging.messages import decode, encode
@@ -25,7 +26,7 @@ LARGEST_REQUEST_BYTES = 4096
 # Requests of each client that wait in memory; others wait in its own.
 MAX_WAITING = 16
 MAX_CONCURRENT = 16
-STOP, STATUS = "stop", "status"
+STOP, STATUS, EXPERIMENTS = "stop", "status", "experiments"
 # The event loop is asked at this interval whether it runs.
 ALIVE_S = 0.2
 
@@ -83,7 +84,7 @@ class RequestExecutor:
     ) -> tuple[str, Request] | Reply:
         """Return the name and content of a valid request, or the refusal; t_ns is the monotonic time.
 
-        `why_late` says that it may be too old to be carried out: `stop` and `status` are never too old.
+        `why_late` says that it may be too old to be carried out; some never are.
         """
         request, problem = {}, ""
         try:
@@ -102,7 +103,7 @@ class RequestExecutor:
         if not isinstance(name, str) or name not in self._handlers:
             known, shown = ", ".join(sorted(self._handlers)), repr(name)[:40]
             return self._refuse("unknown command", f"there is no command {shown}; the commands are {known}")
-        if why_late is not None and name != STATUS:
+        if why_late is not None and name not in NEVER_LATE:
             return self._refuse("late request", why_late)
         if self._running >= MAX_CONCURRENT:
             return self._refuse("too many at once", "too many commands at once; wait")
@@ -124,7 +125,7 @@ class RequestExecutor:
         finally:
             self._running -= 1
         # Pages and scripts ask for the status every second. A question before a command carries nothing out.
-        quiet = name == STATUS or request.get("ask")
+        quiet = name in (STATUS, EXPERIMENTS) or request.get("ask")
         (log.debug if quiet else log.info)("command executed", command=name)
         return {"ok": True, **reply}
 
@@ -133,15 +134,10 @@ class RequestExecutor:
         return {"ok": False, "reason": reason}
 
 
-def _now_ns() -> int:
-    # Unlike the monotonic clock it goes on while the computer is suspended.
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-
-
 async def _stay_alive(late: LateRequests) -> None:
     """Note that the event loop runs, until cancelled."""
     while True:
-        late.alive(_now_ns())
+        late.alive(boot_ns())
         await asyncio.sleep(ALIVE_S)
 
 
@@ -167,12 +163,12 @@ class CommandServer:
 
     async def run(self) -> None:
         """Serve requests until cancelled; a slow command such as `unlock` does not delay a `stop`."""
-        late = LateRequests(_now_ns())
+        late = LateRequests(boot_ns())
         async with asyncio.TaskGroup() as group:
             group.create_task(_stay_alive(late))
             while True:
                 parts = await self._socket.recv_multipart()
-                why_late = late.why_late(_now_ns())
+                why_late = late.why_late(boot_ns())
                 # Receiving a message that has already arrived does not yield to other tasks.
                 await asyncio.sleep(0)
                 # A DEALER sends two frames, a REQ three. Other counts are answered like a DEALER's.

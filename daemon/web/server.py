@@ -29,12 +29,14 @@ from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.callers import caller
-from shearloop.daemon.messaging.client import ask, connect, meant_for
+from shearloop.daemon.messaging.client import LateRequestError, UnansweredError, ask, connect, meant_for
+from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S, NEVER_LATE, why_late
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to_stop_socket
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.message_store import MessageStore
+from shearloop.daemon.web.moments import Moments, UnknownMomentError
 from shearloop.errors import UserError
 from shearloop.timeouts import timeout
 
@@ -56,20 +58,13 @@ ASKED = ("start", "release")
 WORDS = {"start": ("experiment", "digest"), "unlock": ("digest", "stop"), "release": ("digest",)}
 # Those that are carried out at once, unless the daemon's refusal has a question; the digest answers it.
 ASKED_IF_NEEDED = ("unlock",)
+# The word of every command: the latest moment that the page had when it was clicked on.
+MOMENT = "moment"
 # The parts of a question, which a refusal has as well where another one is to be answered.
 QUESTION = ("question", "plan", "digest")
 # The parts of a daemon's reply that a page shows.
-_SHOWN_KEYS = (
-    "ok",
-    "reason",
-    "stopped",
-    "taring",
-    "not_connected",
-    "experiment",
-    *QUESTION,
-    "experiments",
-    "configured",
-)
+_SHOWN_KEYS = ("ok", "reason", "stopped", "taring", "not_connected", "experiment", *QUESTION)
+_LIST_KEYS = ("ok", "reason", "experiments", "configured", "unread")
 # Wrong tokens that are compared at once, and then per second.
 WRONG_BURST, WRONG_PER_S = 20.0, 1.0
 # Maximum redraw rate of a page.
@@ -163,13 +158,20 @@ class Bridge:
         finally:
             self._socket.unsubscribe(messages.EitHeatmap.topic)
 
-    async def command(self, name: str, **arguments: bool | int | str) -> dict[str, Any]:
-        """Return the daemon's reply to a command; raise UserError without a reply."""
+    async def experiments(self) -> dict[str, Any]:
+        """Return the daemon's list of experiments; raise UserError without a reply."""
+        return await self._request({"command": "experiments"}, COMMAND_TIMEOUT_S)
+
+    async def command(self, name: str, age_s: Callable[[], float], **arguments: bool | int | str) -> dict[str, Any]:
+        """Return the daemon's reply to a command; `age_s` returns the age of the click on it.
+
+        Raises LateRequestError if it is too old to be sent, UnansweredError if it was sent and no reply came, and
+        UserError if no daemon answers.
+        """
         content = {"command": name, "by": caller(PROGRAM), **arguments}
-        if name != "experiments":
-            status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
-            self._check_shown(status.get("daemon", {}).get("process"), "nothing was sent to it")
-            content |= meant_for(status)
+        status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
+        self._check_shown(status.get("daemon", {}).get("process"), "nothing was sent to it")
+        content |= meant_for(status, age_s(), CLICK_WITHIN_S)
         return await self._request(content, UNLOCK_TIMEOUT_S if name in SLOW else COMMAND_TIMEOUT_S)
 
     def _check_shown(self, process: int | None, done: str) -> None:
@@ -307,6 +309,7 @@ class _Page:
         self._bridge = bridge
         self._tokens = TokenCheck(token)
         self._refusals = Refusals()
+        self._moments = Moments()
         regular = [topic for topic, kind in messages.TOPICS.items() if kind.rate_hz is not None]
         self._settings = {
             "fingertip": fingertip,
@@ -353,8 +356,15 @@ class _Page:
         return web.json_response(self._settings)
 
     async def experiments(self, _request: web.Request) -> web.Response:
-        """Return the experiments that `start` may name, and the configured one."""
-        return await self._reply("experiments", self._bridge.command("experiments"))
+        """Return the experiments that `start` may name, and the configured one, or the reason without a list.
+
+        It is no refusal: pages ask by themselves, also while the daemon ends.
+        """
+        try:
+            reply = await self._bridge.experiments()
+        except UserError as error:
+            reply = {"ok": False, "reason": str(error)}
+        return web.json_response({key: reply[key] for key in _LIST_KEYS if key in reply})
 
     async def stop(self, _request: web.Request) -> web.Response:
         """Stop all motion; needs no token."""
@@ -368,11 +378,14 @@ class _Page:
         refusal = self._tokens.refusal(name, request.headers.get("Authorization"), time.monotonic_ns())
         if refusal is not None:
             return self._refuse(*refusal)
-        words = WORDS.get(name, ())
+        age_s = self._age(name, request.query.get(MOMENT, ""))
+        if isinstance(age_s, web.Response):
+            return age_s
+        words = (MOMENT, *WORDS.get(name, ()))
         if unknown := [word for word in request.query if word not in words]:
-            has = f"there are {', '.join(words)}" if words else "there are none"
-            return self._refuse(400, f"`{name}` has no word {unknown[0][:40]!r} here; {has}")
-        arguments: dict[str, bool | int | str] = {word: text for word, text in request.query.items() if text}
+            return self._refuse(400, f"`{name}` has no word {unknown[0][:40]!r} here; there are {', '.join(words)}")
+        own_words = {word: text for word, text in request.query.items() if text and word != MOMENT}
+        arguments: dict[str, bool | int | str] = {**own_words}
         if "stop" in arguments:
             number = request.query["stop"]
             if not (number.isascii() and number.isdecimal() and len(number) <= _MAX_DIGITS):
@@ -383,11 +396,28 @@ class _Page:
             arguments["ask"] = True
         elif name == "release" or (name in ASKED_IF_NEEDED and "digest" in arguments):
             arguments["confirmed"] = True
-        return await self._reply(name, self._bridge.command(name, **arguments))
+        return await self._reply(name, self._bridge.command(name, age_s, **arguments))
+
+    def _age(self, name: str, moment: str) -> Callable[[], float] | web.Response:
+        """Return a function that returns the age of a click, or the refusal of one that is too old."""
+        if name in NEVER_LATE:
+            return lambda: 0.0
+        try:
+            reason = why_late(self._moments.age_s(moment), CLICK_WITHIN_S)
+        except UnknownMomentError:
+            return self._refuse(400, "the page does not say when it was clicked on; look at the rig, and click again")
+        if reason is not None:
+            return self._refuse(409, reason)
+        return partial(self._moments.age_s, moment)
 
     async def _reply(self, name: str, requested: Awaitable[dict[str, Any]]) -> web.Response:
         try:
             reply = await requested
+        except LateRequestError as error:
+            return self._refuse(409, str(error))
+        except UnansweredError as error:
+            self._refusals.add("status 504", str(error))
+            return web.json_response({"ok": False, "reason": str(error), "unconfirmed": True}, status=504)
         except UserError as error:
             return self._refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
@@ -418,7 +448,8 @@ class _Page:
                 now_s = time.monotonic()
                 if first or latest.number > sent or now_s - sent_s >= HEARTBEAT_S:
                     history = latest.history(now_s) if first else []
-                    text = latest.batch(sent, now_s, first=first, now=time.time(), history=history)
+                    moment = self._moments.present()
+                    text = latest.batch(sent, now_s, first=first, now=time.time(), moment=moment, history=history)
                     sent, first, sent_s = latest.number, False, now_s
                     try:
                         async with timeout(SEND_TIMEOUT_S):

@@ -31,6 +31,7 @@ from shearloop.cli.registry import COMMANDS, GROUPS, OTHER_SPELLINGS, command_mo
 from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
+from shearloop.daemon.messaging.deadlines import boot_ns
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, RobotStateMessage, decode, encode, wire_map
 from shearloop.daemon.rig import LOOP_KEYS
 from shearloop.daemon.run_summary import RunSummary
@@ -672,6 +673,30 @@ def test_listen_says_first_that_the_rig_is_emulated(emulated, as_json, tmp_path,
     out, err = capsys.readouterr()
     assert ("EMULATED" in (err if as_json else out.splitlines()[0])) is emulated
     assert len(out.splitlines()) == (1 if as_json or not emulated else 2)
+
+
+@pytest.mark.parametrize(("name", "sent"), [("start", False), ("unlock", False), ("pause", True)])
+def test_a_command_that_was_held_up_is_not_sent_unless_it_lets_nothing_move(name, sent, monkeypatch, capsys):
+    """Ctrl-Z, or a suspended computer, between the person's word and the daemon."""
+    asked: list[str] = []
+
+    def answers(_address: str, content: dict[str, Any], *_: object) -> dict[str, Any]:
+        asked.append(content["command"])
+        return {"ok": True, "daemon": {"instance": "a1", "now_ns": 1}}
+
+    monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", answers)
+    monkeypatch.setattr("shearloop.cli.command.boot_ns", lambda: boot_ns() + 6_000_000_000)
+    assert main(["command", name]) == (0 if sent else 2)
+    assert asked == ["status", name][: 1 + sent]
+    assert ("asked for 6.0 s ago, and nothing begins later than 5 s after that" in capsys.readouterr().err) is not sent
+
+
+def test_a_command_is_as_old_as_its_process():
+    program = "from shearloop.daemon.messaging.deadlines import process_began_ns; print(process_began_ns())"
+    before_ns = boot_ns()
+    began_ns = int(subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout)
+    tick_ns = 10_000_000
+    assert before_ns - tick_ns <= began_ns <= boot_ns()
 
 
 @pytest.mark.parametrize("given", [(), ("--connect", "tcp://127.0.0.1:9762")])

@@ -5,9 +5,11 @@ import { byId, put, putLines, show } from "./text.js";
 
 const KEY = "shearloop-token";
 const TOKEN_NEEDED = "needs the token: open the address that `shearloop view` printed";
-// A daemon answers within milliseconds; `unlock` takes longer.
-const LATE_MS = 65000;
+// A daemon answers within milliseconds; `start`, `unlock` and `release` may take 150 s.
+const LATE_MS = 155000;
+const LIST_LATE_MS = 10000;
 const STOP_LATE_MS = 4000;
+const NO_VIEWER = "the viewer on the rig's computer does not answer";
 // An answer disappears after this time; an unconfirmed stop stays.
 const SHOWN_MS = 8000;
 
@@ -22,13 +24,17 @@ export class Controls {
   constructor() {
     this.takeTokenFromAddress();
     this.reasons = {};
+    // Why the daemon has no list of experiments to pick from.
+    this.unlisted = "";
+    // Counts what was clicked: an answer to an earlier click does not replace what is said of a later one.
+    this.clicks = 0;
     byId("stop").addEventListener("click", () => this.stop());
     byId("stop").disabled = false;
     document.addEventListener("keydown", (event) => {
       if (event.key === "Escape" && !event.repeat) this.stop();
     });
-    for (const button of this.buttons()) button.addEventListener("click", () => this.command(button.dataset.command));
-    byId("confirm").addEventListener("click", () => this.confirm());
+    for (const button of this.buttons()) button.addEventListener("click", (event) => this.command(button.dataset.command, event));
+    byId("confirm").addEventListener("click", (event) => this.confirm(event));
     byId("cancel").addEventListener("click", () => this.ask_about(""));
     byId("token-form").addEventListener("submit", (event) => {
       event.preventDefault();
@@ -56,6 +62,7 @@ export class Controls {
 
   // Disable what the rig would refuse now, with the reason.
   update(link) {
+    this.link = link;
     this.reasons = refusals(link);
     this.refresh();
     const loop = link.get("loop.state")?.content;
@@ -68,6 +75,27 @@ export class Controls {
     this.busy = busy;
     // An unlock acknowledges the stop that is shown, and no other.
     this.stopShown = loop?.stop;
+    this.watch(loop);
+  }
+
+  // A command without an answer, once nothing answers: the page says so until an answer, or the rig's state, says more.
+  watch(loop) {
+    const { sent, link } = this;
+    if (!sent) return;
+    if (link.state() !== "live") {
+      if (!sent.inDoubt) this.doubt(link.viewerLost() ? NO_VIEWER : "the daemon does not answer");
+      return;
+    }
+    if (!sent.inDoubt) return;
+    const known = outcomeByState(link, sent, loop);
+    if (!known) return;
+    this.sent = null;
+    this.tell(known.sentence, known.kind);
+  }
+
+  doubt(reason) {
+    this.sent.inDoubt = true;
+    this.tell(`${this.sent.name.toUpperCase()} NOT CONFIRMED: ${reason}. Look at the rig: it may still move.`, "bad", true);
   }
 
   // Fill the picker with the experiments that the daemon offers.
@@ -75,11 +103,12 @@ export class Controls {
     const picker = byId("experiment");
     let reply;
     try {
-      reply = await (await fetch("experiments.json", { signal: AbortSignal.timeout(LATE_MS) })).json();
+      reply = await (await fetch("experiments.json", { signal: AbortSignal.timeout(LIST_LATE_MS) })).json();
     } catch {
       reply = {};
     }
-    this.listed = reply.ok === true;
+    this.unlisted = reply.ok ? reply.unread ?? "" : reply.reason ?? NO_VIEWER;
+    this.listed = this.unlisted === "";
     const before = picker.value;
     const offered = reply.experiments ?? [];
     picker.replaceChildren(...offered.map(({ path, name }) => new Option(name, path)));
@@ -99,16 +128,26 @@ export class Controls {
       if (reason) names.set(reason, [...(names.get(reason) ?? []), command]);
     }
     const sentences = [...names].map(([reason, commands]) => `${commands.join(", ")}: ${reason}`);
+    if (this.received && this.unlisted) sentences.push(`no list of experiments: ${this.unlisted}`);
     put(byId("controls-reason"), token ? sentences.join("; ") : "");
     if (byId("token-form").hidden !== Boolean(token)) byId("token-form").hidden = Boolean(token);
   }
 
   async stop() {
-    this.ask_about("");
+    const click = this.begin();
     this.tell("stopping …");
     const reply = await this.ask("stop", {}, STOP_LATE_MS);
+    if (click !== this.clicks) return;
     if (reply.ok) this.tell(reply.stopped ? `stopped: ${reply.stopped}` : "stop: nothing was moving");
     else this.tell(`STOP NOT CONFIRMED: ${reply.reason}. Use the emergency stop of the robot.`, "bad", true);
+  }
+
+  // A new click ends the question and what was said before; returns its number.
+  begin() {
+    this.ask_about("");
+    this.sent = null;
+    this.clicks += 1;
+    return this.clicks;
   }
 
   // The daemon's question, which `confirm` answers with its digest; an empty one is taken away.
@@ -122,30 +161,40 @@ export class Controls {
     show(byId("question"), name !== "");
   }
 
-  confirm() {
+  confirm(event) {
     const { asked: name, digest } = this;
     this.ask_about("");
     if (!name) return;
     // Meanwhile something was stopped, started or lost.
     const reason = this.reasons[name];
     if (reason) this.tell(`${name} was not sent: ${reason}`, "bad");
-    else this.command(name, digest, this.picked);
+    else this.command(name, event, digest, this.picked);
   }
 
   // The confirmation starts the experiment of the question, even if another one is picked meanwhile. The digest says
   // which content was shown: the daemon refuses another one, with its own question.
-  async command(name, digest = "", picked = byId("experiment").value) {
-    this.ask_about("");
+  async command(name, event, digest = "", picked = byId("experiment").value) {
+    const click = this.begin();
     this.picked = picked;
-    const words = new URLSearchParams();
+    const words = new URLSearchParams({ moment: this.link.momentOf(event) });
     if (digest) words.set("digest", digest);
     if (name === "start" && picked) words.set("experiment", picked);
     if (name === "unlock" && Number.isInteger(this.stopShown)) words.set("stop", this.stopShown);
-    this.tell(`${name} …`);
+    this.sent = { name, at: event.timeStamp / 1000, run: this.link.get("loop.state")?.content.run, inDoubt: false };
+    this.tell(`${name} …`, "", true);
     const reply = await this.ask(`commands/${name}?${words}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
+    if (click !== this.clicks) return;
+    if (reply.unconfirmed) {
+      // The state may already have told it.
+      if (this.sent) this.doubt(reply.reason);
+      return;
+    }
+    const inDoubt = this.sent?.inDoubt ?? false;
+    this.sent = null;
     // A refusal of the first press with a question is no more than the question.
     const asks_only = reply.question && !digest;
-    if (!reply.ok) this.tell(asks_only ? "" : `${name} was refused: ${reply.reason}`, "bad");
+    // Who was told that nothing confirms it also has to see how it ended.
+    if (!reply.ok) this.tell(asks_only ? "" : `${name} was refused: ${reply.reason}`, "bad", inDoubt);
     else this.tell(reply.question ? "" : outcome(name, reply));
     if (reply.question) this.ask_about(name, reply.question, reply.plan, reply.digest);
     // Ask again after a wrong token.
@@ -157,7 +206,7 @@ export class Controls {
       const response = await fetch(path, { method: "POST", headers, keepalive: true, signal: AbortSignal.timeout(lateMs) });
       return { status: response.status, ...(await response.json()) };
     } catch {
-      return { ok: false, reason: "the viewer on the rig's computer does not answer" };
+      return { ok: false, unconfirmed: true, reason: NO_VIEWER };
     }
   }
 
@@ -168,6 +217,17 @@ export class Controls {
     clearTimeout(this.going);
     if (!stays) this.going = setTimeout(() => put(answer, ""), SHOWN_MS);
   }
+}
+
+// What the rig's state shows of a command without an answer; undefined while it shows nothing.
+function outcomeByState(link, { name, at, run }, loop) {
+  const answered = link.get("daemon.command");
+  if (answered?.at >= at && answered.content.command === name) {
+    const { accepted, reason } = answered.content;
+    return accepted ? { sentence: `${name}: done` } : { sentence: `${name} was refused: ${reason}`, kind: "bad" };
+  }
+  if (name === "start" && loop && ACTIVE.has(loop.phase) && loop.run !== run) return { sentence: "start: done" };
+  return undefined;
 }
 
 // Why each command cannot work now. What the page cannot know, the daemon refuses.

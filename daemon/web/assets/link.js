@@ -8,6 +8,9 @@ const LOST_AFTER_S = 1.0;
 // Messages that are further from now come from a replay; a step back by more than this starts it again.
 const REPLAYED_S = 5.0;
 
+// The viewer sends at most 30 moments a second, and a click names one of before it.
+const MOST_MOMENTS = 300;
+
 // Lines of the list of what happened.
 const MOST_EVENTS = 200;
 
@@ -22,6 +25,7 @@ export class Link {
     // What happened, oldest first; another viewer begins another list.
     this.events = [];
     this.eventsOf = 0;
+    this.moments = [];
     this.ended = false;
     this.onMessage = onMessage;
     this.batchAt = null;
@@ -49,6 +53,8 @@ export class Link {
       this.said = null;
     }
     this.batchAt = now;
+    this.moments.push({ at: now, moment: batch.moment });
+    if (this.moments.length > MOST_MOMENTS) this.moments.shift();
     this.offset = batch.now - now;
     this.refused = batch.refused;
     this.events.push(...batch.events);
@@ -76,6 +82,11 @@ export class Link {
   unixNow() {
     const replayed = this.said !== null && Math.abs(this.said - this.offset) > REPLAYED_S;
     return seconds() + (replayed ? this.said : this.offset);
+  }
+
+  // The viewer's latest moment that was here when an event happened; the page may have stood still since.
+  momentOf(event) {
+    return this.moments.findLast(({ at }) => at <= event.timeStamp / 1000)?.moment ?? "";
   }
 
   sinceBatch() { return this.batchAt === null ? Infinity : seconds() - this.batchAt; }

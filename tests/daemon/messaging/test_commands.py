@@ -14,10 +14,17 @@ import zmq.asyncio
 
 from shearloop.cli.command import DAEMON_COMMANDS
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commands import EXPERIMENTS, Commands
+from shearloop.daemon.commands import Commands
 from shearloop.daemon.messaging.callers import UNKNOWN, caller, caller_of
-from shearloop.daemon.messaging.client import ask, meant_for, receive_messages, send_command
-from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, CommandServer, RequestExecutor
+from shearloop.daemon.messaging.client import LateRequestError, ask, meant_for, receive_messages, send_command
+from shearloop.daemon.messaging.command_server import (
+    EXPERIMENTS,
+    STATUS,
+    STOP,
+    CommandRefusedError,
+    CommandServer,
+    RequestExecutor,
+)
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
@@ -84,7 +91,7 @@ async def test_only_a_request_that_was_sent_may_still_be_carried_out(tmp_path):
         for name, sent in (("nobody", False), ("silent", True)):
             with pytest.raises(UserError, match="no daemon answered") as refused:
                 await ask(context, f"ipc://{tmp_path}/{name}", request, 0.2, None)
-            assert ("may still carry it out" in str(refused.value)) is sent
+            assert ("may have carried it out" in str(refused.value)) is sent
 
 
 @pytest.mark.parametrize("name", sorted({*DAEMON_COMMANDS} - {STATUS, STOP, EXPERIMENTS}))
@@ -99,10 +106,33 @@ async def test_a_stop_is_for_every_daemon_and_another_request_may_be():
     health = SimpleNamespace(tasks=dict, rig="bench")
     commands = Commands(None, SimpleNamespace(tareable={}), None, health, asyncio.Event(), lambda **_: "held")
     status = await commands.handlers()[STATUS]({})
-    for bound in (meant_for(status), {}):
+    for bound in (meant_for(status, 0.0, 2.0), {}):
         with pytest.raises(CommandRefusedError, match="held"):
             await commands.handlers()["tare"](bound)
     assert (await commands.handlers()[STOP]({"instance": "another", "spare_daemon": True}))["stopped"] == ""
+
+
+@pytest.mark.parametrize("name", sorted({*DAEMON_COMMANDS} - {STATUS, STOP, EXPERIMENTS}))
+async def test_what_is_asked_for_too_long_ago_is_refused_unless_it_lets_nothing_move(name):
+    """The request, the client or the daemon stood still after the operator's word."""
+    health = SimpleNamespace(tasks=dict, rig="bench")
+    now_ns = 7_000_000_000
+    commands = Commands(None, None, None, health, asyncio.Event(), None, now_ns=lambda: now_ns)
+    request = {"command": name, **meant_for(await commands.handlers()[STATUS]({}), 0.5, 2.0)}
+    now_ns += 1_600_000_000
+    with pytest.raises(CommandRefusedError) as refused:
+        await commands.handlers()[name](request)
+    assert ("it came 0.1 s too late" in str(refused.value)) is (name != "pause")
+
+
+async def test_nothing_is_sent_that_was_asked_for_too_long_ago():
+    with pytest.raises(LateRequestError, match=r"asked for 2\.1 s ago, and nothing begins later than 2 s after that"):
+        meant_for({"daemon": {"instance": "a1", "now_ns": 1}}, 2.1, 2.0)
+    assert meant_for({"daemon": {"instance": "a1", "now_ns": 1}}, 0.5, 2.0) == {
+        "instance": "a1",
+        "until_ns": 1_500_000_001,
+    }
+    assert meant_for({}, 0.5, 2.0) == {}
 
 
 def test_an_address_in_use_is_an_error():

@@ -28,20 +28,20 @@ def test_a_standstill_is_known_for_as_long_as_its_requests_are_read():
 
 
 @pytest.mark.parametrize(
-    ("name", "carried_out"), [("start", False), ("release", False), ("status", True), ("stop", True)]
+    ("name", "carried_out"), [("start", False), ("release", False), ("status", True), ("stop", True), ("pause", True)]
 )
-async def test_what_is_sent_to_a_daemon_that_stands_still_is_refused_but_for_stop_and_status(
+async def test_what_is_sent_to_a_daemon_that_stands_still_is_refused_unless_it_lets_nothing_move(
     name, carried_out, monkeypatch
 ):
     done: list[str] = []
     now_ns = [0]
-    monkeypatch.setattr(command_server, "_now_ns", lambda: now_ns[0])
+    monkeypatch.setattr(command_server, "boot_ns", lambda: now_ns[0])
 
     async def handle(request) -> dict[str, bool]:
         done.append(request["command"])
         return {}
 
-    handlers = dict.fromkeys(("start", "release", "status", "stop"), handle)
+    handlers = dict.fromkeys(("start", "release", "status", "stop", "pause"), handle)
     with (
         zmq.asyncio.Context() as context,
         closing(CommandServer(context, "tcp://127.0.0.1:*", handlers, Refusals())) as server,

@@ -4,7 +4,9 @@ import json
 import os
 import select
 import shutil
+import signal
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +50,16 @@ class Killable:
         if self._pid is not None:
             self._forks.kill(self._pid)
             self._pid = None
+
+    @contextmanager
+    def standing_still(self) -> Iterator[None]:
+        """Let the process stand still, and continue."""
+        assert self._pid is not None
+        os.kill(self._pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            os.kill(self._pid, signal.SIGCONT)
 
 
 class FakeDaemon(Killable):

@@ -129,7 +129,7 @@ async def serve(folder: Path) -> None:
 
     async def experiments(_request: Mapping[str, Any]) -> dict[str, Any]:
         if not json.loads((folder / "changed").read_text())["lists"]:
-            raise CommandRefusedError("the experiment 'hold' is running")
+            return {"experiments": [], "configured": "", "unread": "the experiment 'hold' is running"}
         found = [{"path": path, "name": name} for path, name in EXPERIMENTS.items()]
         return {"experiments": found, "configured": next(iter(EXPERIMENTS))}
 

@@ -3,7 +3,9 @@
 from typing import Any
 
 import pytest
+from playwright.sync_api import Page
 
+from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S
 from tests.daemon.web.fake_daemon import CAUSE, MESSAGES, PLAN, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
@@ -143,13 +145,92 @@ def test_the_keyboard_reaches_everything_and_stop_first(browsed):
     assert browsed.daemon.asked == ["stop", "tare"]
 
 
-def test_a_page_that_opens_during_a_run_has_the_list_afterwards(browsed):
+def test_a_page_that_opens_during_a_run_says_why_it_has_no_list_and_has_it_afterwards(browsed):
     browsed.daemon.say(loop={"phase": "running"}, lists=False)
     page = browsed.open(token=True)
     page.wait_for_selector("[data-command=pause]:enabled")
+    browsed.until("#controls-reason", "no list of experiments: the experiment 'hold' is running")
     assert page.locator("#experiment:visible").count() == 0
     browsed.daemon.say(loop={"phase": "done"})
     page.wait_for_selector("#experiment:visible")
+    page.wait_for_function("() => !document.querySelector('#controls-reason').textContent.includes('no list')")
+    assert browsed.complaints == []
+
+
+def begin_a_start(browsed) -> Page:
+    """Open the page and ask for a start, up to its question."""
+    page = browsed.open(token=True)
+    browsed.daemon.say(loop={"phase": "idle"})
+    page.wait_for_selector("#experiment:visible")
+    page.click("[data-command=start]:enabled")
+    browsed.until("#question-text", "Really start?")
+    return page
+
+
+def test_a_start_through_a_viewer_that_stands_still_is_in_doubt_and_never_carried_out_late(browsed):
+    page = begin_a_start(browsed)
+    with browsed.viewer.standing_still():
+        page.click("#confirm")
+        browsed.until("#answer", "START NOT CONFIRMED: the viewer on the rig's computer does not answer")
+        page.wait_for_timeout(1000 * CLICK_WITHIN_S)
+        assert "START NOT CONFIRMED" in browsed.text("#answer"), "it stays"
+    browsed.until("#answer", "start was refused: it may have been asked for")
+    assert browsed.daemon.asked == []
+    page.click("[data-command=start]:enabled")
+    browsed.until("#question-text", "Really start?")
+    page.click("#confirm")
+    browsed.until("#answer", "start: done")
+    assert browsed.daemon.asked == ["start hold"]
+
+
+def test_a_start_to_a_daemon_that_stands_still_is_in_doubt_and_never_carried_out_late(browsed):
+    page = begin_a_start(browsed)
+    with browsed.daemon.standing_still():
+        page.click("#confirm")
+        browsed.until("#answer", "START NOT CONFIRMED: the daemon does not answer")
+        page.wait_for_timeout(1000 * CLICK_WITHIN_S)
+    browsed.until("#link-state", "● live")
+    assert browsed.daemon.asked == []
+
+
+def test_a_click_on_a_page_that_stands_still_is_not_carried_out_late(browsed):
+    page = begin_a_start(browsed)
+    # Before the button hears of the click.
+    page.evaluate(
+        """(ms) => addEventListener("click", () => {
+          const end = performance.now() + ms;
+          while (performance.now() < end);
+        }, { capture: true, once: true })""",
+        1500 * CLICK_WITHIN_S,
+    )
+    page.click("#confirm")
+    browsed.until("#answer", "start was refused: it may have been asked for")
+    assert browsed.daemon.asked == []
+
+
+def test_the_state_tells_how_a_start_without_an_answer_ended(browsed):
+    page = begin_a_start(browsed)
+    browsed.page.route("**/commands/start?*", lambda route: route.abort())
+    page.click("#confirm")
+    browsed.until("#answer", "START NOT CONFIRMED: the viewer on the rig's computer does not answer")
+    browsed.page.unroute("**/commands/start?*")
+    browsed.daemon.say(loop={"phase": "running", "run": MESSAGES["loop"]["run"] + 1})
+    browsed.until("#answer", "start: done")
+    browsed.complaints.clear()
+
+
+def test_an_earlier_answer_does_not_replace_what_is_said_of_a_stop(browsed):
+    page = begin_a_start(browsed)
+    with browsed.viewer.standing_still():
+        page.click("#confirm")
+        browsed.until("#answer", "START NOT CONFIRMED")
+        page.click("#stop")
+        browsed.until("#answer", "STOP NOT CONFIRMED")
+        page.wait_for_timeout(1000 * CLICK_WITHIN_S)
+    browsed.until("#link-state", "● live")
+    # The answer to the start is here once that of a later command is.
+    page.evaluate("fetch('/settings.json')")
+    assert "STOP NOT CONFIRMED" in browsed.text("#answer")
 
 
 def test_the_picked_experiment_shows_its_plan_and_is_the_one_that_starts(browsed):

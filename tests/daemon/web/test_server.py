@@ -31,6 +31,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.web import server as server_module
 from shearloop.daemon.web.message_store import MessageStore
+from shearloop.daemon.web.moments import Moments
 from shearloop.daemon.web.server import (
     ASKED,
     HEADERS,
@@ -113,8 +114,16 @@ async def until(is_so: Callable[[], bool]) -> None:
 
 
 async def post(page: "Served | Page", path: str, **headers: str) -> tuple[int, dict[str, Any]]:
+    if path.startswith("/commands/") and "moment=" not in path and "Authorization" in headers:
+        path += f"{'&' if '?' in path else '?'}moment={await moment(page)}"
     async with page.http.post(page.base + path, headers=headers) as response:
         return response.status, await response.json()
+
+
+async def moment(page: "Served | Page") -> str:
+    """Return the viewer's present moment, as a page has it."""
+    async with page.http.ws_connect(f"{page.base}/stream") as stream:
+        return str((await stream.receive_json())["moment"])
 
 
 async def test_motion_needs_the_token_and_stop_does_not(tmp_path):
@@ -162,6 +171,98 @@ async def test_a_confirmation_is_the_digest_of_a_question(tmp_path):
             409,
             {"ok": False, "reason": "the file has changed", "question": "Start?", "plan": ["one"], "digest": "new"},
         )
+
+
+async def test_a_click_is_carried_out_soon_or_never_whatever_stood_still(tmp_path, monkeypatch):
+    begun_ns, slow_ns = 1_000_000_000, [0]
+    now_ns = begun_ns
+    monkeypatch.setattr(server_module, "Moments", lambda: Moments(lambda: now_ns))
+
+    async def slow_status(_request: Mapping[str, Any]) -> dict[str, Any]:
+        nonlocal now_ns
+        now_ns += slow_ns[0]
+        return {"daemon": {"instance": "a1", "now_ns": 5_000_000_000}}
+
+    async with served(tmp_path, status=slow_status) as page:
+        clicked = await moment(page)
+        now_ns += 2_000_000_000
+        for name in NEEDS_TOKEN:
+            assert (await post(page, f"/commands/{name}?moment={clicked}", **BEARER))[0] in (200, 409), name
+        assert page.asked == [*NEEDS_TOKEN]
+        page.asked.clear()
+        # A little later, or after a viewer or a network that stood still meanwhile.
+        for later_ns, slow_ns[0] in ((1, 0), (-1, 2), (24_000_000_000, 0)):
+            now_ns = begun_ns + 2_000_000_000 + later_ns
+            for name in (name for name in NEEDS_TOKEN if name != "pause"):
+                status, reply = await post(page, f"/commands/{name}?moment={clicked}", **BEARER)
+                now_ns = begun_ns + 2_000_000_000 + later_ns
+                assert status == 409
+                assert "s ago, and nothing begins later than 2 s after that" in reply["reason"], name
+        assert page.asked == []
+        # What the page does not say, or another viewer has said.
+        for unknown in (
+            "",
+            "1",
+            clicked.replace("-", ""),
+            clicked + "0" * 30,
+            f"{clicked}11",
+            "0-0",
+            f"{clicked[:-1]}²",
+        ):
+            assert (await post(page, f"/commands/start?moment={unknown}", **BEARER))[0] == 400, unknown
+        assert (await post(page, f"/commands/pause?moment={clicked}", **BEARER))[0] == 409
+        assert await post(page, "/stop") == (200, {"ok": True, "stopped": "test"})
+        assert page.asked == ["pause", "stop"], "neither is ever too late"
+
+
+async def test_the_daemon_is_told_how_much_time_a_click_has_left(tmp_path, monkeypatch):
+    now_ns = 0
+    monkeypatch.setattr(server_module, "Moments", lambda: Moments(lambda: now_ns))
+    requests: list[Mapping[str, Any]] = []
+
+    async def status(_request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"daemon": {"instance": "a1", "now_ns": 5_000_000_000}}
+
+    async def start(request: Mapping[str, Any]) -> dict[str, Any]:
+        requests.append(request)
+        return {}
+
+    async with served(tmp_path, status=status, start=start) as page:
+        clicked = await moment(page)
+        now_ns += 1_500_000_000
+        await post(page, f"/commands/start?digest=d&moment={clicked}", **BEARER)
+        assert [(one["instance"], one["until_ns"]) for one in requests] == [("a1", 5_500_000_000)]
+
+
+async def test_a_command_without_an_answer_is_told_to_be_in_doubt(tmp_path, monkeypatch):
+    monkeypatch.setattr(server_module, "UNLOCK_TIMEOUT_S", 0.2)
+
+    async def never(_request: Mapping[str, Any]) -> dict[str, Any]:
+        await asyncio.Event().wait()
+        return {}
+
+    async with served(tmp_path, start=never) as page:
+        status, reply = await post(page, "/commands/start?digest=d", **BEARER)
+        assert (status, reply["ok"], reply["unconfirmed"]) == (504, False, True)
+
+
+async def test_a_list_that_there_is_not_is_no_refusal(tmp_path, log, monkeypatch):
+    monkeypatch.setattr(server_module, "COMMAND_TIMEOUT_S", 0.05)
+
+    async def experiments(_request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"experiments": [], "configured": "", "unread": "'hold' is running"}
+
+    async with served(tmp_path, experiments=experiments) as page:
+        async with page.http.get(f"{page.base}/experiments.json") as response:
+            assert (response.status, await response.json()) == (
+                200,
+                {"ok": True, "experiments": [], "configured": "", "unread": "'hold' is running"},
+            )
+        # The daemon has ended.
+        page.bridge.address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
+        async with page.http.get(f"{page.base}/experiments.json") as response:
+            assert (response.status, (await response.json())["ok"]) == (200, False)
+        assert "refused" not in log.said
 
 
 async def test_an_unlock_is_sent_at_once_and_confirmed_by_the_digest_of_its_question(tmp_path):

@@ -1,0 +1,39 @@
+"""How long after an operator's act its request may be carried out, whatever it passes stands still on its way.
+
+Each part on the way has a clock of its own, and no two are compared. A part gives out a reading of its clock before the
+act, and the request carries the reading back. The time since that reading is at least the age of the act.
+"""
+
+import os
+import time
+from pathlib import Path
+from typing import Final
+
+# The page's clicks, and commands that are typed, whose program takes a while to begin on a busy computer.
+CLICK_WITHIN_S: Final = 2.0
+TYPED_WITHIN_S: Final = 5.0
+# They let nothing move: they are never too late.
+NEVER_LATE: Final = ("status", "stop", "pause")
+# The place of a process's first clock tick in /proc/self/stat (proc(5)), after the name, which may have spaces.
+_STARTED = 19
+
+
+def boot_ns() -> int:
+    """Return a clock that goes on while the computer is suspended, in ns."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+def process_began_ns() -> int:
+    """Return when this process began, in ns of `boot_ns`."""
+    facts = Path("/proc/self/stat").read_text(errors="replace").rpartition(")")[2].split()
+    return int(facts[_STARTED]) * 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+
+
+def why_late(age_s: float, within_s: float) -> str | None:
+    """Return why a request is not carried out at this age of the operator's act, or None."""
+    if age_s <= within_s:
+        return None
+    return (
+        f"it may have been asked for {age_s:.1f} s ago, and nothing begins later than {within_s:g} s after that; look "
+        "at the rig, and send it again"
+    )

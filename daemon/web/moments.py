@@ -1,0 +1,36 @@
+"""The moments that the viewer gives out to its pages: a click names the latest one, which tells the age of the click.
+
+The page's clock is not compared with the viewer's. A tab, the connection or the viewer may have stood still since.
+"""
+
+import secrets
+from collections.abc import Callable
+
+from shearloop.daemon.messaging.deadlines import boot_ns
+
+
+class UnknownMomentError(ValueError):
+    """A text is no moment of this viewer."""
+
+
+class Moments:
+    """Gives out moments, and tells how long ago it gave one out."""
+
+    def __init__(self, now_ns: Callable[[], int] = boot_ns) -> None:
+        self._now_ns = now_ns
+        # A moment of another viewer says nothing here.
+        self._own = secrets.token_hex(8)
+
+    def present(self) -> str:
+        """Return the present moment."""
+        return f"{self._own}-{self._now_ns()}"
+
+    def age_s(self, moment: str) -> float:
+        """Return how long ago a moment was given out; raises UnknownMomentError."""
+        own, _, digits = moment.partition("-")
+        if own != self._own or not (digits.isascii() and digits.isdecimal() and len(digits) <= len(str(1 << 63))):
+            raise UnknownMomentError(moment)
+        age_s = (self._now_ns() - int(digits)) / 1e9
+        if age_s < 0.0:
+            raise UnknownMomentError(moment)
+        return age_s

@@ -47,7 +47,7 @@ class LineClock:
         self._phase: deque[tuple[int, int]] = deque(maxlen=PHASE_ARRIVALS)
         self._slot = 0
         self._refused = 0
-        # When the last line before a restart was sent, and whether there was a line since.
+        # When the last line was sent, and whether the port was opened since.
         self._sent_ns: int | None = None
         self._restarted = False
 

@@ -306,6 +306,15 @@ def test_a_tare_under_load_has_to_be_confirmed(torque_nm, refused):
     assert loop.operator.tare_refusal(confirmed=True) is None
 
 
+def test_a_load_that_is_too_large_for_a_torque_becomes_no_zero_by_a_step_or_a_command():
+    loop = ControlLoop(LoopConfig(), {"load_cell": LOAD}, ("robot",))
+    loop.on_torque(TorqueSample("load_cell", None, "it is saturated", 0, 0, load="its range has ended"))
+    loaded = "load_cell is loaded: its range has ended, which would become the zero; take the load off"
+    assert loop.operator.why_no_tare_step().startswith(loaded)
+    assert loop.operator.tare_refusal().startswith(loaded)
+    assert loop.operator.tare_refusal(confirmed=True) is None
+
+
 def test_a_running_experiment_refuses_a_tare():
     rig = started(Rig(new_loop()), WAIT)
     assert "is running" in (rig.control_loop.operator.tare_refusal(confirmed=True) or "")

@@ -109,9 +109,9 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
     if timeout_s is None:
         timeout_s = addresses.UNLOCK_TIMEOUT_S if args.name in addresses.SLOW else addresses.COMMAND_TIMEOUT_S
     if args.name not in _ACTS_ON_NOTHING_SHOWN:
-        # A missing daemon is reported without a long timeout.
-        short_s = min(timeout_s, addresses.COMMAND_TIMEOUT_S)
-        status = send_command(args.connect, {"command": "status"}, short_s, keys)
+        # By default, a missing daemon is reported without a long timeout.
+        status_s = args.timeout or addresses.COMMAND_TIMEOUT_S
+        status = send_command(args.connect, {"command": "status"}, status_s, keys)
         if not status.get("ok"):
             return status
         # Ctrl-Z or a suspended computer may have held this program up.

@@ -44,7 +44,9 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.messages import TOPICS
 
     known = {*TOPICS, *(topic.partition(".")[0] for topic in TOPICS)}
-    for topic in args.topics:
+    # A first part may end with its point.
+    topics = [topic.removesuffix(".") for topic in args.topics]
+    for topic in topics:
         if topic not in known:
             near = "".join(f"; did you mean {name}?" for name in get_close_matches(topic, TOPICS, 1)) or "."
             raise UserError(f"there is no topic {topic!r}{near} The topics are {', '.join(TOPICS)}")
@@ -52,11 +54,11 @@ def run(args: argparse.Namespace) -> int:
 
     def print_hint() -> None:
         nothing = f"shearloop listen: no message came from {args.connect} in {QUIET_S:g} s; waiting"
-        asked = f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?"
+        asked = f"there (`shearloop run CONFIG`), and does it publish {' or '.join(topics) or 'anything'}?"
         print(f"{nothing}. Is a daemon running {asked}", file=sys.stderr, flush=True)
 
     keys = client_keys(args)
-    received = receive_messages(args.connect, args.topics, args.timeout, keys, print_hint)
+    received = receive_messages(args.connect, topics, args.timeout, keys, print_hint)
     with Subscriber(args.connect, ("health",), keys=keys) as health:
         for number, (topic, content) in enumerate(received, start=1):
             if number == 1 and _is_emulated(health):

@@ -29,9 +29,9 @@ PAPERS_RECORDINGS = (
 )
 
 
-def number(low: float, high: float, kind: Callable[[str], float] = float) -> Callable[[str], float]:
-    """Return the type of an option that takes a number from `low` to `high`."""
-    return _number(kind, lambda value: low <= value <= high, f" from {low:g} to {high:g}")
+def number(low: float, high: float, kind: Callable[[str], float] = float, *, unit: str = "") -> Callable[[str], float]:
+    """Return the type of an option that takes a number from `low` to `high`; a refusal names the unit."""
+    return _number(kind, lambda value: low <= value <= high, f" from {low:g} to {high:g} {unit}".rstrip())
 
 
 def positive(kind: Callable[[str], float] = float, high: float = math.inf) -> Callable[[str], float]:
@@ -84,7 +84,7 @@ TIMEOUT_S = positive(high=86_400.0)
 # A larger delay belongs to another recording.
 DELAY_S = number(-600.0, 600.0)
 # What fits between the gripper's fingers.
-TOOL_MM = positive(high=140.0)
+TOOL_MM = number(1.0, 140.0, unit="mm")
 PORT = number(0, 65535, int)
 
 

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import add_json, add_option, check_calibration_file, positive
+from shearloop.cli.options import add_json, add_option, check_calibration_file, number
 from shearloop.cli.terminal import Operator, print_result
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     text = "a known mass to put on the cell; give it once per mass: several show whether they agree"
     add_option(parser, "--mass-g", float, "G", text, action="append", required=True)
     text = "from the shaft to the cell (default: %(default)s)"
-    add_option(parser, "--lever-arm-mm", positive(high=1000.0), "MM", text, default=35.0)
+    add_option(parser, "--lever-arm-mm", number(1.0, 1000.0, unit="mm"), "MM", text, default=35.0)
     text = "the turn that presses on the cell counts as negative torque"
     parser.add_argument("--reverse", action="store_true", help=text)
     add_option(parser, "--out", Path, "FILE", "the calibration file to write", required=True)

@@ -202,9 +202,14 @@ class GripperStateMessage(Message):
     tool_diameter_mm: float | None = column("mm", "diameter from gripper and fingertips, weighted by their variances")
     tool_diameter_std_mm: float | None = column("mm", "its standard deviation")
     current_ma: float | None = column("mA", "motor current")
-    object: str = column("", "moving, contact opening, contact closing or at target")
+    object: str = column(
+        "", "moving, contact opening, contact closing, at target, or unknown without a requested motion"
+    )
     fault: int = column("", "fault code, 0 for none")
     fault_text: str = column("", "the fault in a sentence; empty for none")
+
+
+RESPONSES = "the safety response: note, refuse start, hold, stop and keep grip, or stop and release"
 
 
 @message("loop.state", rate_hz=1.0, per_source=False)
@@ -237,7 +242,7 @@ class LoopState(Message):
     noise_nm: float | None = column("N·m", "identified standard deviation of one torque")
     speed_command_rad_per_s: float = column("rad/s", "the commanded wrist speed, before the worker's clipping")
     speed_sent_rad_per_s: float = column("rad/s", "the wrist speed that was sent, after the worker's clipping")
-    response: str = column("", "the safety response")
+    response: str = column("", RESPONSES)
     stop: int = column("", "number of the stop that waits for `unlock`, larger after each further cause; 0 without one")
     cause: str = column("", "the first reason, which may have caused the others; empty without a reason")
     faults: str = column("", "codes of the reasons, separated by commas, the cause's first; see faults.md")
@@ -252,7 +257,7 @@ class LoopStop(Message):
     experiment: str = column("", "name of the experiment")
     cause: str = column("", "why it stopped, in sentences")
     faults: str = column("", "codes of the faults that stopped it, separated by commas, the cause's first")
-    response: str = column("", "the safety response")
+    response: str = column("", RESPONSES)
     decided_after_s: float = column("s", "time from the cause, a measurement or a request, to the decision")
     sent_after_s: float | None = column(
         "s", "time until the robot's worker had sent the stop; nil if it did not answer"

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
@@ -54,6 +54,20 @@ AVERAGED = 3
 MEMORY_S = 0.2
 # While the skin sticks, the reference response is averaged over about this many: noise chose the first one.
 SETTLES_OVER = 20.0
+
+
+# No gauge with its contacts has less, so that a smaller number is in kΩ.
+MIN_OHM = 1.0
+
+
+def _in_ohm(resistance: float) -> float:
+    """Return a gauge's resistance; raises ValueError for one that has another unit."""
+    if 0.0 < resistance < MIN_OHM:
+        raise ValueError(f"{resistance:g} Ω is too small for a gauge: write it in Ω, not in kΩ")
+    return resistance
+
+
+_Resistance = Annotated[float, Field(gt=0), AfterValidator(_in_ohm)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +103,7 @@ class SkinCalibration(BaseModel):
     gauge_depth_mm: float | None
     rows: int = Field(ge=1)
     rows_beyond: int = Field(ge=0)
-    rest_ohm: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = Field(strict=False)
+    rest_ohm: tuple[_Resistance, _Resistance] = Field(strict=False)
 
     @field_validator("tension_n", "response")
     @classmethod
@@ -179,8 +193,8 @@ class _Row(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     # Larger numbers have another unit: mΩ, or mN. No source of ours feeds such a gauge, and no skin bears such a force.
-    r1_ohm: float = Field(gt=0, le=10_000)
-    r2_ohm: float = Field(gt=0, le=10_000)
+    r1_ohm: _Resistance = Field(le=10_000)
+    r2_ohm: _Resistance = Field(le=10_000)
     shear_n: float = Field(ge=-100, le=100)
     # A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
     normal_n: float = Field(ge=-0.05, le=100)

@@ -184,6 +184,8 @@ def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, m
         (["command", "status", "--timeout", "nan"], "--timeout nan"),
         (["command", "status", "--timeout", "-1"], "--timeout -1"),
         (["listen", "--connect", "here", "--timeout", "1"], "'here' is not an address"),
+        (["listen", "eit.", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no message came"),
+        (["command", "start", "--connect", "ipc:///nobody", "--timeout", "2.5"], "at ipc:///nobody within 2.5 s"),
         (
             ["listen", "--connect", "tcp://127.0.0.1:70000", "--timeout", "0.05"],
             "tcp://127.0.0.1:70000 has no valid port",

@@ -140,7 +140,7 @@ async def test_twists_are_synthesised_from_a_bank(tmp_path):
         ("skin --rate-hz 5", "--rate-hz 5 is not a number from 50 to 1000"),
         ("rig {run} --bank absent.bank", "absent.bank"),
         ("rig {run} --bank {bank} --gel-stiffness -1", "--gel-stiffness -1 is not a number above 0"),
-        ("rig {run} --bank {bank} --diameter-mm 150", "--diameter-mm 150 is not a number above 0 and up to 140"),
+        ("rig {run} --bank {bank} --diameter-mm 150", "--diameter-mm 150 is not a number from 1 to 140 mm"),
         ("rig {run} --bank {bank} --run-dir /dev/null/run", "cannot be played: /dev/null/run: Not a directory"),
         ("rig {run} --bank {bank} --truth /nowhere/truth", "cannot be played: /nowhere/truth: No such file or dir"),
         ("rig {run} --bank {bank} --sigma 1.2 1.8", "give the larger one first"),

@@ -291,6 +291,11 @@ def test_a_gripper_of_another_model_is_measured_where_its_counts_begin_and_bow(t
         ("load --port /dev/none --mass-g -1 --out load.yaml", "mass in grams"),
         ("load --port /dev/none --mass-g 1 --out no/load.yaml", "does not exist"),
         ("load --port /dev/none --mass-g 1 --lever-arm-mm 0 --out l.yaml", "--lever-arm-mm 0"),
+        (
+            "load --port /dev/none --mass-g 1 --lever-arm-mm 0.035 --out l.yaml",
+            "0.035 is not a number from 1 to 1000 mm",
+        ),
+        ("gripper --port /dev/none --diameter-mm 0.02 --out g.yaml", "0.02 is not a number from 1 to 140 mm"),
         ("gripper --port /dev/none --diameter-mm 20 --out g.yaml", "two different"),
         ("gripper --port /dev/none --diameter-mm 2 --diameter-mm 4 --out g.yaml", "/dev/none"),
     ],

@@ -283,6 +283,10 @@ def test_a_table_is_read_whatever_the_order_of_its_columns(tmp_path):
             "semicolons separate the columns; write commas, and points",
         ),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25000,25,0,0\n", "r1_ohm: '25000' .*; allowed: above 0 to 10000"),
+        (
+            "r1_ohm,r2_ohm,shear_n,normal_n\n25,0.025,0,0\n",
+            "line 2: r2_ohm: 0.025 Ω is too small for a gauge: write it in Ω, not in kΩ",
+        ),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,500,0\n", "shear_n: '500' .*; allowed: from -100 to 100"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,inf,0,0\n", "r2_ohm: 'inf' is not a finite number"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n0,25,0,0\n", "r1_ohm: '0' .*; allowed: above 0"),

@@ -610,7 +610,8 @@ def test_what_takes_long_waits_and_a_missing_daemon_is_reported_at_once(monkeypa
     assert main(["command", "pause", "--timeout", "0.5"]) == 0
     assert main(["command", "stop", "--connect", f"ipc://{tmp_path}/commands"]) == 0
     long = [("status", 2.0), ("unlock", 150.0), ("status", 2.0), ("start", 150.0)]
-    given = [("status", 2.0), ("unlock", 5.0), ("status", 0.5), ("pause", 0.5)]
+    # A given timeout holds for all that the command waits for.
+    given = [("status", 5.0), ("unlock", 5.0), ("status", 0.5), ("pause", 0.5)]
     assert asked == [*long, *given, ("stop", 2.0)]
     assert "unlock: done" in capsys.readouterr().out
 

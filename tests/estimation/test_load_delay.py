@@ -79,6 +79,23 @@ def test_lateness_that_is_uncertain_is_not_refused(recorded, monkeypatch):
         measure_timing([late])
 
 
+def test_no_delay_is_advised_where_the_recordings_computer_was_too_busy(recorded):
+    late = replace(recorded, torque_t_s=recorded.torque_t_s - 2.0)
+    with pytest.raises(CalibrationError, match=r"calibrate with --load-cell-delay-s -2\.0\d"):
+        measure_timing([late])
+    # Frames that waited come in bursts.
+    t_s = late.t_s.copy()
+    t_s[2::20] = t_s[1::20][: len(t_s[2::20])] + 0.01
+    # A clock that jumps on the way.
+    times_s = recorded.torque_t_s
+    jumped = replace(recorded, torque_t_s=np.where(times_s < np.quantile(times_s, 0.55), times_s - 2.0, times_s - 1.0))
+    for busy, why in ((replace(late, t_s=t_s), "came in bursts"), (jumped, "its halves show other delays")):
+        with pytest.raises(CalibrationError, match=f"{why}.*too busy.*record again") as refused:
+            measure_timing([busy])
+        assert "--load-cell-delay-s" not in str(refused.value)
+        assert "--load-cell-delay-s" not in load_delay_warning(busy)
+
+
 def test_a_knocked_frame_does_not_hide_the_rest(recorded):
     knocked = recorded.channels.copy()
     knocked[[90, 140]] *= 1.5

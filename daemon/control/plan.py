@@ -262,7 +262,7 @@ def _assumed(file: ExperimentFile) -> str:
     if any(map(_is_less_certain, turns(file), turns(file, NOTHING_KNOWN))):
         return (
             "the directions assume that a tool that is held at the start is neither turned nor loaded then; the plan "
-            "before a start counts with its angle"
+            "before a start does not, because the daemon knows whether it is turned"
         )
     return ""
 

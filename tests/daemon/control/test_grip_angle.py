@@ -12,6 +12,7 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import Grip
+from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.rig_memory import RigMemory, read_memories
 from shearloop.daemon.robot_files import RobotFiles
@@ -348,3 +349,16 @@ def test_a_grip_after_one_that_met_nothing_begins_an_angle_of_its_own():
     rig.run(20)
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
     assert rig.wrist_rad - again_rad == pytest.approx(0.25, abs=0.01)
+
+
+@pytest.mark.parametrize("rig", [clamped_rig, twisted], ids=["clamped", "gripped"])
+def test_the_plan_before_a_start_assumes_nothing_of_a_tool_that_is_turned(rig):
+    """From 0.25 rad a twist to 0.1 rad turns clockwise; its sign alone would say counterclockwise."""
+    ready = rig()
+    file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "twist", "angles_rad": [0.1]}]})
+    if rig is clamped_rig:
+        before = plan_of(file, start=ready.control_loop.operator.known_at_start())
+        assert (before.steps[0].direction, before.assumed) == ("counterclockwise", "")
+        started(ready, TWIST_AGAIN, **TWISTED).run(20)
+    plan = plan_of(file, start=ready.control_loop.operator.known_at_start())
+    assert (plan.steps[0].way_unknown, plan.steps[0].direction, plan.assumed) == (True, "", "")

@@ -17,6 +17,7 @@ from shearloop.daemon import experiment_files
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import MAX_ANGLES_IN_ALL, MAX_STEPS
+from shearloop.daemon.control.known_tool import AT_REST
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.experiment_files import ExperimentFiles, read_experiment
 from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
@@ -247,7 +248,12 @@ def rig(folder: Path, runner: Runner) -> Rig:
             runs=1,
             safety=SimpleNamespace(acknowledgements=0),
             tool=SimpleNamespace(may_hold=lambda: False),
-            operator=SimpleNamespace(activation_note=lambda _: "", held_note=lambda _: "", file_refusal=lambda _: None),
+            operator=SimpleNamespace(
+                activation_note=lambda _: "",
+                held_note=lambda _: "",
+                file_refusal=lambda _: None,
+                known_at_start=lambda: AT_REST,
+            ),
         ),
         runner,
         {},

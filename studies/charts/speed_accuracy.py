@@ -97,8 +97,10 @@ def estimators(split: Split, physics: Physics, sides: tuple[str, ...]) -> Iterat
         if isinstance(calibration, SliceCalibration) and isinstance(split.future, SliceSeries):
             track = estimate_slices(calibration, split.future, physics.bank)
         elif isinstance(calibration, Calibration):
-            track = estimate_series(calibration, split.future, physics.bank)
-        return values_of(track.estimates)[0], track.latency_ms
+            # As `evaluate` does: an estimator reads a grip only if it has seen it begin.
+            track = estimate_series(calibration, split.whole, physics.bank)
+        later = len(split.future.t_s)
+        return values_of(track.estimates)[0][-later:], track.latency_ms[-later:]
 
     for calibration in fitted(split, _ESTIMATORS, physics, sides):
         yield TorqueMethod(f"{calibration.estimator.name}{count}", family, partial(run, calibration))

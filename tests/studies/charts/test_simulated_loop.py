@@ -68,5 +68,7 @@ def test_the_chart_shows_that_the_torque_filter_brings_a_kicked_torque_back_soon
     found = json.loads(paths[0].read_text())
     assert list(found) == ["torque filter", "constant gain", "latest estimates alone"]
     with_filter, without, _ = (one["kick_back_s"] for one in found.values())
+    # What is drawn before and after it is not counted.
+    assert {tuple(one["time_in_band_of_s"]) for one in found.values()} == {(6.0, 15.0)}
     assert max(with_filter) <= 2.5
     assert max(with_filter) < min(without)

@@ -11,9 +11,9 @@ from matplotlib.text import Annotation, Text
 
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.cli.chart import NAMES
-from shearloop.estimation import FrameSeries
+from shearloop.estimation import FrameSeries, Physics
 from shearloop.studies.charts import scene
-from shearloop.studies.charts.chart_data import Split, own_fingertip, splits, synthetic_stream
+from shearloop.studies.charts.chart_data import Split, fitted, own_fingertip, splits, synthetic_stream
 from shearloop.studies.charts.forward_methods import converged, direct, error_of, forward_methods
 from shearloop.studies.charts.simulated_loop import tracking_errors
 from shearloop.studies.charts.speed_accuracy import (
@@ -22,6 +22,7 @@ from shearloop.studies.charts.speed_accuracy import (
     _draw_methods,
     _short,
     compare_methods,
+    estimators,
     loaded_truth,
     measure,
     often_valid,
@@ -29,6 +30,7 @@ from shearloop.studies.charts.speed_accuracy import (
 )
 from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.drawing import figure, frontier, lay_out, plain_log, write_names
+from shearloop.tools.estimate_tracks import estimate_series, values_of
 from shearloop.tools.parallel import SerialExecutor
 
 
@@ -73,6 +75,17 @@ def test_a_recording_of_a_known_tool_is_judged_and_one_without_torques_is_named(
     [split] = splits([Path(name) for name in recorded], 0.6, scratch)
     assert split.title.startswith("known.mcap, stream")
     assert capsys.readouterr().out == "empty.mcap is left out: it holds no torques of a load cell\n"
+
+
+def test_an_estimator_has_seen_the_grip_begin_before_the_later_frames(stream, bank, coarse_mesh):
+    """`evaluate` reads a recording from its beginning too."""
+    later = len(stream.future.t_s)
+    method = next(estimators(stream, Physics(bank, coarse_mesh), stream.past.sides))
+    torque_nm, latency_ms = method.run()
+    assert len(torque_nm) == len(latency_ms) == later
+    (calibration, *_) = fitted(stream, [method.name.partition(",")[0]], Physics(bank, coarse_mesh), stream.past.sides)
+    whole_nm = values_of(estimate_series(calibration, stream.whole, bank).estimates)[0]
+    np.testing.assert_array_equal(torque_nm, whole_nm[-later:])
 
 
 def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch, slices, stream):

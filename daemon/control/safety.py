@@ -108,7 +108,10 @@ class SafetyMonitor:
         `reason` is as in `Stop`.
         """
         self._causes += 1
-        self._join(fault, reason)
+        waiting = self.waiting.faults if self.waiting is not None else ()
+        # A further stop of an arm that stands does not hide what the first one stopped.
+        known = next((one for one in waiting if one.code is fault.code), fault)
+        self._join(known, reason)
 
     def _join(self, fault: Fault, reason: str = "") -> None:
         """Let a fault join the stop that waits, or begin one."""

@@ -29,7 +29,7 @@ from shearloop.drivers.ur.settings import UrSettings
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
 
-NOT_ENABLED = "Motion has not been enabled since the robot's worker was started: enable it when the arm may move."
+NOT_ENABLED = "Motion has not been enabled since the robot's worker was started: `start` or `unlock` enables it."
 BEING_MADE_READY = "The robot is being made ready (safety, power, control program); this takes some seconds."
 LEAVING = "The daemon disconnects from the robot: start it again to continue."
 

@@ -112,13 +112,13 @@ function into(place, name) {
 
 function linkLine() {
   const state = link.state();
-  byId("link").dataset.state = state;
+  byId("link").dataset.state = link.done() ? "done" : state;
   const received = Number.isFinite(link.sinceDaemon());
   const end = link.end()?.content;
   show(byId("summary"), state === "ended" && Boolean(end?.summary));
   putLines(byId("summary-text"), (end?.summary ?? "").split("\n"));
   const [name, reason] = {
-    ended: [end?.finished ? "✓ DONE" : "ended", `the daemon ${link.viewerLost() ? "and the viewer have" : "has"} ended; its last values are struck out`],
+    ended: [link.done() ? "✓ DONE" : "ended", `the daemon ${link.viewerLost() ? "and the viewer have" : "has"} ended; its last values are struck out`],
     live: ["● live", ""],
     connecting: ["connecting", "to the viewer on the rig's computer"],
     lost: ["✗ VIEWER LOST", `nothing from the viewer for ${age(link.sinceBatch())}; all values are old, and the page reconnects by itself`],

@@ -30,6 +30,16 @@ export class TimeChart {
     this.chart = new uPlot(this.options(lines), [[], ...this.names.map(() => [])], this.element);
     const all = limit === null ? lines : [...lines, { ...this.limitStyle(), label: `limit ±${limit} ${this.unit}` }];
     this.legend.replaceChildren(...all.map((line) => this.sample(line)));
+    this.limitLabel = limit === null ? null : this.legend.lastElementChild.lastChild;
+  }
+
+  // The legend says where the limit is beyond the picture.
+  tellLimit(chart) {
+    if (this.limit === null) return;
+    const { min, max } = chart.scales.y;
+    const beyond = this.limit > max && -this.limit < min ? ", beyond the picture" : "";
+    const text = `limit ±${this.limit} ${this.unit}${beyond}`;
+    if (this.limitLabel.textContent !== text) this.limitLabel.textContent = text;
   }
 
   limitStyle() { return { stroke: colours.limit, width: 2, dash: [1, 4] }; }
@@ -97,11 +107,11 @@ export class TimeChart {
     return [Math.min(low - room, -this.least / 5), Math.max(high + room, this.least)];
   }
 
-  // The limit on the side of the larger values belongs to the picture, unless it would flatten them.
+  // The limits of both sides belong to the picture, unless they would flatten the values.
   withLimit(low, high) {
     const reach = Math.max(-low, high, this.least);
     if (this.limit === null || this.limit > 5 * reach) return [low, high];
-    return high >= -low ? [low, Math.max(high, this.limit)] : [Math.min(low, -this.limit), high];
+    return [Math.min(low, -this.limit), Math.max(high, this.limit)];
   }
 
   size() { return { width: Math.max(200, this.element.clientWidth), height: Math.max(120, this.element.clientHeight) }; }
@@ -114,6 +124,7 @@ export class TimeChart {
     if (!this.chart) return;
     this.now = now;
     this.chart.setData(series.data(this.names), true);
+    this.tellLimit(this.chart);
   }
 
   // The legend shows each line's style.

@@ -1,6 +1,6 @@
 // The buttons: stop needs no token, every motion needs it.
 
-import { ACTIVE } from "./panels.js";
+import { ACTIVE } from "./link.js";
 import { byId, put, putLines, show } from "./text.js";
 
 const KEY = "shearloop-token";

@@ -2,6 +2,9 @@
 
 import { number } from "./text.js";
 
+// Phases with a set point.
+export const ACTIVE = new Set(["running", "paused", "held"]);
+
 const RETRY_MS = 500;
 // The viewer sends a batch every quarter of a second; after this silence the connection counts as lost.
 const LOST_AFTER_S = 1.0;
@@ -110,6 +113,15 @@ export class Link {
 
   // The daemon's last message, until another one arrives.
   end() { return this.ended ? this.get("daemon.end") : undefined; }
+
+  // Whether the daemon has ended because its work is done, and not because a person or a fault stopped it.
+  done() { return Boolean(this.end()?.content.finished) && this.get("loop.state")?.content.phase === "done"; }
+
+  // Whether no experiment runs: a sensor that touches nothing is then no fault.
+  idle() {
+    const loop = this.get("loop.state")?.content;
+    return loop !== undefined && !ACTIVE.has(loop.phase) && !loop.response.startsWith("stop");
+  }
 
   ageOf(message) { return seconds() - message.at; }
 

@@ -1,5 +1,6 @@
 // Fills the panels. A panel with a stale message is marked and its numbers are struck out.
 
+import { ACTIVE } from "./link.js";
 import { drawGel, drawMap } from "./pictures.js";
 import { age, array, byId, interval, number, put, show, warn } from "./text.js";
 
@@ -11,9 +12,6 @@ const MARK_OLD_AFTER_S = 1;
 const TORQUES = ["eit.estimate", "load.torque", "skin.shear"];
 const WRENCH = "wrench";
 const SIGNED = { signed: true };
-
-// Phases with a set point.
-export const ACTIVE = new Set(["running", "paused", "held"]);
 
 export const wantedNow = (loop) => (ACTIVE.has(loop.phase) ? loop.ramp_nm : null);
 
@@ -68,8 +66,10 @@ function drivingTorque(link) {
   const named = link.get("loop.state")?.content.torque_source;
   if (named === WRENCH) return wrenchTorque(link);
   if (named) return TORQUES.map((topic) => torqueOf(link, topic, named)).find(Boolean);
-  const [first] = estimatesFirst(link);
-  return (first && torqueOf(link, "eit.estimate", first)) ?? torqueOf(link, "skin.shear") ?? torqueOf(link, "load.torque");
+  const estimates = estimatesFirst(link).map((source) => torqueOf(link, "eit.estimate", source));
+  const known = [...estimates, torqueOf(link, "skin.shear"), torqueOf(link, "load.torque")].filter(Boolean);
+  // One that gives a torque comes before an estimate without a calibration.
+  return known.find((torque) => torque.valid && torque.value != null) ?? known[0];
 }
 
 // The driving torque, the set point, another torque to compare with, and the diameter.
@@ -89,7 +89,7 @@ export function torquePanel(link) {
   const other = load && driving?.message === load.message ? first && torqueOf(link, "eit.estimate", first) : load;
   const against = (torque) => (torque && !torque.valid && !link.isOld(torque.message) ? `${torque.name}: ${torque.reason}` : "");
   const none = driving && !driving.valid ? `no torque from the ${driving.name}: ${driving.reason}` : "";
-  warn(byId("torque-reason"), [none, against(other)].filter(Boolean).join("; "));
+  warn(byId("torque-reason"), [none, against(other)].filter(Boolean).join("; "), link.idle());
   wantedFigure(link, loop);
   otherFigure(link, other);
   diameterFigure(link, estimate);
@@ -152,7 +152,7 @@ export class FingertipPanel {
     put(this.part("sigma"), link.number(estimate, "sigma", 3));
     put(this.part("frame"), said.frame === undefined ? "–" : String(said.frame));
     put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));
-    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : "");
+    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : "", link.idle());
     if (this.drawn.gel !== estimate || !estimate) this.drawGel(estimate);
     // An empty picture would push all below it off a phone's screen.
     this.part("map").closest("figure").hidden = !heatmap;
@@ -184,7 +184,7 @@ export class FingertipPanel {
 
   mapText(heatmap, said) {
     const [rows, columns] = heatmap.content.scores.shape;
-    const late = said.frame !== undefined && said.frame !== heatmap.content.frame ? `, frame ${heatmap.content.frame}` : "";
+    const late = said.frame !== undefined && said.frame !== heatmap.content.frame ? ` of the earlier frame ${heatmap.content.frame}` : "";
     put(this.part("map-text"), `scores of ${rows} k × ${columns} σ${late}; blank cells have no valid signal`);
     const cell = (peak) => (peak ? `row ${peak[0]}, column ${peak[1]}` : "none");
     this.part("map").setAttribute("aria-label", `heatmap of ${rows} by ${columns} cells; maximum at ${cell(heatmap.peaks?.best)}, runner-up at ${cell(heatmap.peaks?.runner_up)}`);
@@ -204,7 +204,7 @@ export function shearPanel(link) {
   put(byId("shear-response"), number(said.response, 5, "", SIGNED));
   put(byId("shear-gauges"), `${number(said.r1_ohm, 3)} · ${link.number(message, "r2_ohm", 3)}`);
   put(byId("shear-state"), said.deadband ? "within the deadband" : said.direction);
-  warn(byId("shear-reason"), said.valid ? "" : `no force: ${said.reason}`);
+  warn(byId("shear-reason"), said.valid ? "" : `no force: ${said.reason}`, link.idle());
 }
 
 export function robotPanel(link) {
@@ -215,7 +215,9 @@ export function robotPanel(link) {
   if (!message) return;
   const said = message.content;
   const stops = [said.emergency_stop ? "EMERGENCY STOP" : "", said.protective_stop ? "PROTECTIVE STOP" : "", said.blocked];
-  warn(byId("robot-blocked"), stops.filter(Boolean).join(": "));
+  // Before the first start, motion is not enabled, and the start enables it.
+  const startable = link.get("health")?.content.start_refusal === "" && !said.emergency_stop && !said.protective_stop;
+  warn(byId("robot-blocked"), stops.filter(Boolean).join(": "), link.idle() && startable);
   put(byId("wrist"), link.number(message, "wrist_rad", 3, SIGNED));
   put(byId("wrist-speed"), link.number(message, "wrist_speed_rad_per_s", 3, SIGNED));
   put(byId("wrist-torque"), number(wrenchTorque(link).value, 3, link.unit(message.topic, "wrist_torque_nm"), SIGNED));
@@ -262,7 +264,8 @@ export function headPanel(link) {
   put(byId("rig"), name);
   const title = [stateWord(link), health?.emulated ? "EMULATED" : "", name].filter(Boolean).join(" · ");
   if (document.title !== title) document.title = title;
-  const alarm = { ended: "ended", dead: "silent", lost: "silent" }[link.state()] ?? (isStopped(link) ? "stopped" : "");
+  const ended = link.done() ? "done" : "ended";
+  const alarm = { ended, dead: "silent", lost: "silent" }[link.state()] ?? (isStopped(link) ? "stopped" : "");
   if (document.body.dataset.alarm !== alarm) document.body.dataset.alarm = alarm;
 }
 
@@ -277,7 +280,7 @@ function isStopped(link) {
 function stateWord(link) {
   const state = link.get("loop.state");
   const loop = state?.content;
-  const lost = { ended: "ENDED", dead: "NO DAEMON", lost: "NO VIEWER", connecting: "connecting" }[link.state()];
+  const lost = { ended: link.done() ? "DONE" : "ENDED", dead: "NO DAEMON", lost: "NO VIEWER", connecting: "connecting" }[link.state()];
   if (lost) return lost;
   if (!loop) return "no robot";
   const word = waitsForUnlock(loop) ? "STOPPED" : loop.phase === "held" ? "HOLD" : loop.phase;

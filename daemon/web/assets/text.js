@@ -29,9 +29,10 @@ export function show(element, shown) {
 const WAITING =
   /^(no [^:]+: |not valid: )?(no grip|gripped too recently|the fingers moved|taking the idle frame|there is no earlier frame)/;
 
-export function warn(element, sentence) {
+// `calm`: it is no fault at present.
+export function warn(element, sentence, calm = false) {
   put(element, sentence);
-  element.classList.toggle("waiting", WAITING.test(sentence));
+  element.classList.toggle("waiting", calm || WAITING.test(sentence));
   show(element, sentence !== "");
 }
 

@@ -35,6 +35,14 @@ def test_a_hold_that_lasts_too_long_becomes_a_stop(event):
     assert gate.judge([trouble(event)], int(longest_s * SECOND) + 1).response is Response.STOP_AND_KEEP_GRIP
 
 
+def test_a_further_stop_by_a_person_keeps_the_cause_of_the_first():
+    gate = SafetyMonitor()
+    gate.stop(Fault(FaultCode.OPERATOR_STOP, "'hold' was under way"))
+    gate.stop(Fault(FaultCode.OPERATOR_STOP, "nothing was under way"))
+    assert gate.waiting is not None
+    assert (gate.waiting.causes, gate.stop_number) == ("the operator stopped it: 'hold' was under way", 2)
+
+
 def test_a_stop_has_a_larger_number_after_each_further_cause_and_not_while_one_lasts():
     gate = SafetyMonitor()
     assert gate.stop_number == 0

@@ -193,6 +193,27 @@ def test_a_persons_own_stop_is_no_error(browsed):
     browsed.daemon.say()
 
 
+def test_a_sensor_that_touches_nothing_is_no_warning_while_no_experiment_runs(browsed):
+    reason = "no signal above the noise: the difference is 1.00 times the noise"
+    browsed.open()
+    for phase, calm in (("idle", True), ("running", False)):
+        browsed.daemon.say(loop={"phase": phase}, estimate={**NO_ESTIMATE, "valid": False, "reason": reason})
+        browsed.page.wait_for_function(
+            """([calm, reason]) => [...document.querySelectorAll('#torque-reason, .fingertip .invalid')].every(
+              (element) => element.textContent.includes(reason) && element.classList.contains('waiting') === calm)""",
+            arg=[calm, reason],
+        )
+
+
+def test_before_the_first_run_the_large_figure_is_of_a_source_that_gives_a_torque(browsed):
+    browsed.open()
+    idle = {"phase": "idle", "torque_source": ""}
+    browsed.daemon.say(loop=idle, estimate={**NO_ESTIMATE, "valid": False, "reason": "no calibration"}, shear=None)
+    browsed.until_shown({"#torque-source": "load cell", "#torque-now": "+0.1012 N·m"})
+    browsed.daemon.say(loop=idle)
+    browsed.until("#torque-source", "estimate of right")
+
+
 def test_a_replay_is_drawn_at_its_own_times(browsed):
     browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES if name != "end"})
     browsed.open()
@@ -401,8 +422,11 @@ def test_limits_are_lines_of_the_chart(browsed):
       }
       return found > 50;
     }"""
-    browsed.until("#torque-legend", "limit ±0.25 N·m")
+    browsed.until_shown({"#torque-legend > :last-child": "limit ±0.25 N·m"})
     page.wait_for_function(count)
+    # The load cell's line is in the picture.
+    browsed.daemon.say(loop={"torque_limit_nm": 5.0})
+    browsed.until_shown({"#torque-legend > :last-child": "limit ±5 N·m, beyond the picture"})
     browsed.daemon.say(loop={"torque_limit_nm": None})
     page.wait_for_function("() => !document.querySelector('#torque-legend').textContent.includes('limit')")
     assert not page.evaluate(count)

@@ -461,8 +461,10 @@ def test_a_dead_daemon_is_shown_within_two_seconds(browsed):
 def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     page = browsed.open()
     browsed.until_complete()
+    browsed.daemon.say(loop={"phase": "done"})
+    browsed.until("#phase-name", "done")
     silent = dict.fromkeys(name for name in MESSAGES if name != "end")
-    figures = ("torque-now", "wanted", "other-torque", "diameter", "speed-sent")
+    figures = ("torque-now", "other-torque", "diameter", "speed-sent")
     shown = {name: browsed.text(f"#{name}") for name in figures}
     assert "–" not in shown.values()
     browsed.daemon.say(**silent, end={"summary": "What happened: 'hold 0.10 N·m' was done" + ", and more" * 20})
@@ -474,15 +476,18 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     assert browsed.text("#link-state") == "✓ DONE"
     # It looks as ended as it is: nothing that is shown is of now.
     browsed.until_all_old()
-    assert page.evaluate("document.body.dataset.alarm") == "ended"
-    assert page.title().startswith("ENDED · ")
+    assert page.evaluate("document.body.dataset.alarm") == "done"
+    assert page.title().startswith("DONE · ")
     struck = "(id) => getComputedStyle(document.getElementById(id)).textDecorationLine"
     assert page.evaluate(struck, "trouble") == page.evaluate(struck, "phase") == "line-through"
     # The last values stay, and each of them is struck out.
     assert {name: page.evaluate(struck, name) for name in figures} == dict.fromkeys(figures, "line-through")
     assert {name: browsed.text(f"#{name}") for name in figures} == shown
     alarm = "(id) => getComputedStyle(document.getElementById(id)).borderTopColor"
-    assert page.evaluate(alarm, "summary") == page.evaluate(alarm, "link-state"), "no green on a page that is red"
+    assert page.evaluate(alarm, "summary") == page.evaluate(alarm, "link-state")
+    plain = "() => ['header', 'body'].map((name) => getComputedStyle(document.querySelector(name)).backgroundColor)"
+    panel = "() => getComputedStyle(document.querySelector('#happened')).backgroundColor"
+    assert page.evaluate(plain)[0] == page.evaluate(panel), "nothing is red"
     browsed.viewer.kill()
     browsed.until("#link-reason", "the daemon and the viewer have ended; its last values are struck out")
     assert browsed.text("#link-state") == "✓ DONE"
@@ -491,6 +496,26 @@ def test_a_daemon_that_ends_well_is_shown_as_done_with_its_summary(browsed):
     browsed.viewer.start()
     browsed.until("#link-state", "● live")
     assert not page.is_visible("#summary")
+
+
+@pytest.mark.parametrize("phase", ["stopped", "running", "idle"])
+def test_a_daemon_that_ends_without_being_done_is_shown_as_ended(phase, browsed):
+    page = browsed.open()
+    browsed.until_complete()
+    browsed.daemon.say(loop={"phase": phase, "cause": CAUSE, "reasons": CAUSE, "faults": "operator stop"})
+    browsed.until("#phase-name", phase)
+    browsed.daemon.say(**dict.fromkeys(name for name in MESSAGES if name != "end"), end={"finished": True})
+    browsed.until("#link-state", "ended")
+    assert page.evaluate("document.body.dataset.alarm") == "ended"
+    assert page.title().startswith("ENDED · ")
+    struck = "(id) => getComputedStyle(document.getElementById(id)).textDecorationLine"
+    # The cause is what a person wants to read then.
+    assert [page.evaluate(struck, name) for name in ("holding-title", "cause")] == ["line-through", "none"]
+    page.click("#stop")
+    browsed.until("#answer", "stop")
+    browsed.viewer.kill()
+    browsed.daemon.say()
+    browsed.viewer.start()
 
 
 def test_a_lost_viewer_is_shown_and_reconnects(browsed):

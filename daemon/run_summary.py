@@ -30,6 +30,8 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 # The name of the emulated tool's torque, which no sensor measures.
 TRUE = "true torque"
 _ENDS = ("done", "stopped")
+# Of a hold for too long, from this fraction of the time with a fault of a busy computer on.
+_LATE_FRACTION = 0.1
 _TOO_BUSY = "This computer was too busy for the emulated rig: close other programs and run it again."
 _ASKED_FOR = frozenset(code.text for code in FaultCode if code.value.asked_for)
 _BY_BUSY_COMPUTER = frozenset(code.text for code in FaultCode if code.value.by_busy_computer)
@@ -88,6 +90,8 @@ class _Run:
     steps: list[_StepSummary] = field(default_factory=list)
     identified: str = ""
     held_s: float = 0.0
+    # The part of it with a fault that a busy computer can cause.
+    late_s: float = 0.0
     hold_reasons: Counter[str] = field(default_factory=Counter)
     # By source, why a torque was not valid.
     invalid: defaultdict[str, CountedReasons] = field(default_factory=lambda: defaultdict(CountedReasons))
@@ -136,7 +140,7 @@ class RunSummary:
             self.ended_as_asked = phase == "done" or _was_asked_for(content)
             rig = self._emulated
             lines = list(_lines(run, None, ()) if rig is None else _lines(run, rig.torques(), rig.sent))
-            if rig is not None and phase != "done" and _may_be_late(content):
+            if rig is not None and phase != "done" and _may_be_late(run, content):
                 lines.insert(0, _TOO_BUSY)
             if self._heading:
                 lines.insert(0, self._heading)
@@ -155,12 +159,13 @@ def _was_asked_for(content: Mapping[str, Any]) -> bool:
     return bool(_ASKED_FOR.intersection(_codes(content)[:1]))
 
 
-def _may_be_late(content: Mapping[str, Any]) -> bool:
+def _may_be_late(run: _Run, content: Mapping[str, Any]) -> bool:
     """Return whether a busy computer can be the cause of a stop; a consequence of another fault does not count."""
     codes = _codes(content)
-    # Several holds together have no cause among them.
-    causes = codes if FaultCode.HELD_TOO_LONG.text in codes[:1] else codes[:1]
-    return bool(_BY_BUSY_COMPUTER.intersection(causes))
+    if FaultCode.HELD_TOO_LONG.text not in codes[:1]:
+        return bool(_BY_BUSY_COMPUTER.intersection(codes[:1]))
+    # Several holds together have no cause among them, and those that were before may be gone.
+    return bool(_BY_BUSY_COMPUTER.intersection(codes)) or 0.0 < _LATE_FRACTION * run.held_s <= run.late_s
 
 
 def _codes(content: Mapping[str, Any]) -> list[str]:
@@ -184,7 +189,9 @@ def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
 def _update(run: _Run, content: Mapping[str, Any]) -> None:
     now_ns = content["t_mono_ns"]
     if run.last["phase"] == "held":
-        run.held_s += _elapsed_s(run.last, content)
+        held_s = _elapsed_s(run.last, content)
+        run.held_s += held_s
+        run.late_s += held_s if _BY_BUSY_COMPUTER.intersection(_codes(run.last)) else 0.0
     if run.last["phase"] == "paused" and run.steps:
         run.steps[-1].paused_s += _elapsed_s(run.last, content)
     if content["response"] == "hold" and run.last["response"] != "hold":

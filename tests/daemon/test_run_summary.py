@@ -233,6 +233,17 @@ def test_what_followed_from_another_cause_is_not_blamed_on_the_computer(codes, s
     assert ("too busy" in summary_of(loop_state(0), stopped)) is shown
 
 
+@pytest.mark.parametrize(("late_s", "shown"), [(16.0, True), (1.0, False)])
+def test_holds_of_a_busy_computer_that_are_over_at_the_stop_are_named(late_s, shown):
+    def held(t_s: float, code: FaultCode) -> dict[str, Any]:
+        return loop_state(t_s, phase="held", response="hold", faults=code.text)
+
+    faults = f"{FaultCode.HELD_TOO_LONG.text}, {FaultCode.ESTIMATE_INVALID.text}"
+    stopped = loop_state(61, phase="stopped", cause="it stopped", activity="it stopped", faults=faults)
+    held_in_turn = held(1, FaultCode.ESTIMATE_STALE), held(1 + late_s, FaultCode.ESTIMATE_INVALID)
+    assert ("too busy" in summary_of(loop_state(0), *held_in_turn, stopped)) is shown
+
+
 @pytest.mark.parametrize("code", [FaultCode.OPERATOR_STOP, FaultCode.DAEMON_ENDED])
 def test_a_stop_that_was_asked_for_is_no_error(code):
     faults = f"{code.text}, {FaultCode.STATE_STALE.text}"

@@ -116,8 +116,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
-    # A person typed it before this process began. Without words of its own, this is no process of its own.
-    began_ns = boot_ns() if argv is not None else process_began_ns()
+    # A person typed it before this process began. With words that are given, it is called from a longer process.
+    called_ns = boot_ns()
+    began_ns = process_began_ns if argv is None else lambda: called_ns
     if arguments[:1] in ([], ["help"]):
         arguments = [*arguments[1:2], "--help"]
     program, interrupt_is_end = "shearloop", False

@@ -108,7 +108,9 @@ def _dead(facts: Mapping[str, Any]) -> bool:
 
 def _robot(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
     if now.get("blocked") and not before.get("blocked"):
-        yield "fault", str(now["blocked"])
+        # Before the first start, motion is only not enabled.
+        stopped = now.get("protective_stop") or now.get("emergency_stop")
+        yield "fault" if stopped else "step", str(now["blocked"])
 
 
 def _gripper(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:

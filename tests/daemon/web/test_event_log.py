@@ -71,7 +71,7 @@ def test_the_event_log_lists_faults_of_tasks_and_devices_and_the_daemons_end():
         ("health", {"tasks": {"loop": alive, "right": alive}}),
         ("robot.state", {"blocked": ""}),
         ("gripper.state", {"fault_text": ""}),
-        ("robot.state", {"blocked": "it is in a protective stop"}),
+        ("robot.state", {"blocked": "it is in a protective stop", "protective_stop": True}),
         ("gripper.state", {"fault_text": "no current"}),
         ("loop.stop", times),
         ("daemon.end", {}),
@@ -86,13 +86,19 @@ def test_the_event_log_lists_faults_of_tasks_and_devices_and_the_daemons_end():
     ]
 
 
+def test_a_robot_whose_motion_is_not_enabled_yet_has_no_fault():
+    assert lines(("robot.state", {"blocked": ""}), ("robot.state", {"blocked": "not enabled"})) == [
+        ("step", "not enabled")
+    ]
+
+
 def test_what_began_before_the_viewer_is_not_dated_at_its_start():
     since = " (since before this time)"
     assert lines(
         loop("running", 2),
         loop("running", 3),
         ("health", {"tasks": {"loop": {"alive": False, "last_error": "a bug"}}}),
-        ("robot.state", {"blocked": "it is in a protective stop"}),
+        ("robot.state", {"blocked": "it is in a protective stop", "protective_stop": True}),
         ("gripper.state", {"fault_text": "no current"}),
     ) == [
         ("step", f"hold runs{since}"),

@@ -18,6 +18,7 @@ from shearloop.cli.emulator_processes import SHEARLOOP, running
 from shearloop.cli.free_ports import free_loopback, is_free, plays_no_robot
 from shearloop.cli.options import PORT, add_option, path_of
 from shearloop.cli.other_daemon import refuse_second_daemon
+from shearloop.cli.temporary_folders import run_folder
 from shearloop.cli.view import PAGE_PORT
 from shearloop.daemon.process import interrupt_status
 from shearloop.errors import UserError, missing
@@ -142,8 +143,8 @@ def elsewhere(config: "DaemonConfig") -> Iterator[list[str]]:
     print(f"{settings.host} plays another robot: this one is played at {host}.", flush=True)
     # The last `--host` counts.
     arguments = [*config.emulators[players[0]].arguments, "--host", host]
-    with TemporaryDirectory(prefix="shearloop-") as folder:
-        robot = Path(folder) / config.robot.name
+    with run_folder() as folder:
+        robot = folder / config.robot.name
         robot.write_text(yaml.safe_dump({**read_yaml(config.robot, UserError), "host": host}), encoding="utf-8")
         values = {"robot": str(robot), f"emulators.{players[0]}.arguments": json.dumps(arguments)}
         if config.gripper is not None and config.gripper.socket is not None:

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
+from shearloop.cli.temporary_folders import run_folder
 from shearloop.daemon.process import end_with_parent
 from shearloop.errors import UserError
 
@@ -86,8 +87,7 @@ class EmulatedDevices:
         """Start the devices."""
         with contextlib.ExitStack() as stack:
             if any(emulator.device == "rig" and "--truth" not in emulator.arguments for emulator in self._emulators):
-                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="shearloop-"))
-                self.truth = Path(folder) / "truth.jsonl"
+                self.truth = stack.enter_context(run_folder()) / "truth.jsonl"
             devices: list[tuple[subprocess.Popen[bytes], IO[bytes]]] = []
             for emulator in self._emulators:
                 output: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())

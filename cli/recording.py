@@ -23,7 +23,7 @@ from shearloop.cli.options import (
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError
 from shearloop.tools.outputs import check_overwrite, progress_bar, writing
-from shearloop.tools.recordings.time_formats import DATENUM, TIME_FORMATS
+from shearloop.tools.recordings.time_formats import DATENUM, STREAM_VARIABLES, TIME_FORMATS
 from shearloop.words import counted
 
 if TYPE_CHECKING:
@@ -64,7 +64,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     imported = parts.add_parser("import", help=summary, description=summary, epilog=PAPERS_RECORDINGS)
     formats = imported.add_subparsers(dest="format", metavar="FORMAT", required=True)
     mat = add_action(formats, "mat", "import the paper's MATLAB streams", _import)
-    add_option(mat, "sources", Path, "SRC", ".mat files of one recording, or its folder", nargs="+")
+    variables = "; ".join(f"{stream}: {' or '.join(names)}" for stream, names in STREAM_VARIABLES.items())
+    text = f".mat files of one recording, or its folder; the variable of each stream is {variables}"
+    add_option(mat, "sources", Path, "SRC", text, nargs="+")
     add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
     formats_text = "; ".join(f"{name}: {form.words}" for name, form in TIME_FORMATS.items())
     text = f"what the first column's times are (default: %(default)s). {formats_text}"

@@ -62,6 +62,9 @@ COMMANDS = {name: command for group in GROUPS.values() for name, command in grou
 OTHER_SPELLINGS = {
     "replay": ("recording", "replay"),
     "import": ("recording", "import"),
+    "export": ("recording", "export"),
+    "info": ("recording", "info"),
+    "repair": ("recording", "repair"),
     "stop": ("command", "stop"),
     "pause": ("command", "pause"),
     "status": ("command", "status"),

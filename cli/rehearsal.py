@@ -1,13 +1,13 @@
 """A rehearsal: a configuration of real devices, with an emulated one in the place of each."""
 
 import contextlib
-import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.cli.free_ports import LOOPBACKS, free_loopback, free_port
+from shearloop.cli.temporary_folders import run_folder
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS
 from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.errors import UserError
@@ -41,8 +41,8 @@ def rehearsal(config: "DaemonConfig", path: Path) -> Iterator[Rehearsal]:
     """
     if config.emulated or config.emulators:
         raise UserError(f"{path} is emulated already: run it without --emulate")
-    with tempfile.TemporaryDirectory(prefix="shearloop-") as folder:
-        yield _DeviceReplacer(config, path, Path(folder)).rehearsal()
+    with run_folder() as folder:
+        yield _DeviceReplacer(config, path, folder).rehearsal()
 
 
 def sentences_of_run(config: "DaemonConfig") -> Iterator[str]:

@@ -127,7 +127,10 @@ def _comparison_text(comparison: "ReplayComparison", same_code: bool) -> list[st
     lines += comparison.examples
     if comparison.unrecorded:
         computed = counted(comparison.unrecorded, "computed message is", "computed messages are")
-        lines.append(f"{computed} not in the recording.")
+        lines.append(
+            f"{computed} not in the recording: of its last inputs, which the daemon did not publish any more, or of "
+            "topics that it did not record; --check does not count them."
+        )
     if comparison.different and not same_code:
         lines.append("The recording was made by different code, so its results may differ.")
     return lines

@@ -80,8 +80,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, out: "NonBlockingWriter", on_ready: Callable[[], None], *, terminal: bool) -> int:
+    from shearloop.cli.other_daemon import refuse_second_daemon
+
     with ExitStack() as rehearsing:
         config = _config(args)
+        # Before a rehearsal says what it plays.
+        refuse_second_daemon(config.commands)
         if args.emulate:
             from shearloop.cli.rehearsal import rehearsal, sentences_of_run
 
@@ -104,7 +108,6 @@ def _run_config(
 
     from shearloop.cli import EXIT_OK, EXIT_STOPPED, EXIT_UNFINISHED
     from shearloop.cli.emulator_processes import EmulatedDevices
-    from shearloop.cli.other_daemon import refuse_second_daemon
     from shearloop.cli.terminal import StatusLine, print_estimate, shown_topics
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.messaging.refusals import Refusals
@@ -118,7 +121,6 @@ def _run_config(
     if config.robot is not None:
         # Without permission the loop still detects late commands and holds the wrist.
         raise_priority()
-    refuse_second_daemon(config.commands)
     if config.emulators:
         # A daemon that does not answer is found before the emulators find their ports taken.
         StopSocket(config.commands, {}, Refusals()).close()

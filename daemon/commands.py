@@ -4,7 +4,7 @@ import asyncio
 import os
 import secrets
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -255,7 +255,7 @@ class Commands:
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()
-        daemon = {"process": os.getpid(), "instance": self.instance, "folder": os.getcwd(), **self.running_rig.facts()}
+        daemon = {"process": os.getpid(), "instance": self.instance, "folder": os.getcwd(), **asdict(self.running_rig)}
         daemon |= {"now_ns": self.now_ns()}
         if self.rig is None:
             return {"tasks": tasks, "daemon": daemon}

@@ -416,11 +416,10 @@ class DaemonConfig(ConfigModel):
         """The serial number, path or socket of each device, by its key; the robot's is in its own settings."""
         found: dict[str, str] = {}
         for key, section in self.walk():
-            match section:
-                case SerialDevice():
-                    found[key] = section.serial_number or str(section.path)
-                case InstrumentSocket() | GripperSocket():
-                    found[key] = f"{section.host}:{section.port}"
+            if isinstance(section, SerialDevice):
+                found[key] = section.serial_number or str(section.path)
+            elif isinstance(section, InstrumentSocket | GripperSocket):
+                found[key] = f"{section.host}:{section.port}"
         return found
 
     def _ports(self) -> dict[str, list[str]]:

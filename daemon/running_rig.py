@@ -1,7 +1,7 @@
 """Which rig a daemon drives, as it says in its reply to `status`."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Self
 
 if TYPE_CHECKING:
@@ -27,10 +27,6 @@ class RunningRig:
         """Return the rig of a configuration, whose robot has this address."""
         robot = {"robot": robot_host} if robot_host is not None else {}
         return cls(config.name, config.emulated, config.publish, {**config.device_addresses, **robot})
-
-    def facts(self) -> dict[str, Any]:
-        """Return the rig for a reply to `status`."""
-        return asdict(self)
 
 
 def whose_daemon(reply: Mapping[str, Any]) -> str:

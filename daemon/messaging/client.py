@@ -1,6 +1,7 @@
 """Clients of a daemon: receive its messages, send it a command."""
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from typing import Any, TypeAlias
@@ -33,7 +34,8 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
     """Messages of a daemon as (topic, content), for `for` and for `async for`; close it, or use `with`.
 
     It receives the topics that start with one of `topics`, or all. Raises UserError for a malformed address, for
-    messages of another program, and if no message arrives for `timeout_s`.
+    messages of another program, and if no message arrives for `timeout_s`. Without `timeout_s` it waits, and calls
+    `on_quiet` once if no message has come in QUIET_S; by default that is a warning.
     """
 
     def __init__(
@@ -42,9 +44,11 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         topics: Iterable[str] = (),
         timeout_s: float | None = None,
         keys: ClientKeys | None = None,
+        on_quiet: Callable[[], None] | None = None,
     ) -> None:
         """Connect; an address on another computer needs keys."""
         self._address, self._timeout_s, self._keys = address, timeout_s, keys
+        self._on_quiet, self._has_waited = on_quiet or self._warn, timeout_s is not None
         self._context = zmq.asyncio.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._blocking: zmq.Socket[bytes] = zmq.Socket.shadow(self._socket.underlying)
@@ -72,15 +76,28 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
 
     def __next__(self) -> TopicContent:
         """Wait for the next message and return it."""
+        if not self._has_waited:
+            self._note(came=self.wait(QUIET_S))
         if not self.wait(self._timeout_s):
             raise self._no_message()
         return self._decoded(self._blocking.recv_multipart())
 
     async def __anext__(self) -> TopicContent:
         """Wait for the next message and return it."""
+        if not self._has_waited:
+            self._note(came=bool(await self._socket.poll(_milliseconds(QUIET_S))))
         if not await self._socket.poll(_milliseconds(self._timeout_s)):
             raise self._no_message()
         return self._decoded(await self._socket.recv_multipart())
+
+    def _note(self, *, came: bool) -> None:
+        self._has_waited = True
+        if not came:
+            self._on_quiet()
+
+    def _warn(self) -> None:
+        waits = "no message came from %s in %g s; waiting. Is a daemon running there?"
+        logging.getLogger(__name__).warning(waits, self._address, QUIET_S)
 
     def _no_message(self) -> UserError:
         return UserError(
@@ -115,9 +132,7 @@ def receive_messages(
     on_quiet: Callable[[], None] = lambda: None,
 ) -> Iterator[TopicContent]:
     """Yield the messages of a Subscriber; calls `on_quiet` if none arrives in the first QUIET_S."""
-    with Subscriber(address, topics, timeout_s, keys) as subscriber:
-        if timeout_s is None and not subscriber.wait(QUIET_S):
-            on_quiet()
+    with Subscriber(address, topics, timeout_s, keys, on_quiet) as subscriber:
         yield from subscriber
 
 

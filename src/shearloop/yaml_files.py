@@ -124,7 +124,10 @@ class Document:
             root = loader.get_single_node()
             content = loader.construct_document(root) if root is not None else None
         except UnicodeDecodeError as error:
-            raise raises(f"{path}: the {what} is not UTF-8 text (byte {error.start})") from error
+            # Only this mistake needs the module.
+            from shearloop.binary_files import why_no_text
+
+            raise raises(f"{path}: the {what} {why_no_text(data, error.start)}") from error
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             where = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)

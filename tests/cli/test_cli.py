@@ -38,6 +38,7 @@ from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.torques import WRENCH
+from shearloop.tools.recordings.time_formats import STREAM_VARIABLES
 from shearloop.tools.task_row import task_row
 from tests.fixtures.robots import write_filled_in
 from tests.paper_curve import paper_curve
@@ -307,6 +308,9 @@ def test_a_played_file_needs_an_emulator(option, config, mistake):
     [
         ("replay no.mcap", "recording replay"),
         ("import mat no.mat --out a.mcap", "recording import"),
+        ("export no.mcap", "recording export"),
+        ("info no.mcap", "recording info"),
+        ("repair no.mcap --out a.mcap", "recording repair"),
         ("stop --connect ipc://none --timeout 0.1", "command stop"),
         ("status --connect ipc://none --timeout 0.1", "command status"),
     ],
@@ -317,6 +321,13 @@ def test_other_spellings_work_and_answer_with_the_command(old, new, ran, tmp_pat
     assert first == f"`shearloop {old.split()[0]}` is `shearloop {new}`"
     assert rest == ran(*new.split(), *old.split()[1:], status=2).err
     assert set(OTHER_SPELLINGS).isdisjoint(COMMANDS)
+
+
+def test_the_help_of_import_names_the_variables_of_each_stream(capsys):
+    with pytest.raises(SystemExit):
+        main(["recording", "import", "mat", "--help"])
+    said = capsys.readouterr().out
+    assert all(name in said for names in STREAM_VARIABLES.values() for name in names)
 
 
 @pytest.mark.parametrize("one", [("--connect", "tcp://127.0.0.1:8791"), ("--commands", "tcp://127.0.0.1:8792")])

@@ -45,6 +45,12 @@ def test_a_second_run_is_refused_by_name(config, monkeypatch, mistake, emulators
     assert "process 4711 (demo) in /home/ann/demo; `shearloop command stop --connect" in said
 
 
+def test_a_second_rehearsal_is_refused_before_it_says_what_it_plays(config, monkeypatch, mistake):
+    answering(monkeypatch, {"ok": True, "tasks": {}, "daemon": RUNNING})
+    # `mistake` allows no output.
+    assert "process 4711 (demo)" in mistake("run", "--emulate", str(config()))
+
+
 def test_a_daemon_that_does_not_answer_is_refused_before_emulators_start(config, tmp_path, monkeypatch, mistake):
     monkeypatch.setattr(other_daemon, "STATUS_S", 0.01)
     path = str(config(emulators=[{"device": "hx711", "arguments": ["--link", "load"]}]))

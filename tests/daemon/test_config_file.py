@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -11,14 +12,18 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import MCAP0_MAGIC
 from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
+from shearloop.bank.bank_file import BANK_MAGIC
+from shearloop.binary_files import FIRST_BYTES
 from shearloop.cli.config_schema import MODELS, schema_of
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
+from shearloop.estimation.archive import ARCHIVE_MAGIC
 from shearloop.yaml_files import load_model, read_yaml
 from tests.fixtures.robots import filled_in
 
@@ -268,6 +273,11 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
     for endless in ("/proc/kmsg", "/proc/self/status"):
         with pytest.raises(UserError, match=r"the configuration (is empty|cannot be read)"):
             load_yaml_model(Path(endless), Outer)
+    for first, what in FIRST_BYTES.items():
+        (tmp_path / "binary").write_bytes(first + b"\0\xff\xfe")
+        with pytest.raises(UserError, match=re.escape(f"the configuration has to be YAML, and this file is {what}")):
+            load_yaml_model(tmp_path / "binary", Outer)
+    assert {ARCHIVE_MAGIC, BANK_MAGIC, MCAP0_MAGIC[:5]} < FIRST_BYTES.keys()
     (tmp_path / "latin.yaml").write_bytes(b"mode: sl\xf6w\n")
     with pytest.raises(UserError, match=r"latin\.yaml: the configuration is not UTF-8 text \(byte 8\)"):
         load_yaml_model(tmp_path / "latin.yaml", Outer)

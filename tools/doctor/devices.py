@@ -5,6 +5,7 @@ import contextlib
 import time
 from collections import defaultdict
 from collections.abc import Awaitable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -175,7 +176,7 @@ def another_rig(config: DaemonConfig, reply: Mapping[str, Any]) -> str:
         # The mistakes in the settings are among the findings on files.
         with contextlib.suppress(DriverError):
             host = read_settings(config.robot).host
-    own, theirs = RunningRig.of(config, host).facts(), dict(reply.get("daemon", {}))
+    own, theirs = asdict(RunningRig.of(config, host)), dict(reply.get("daemon", {}))
     keys = [key for fact, key in _COMPARED.items() if own[fact] != theirs.get(fact)]
     devices, others = own["devices"], theirs.get("devices") or {}
     keys += [key for key in sorted({*devices, *others}) if devices.get(key) != others.get(key)]

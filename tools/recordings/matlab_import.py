@@ -28,15 +28,9 @@ from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import measured_delay
 from shearloop.estimation.values import LARGEST_TORQUE_NM
 from shearloop.files import open_file
-from shearloop.tools.recordings.time_formats import DATENUM, TIME_FORMATS
+from shearloop.tools.recordings.time_formats import DATENUM, STREAM_VARIABLES, TIME_FORMATS
 from shearloop.words import counted
 
-# The recording scripts changed these names over time.
-_STREAMS = {
-    "right": ("Right_Data", "plotthis2", "plotthis_right"),
-    "left": ("Left_Data", "plotthis1", "plotthis_left"),
-    "load": ("Load_Data", "plotthis3", "plotthis_truth"),
-}
 TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
 RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 _LINES = ("clipped_data", "clipped_data_hom")
@@ -105,9 +99,9 @@ class Slices:
 def find_streams(path: Path) -> tuple[str, ...]:
     """Return the streams of a file: "right", "left" or "load"; raises UserError if it cannot be read or has none."""
     variables = _load(path)
-    found = tuple(stream for stream, names in _STREAMS.items() if any(name in variables for name in names))
+    found = tuple(stream for stream, names in STREAM_VARIABLES.items() if any(name in variables for name in names))
     if not found:
-        wanted = ", ".join(name for names in _STREAMS.values() for name in names)
+        wanted = ", ".join(name for names in STREAM_VARIABLES.values() for name in names)
         raise UserError(f"{path} holds {', '.join(variables) or 'no variable'}, expected one of {wanted}")
     return found
 
@@ -134,7 +128,7 @@ def read_lines(path: Path, side: str | None = None) -> FloatArray:
 
 
 def _table(path: Path, name: str | None) -> FloatArray:
-    names = _STREAMS[name] if name is not None else (*_STREAMS["right"], *_STREAMS["left"])
+    names = STREAM_VARIABLES[name] if name is not None else (*STREAM_VARIABLES["right"], *STREAM_VARIABLES["left"])
     table, width = _one_of(path, _load(path), names), 1 if name == "load" else PAPER_TABLE.n_line_values
     if table.shape[1] != width + 1 or len(table) == 0:
         raise UserError(f"{path}: expected rows of one time and {counted(width, 'value')}, found {_size(table)}")

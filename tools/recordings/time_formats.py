@@ -24,3 +24,10 @@ TIME_FORMATS = {
     "elapsed-ms": TimeFormat(1e-3, -1e3 * _DAY_S, "milliseconds since the start", has_date=False),
 }
 DATENUM = "datenum"
+
+# The recording scripts changed these names over time.
+STREAM_VARIABLES = {
+    "right": ("Right_Data", "plotthis2", "plotthis_right"),
+    "left": ("Left_Data", "plotthis1", "plotthis_left"),
+    "load": ("Load_Data", "plotthis3", "plotthis_truth"),
+}

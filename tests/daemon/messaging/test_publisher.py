@@ -1,4 +1,6 @@
+import asyncio
 import errno
+import logging
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -114,6 +116,35 @@ def test_a_subscriber_is_warned_once_and_receives_a_later_daemon(tmp_path, monke
         with closing(receive_messages(address, ["health"], on_quiet=comes)) as heard:
             assert [next(heard)[1]["seq"] for _ in range(2)] == [0, 1]
     assert warnings == ["quiet"]
+
+
+@pytest.mark.parametrize("with_asyncio", [False, True])
+def test_a_subscriber_without_a_daemon_says_that_it_waits(with_asyncio, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("shearloop.daemon.messaging.client.QUIET_S", 0.02)
+    address = f"ipc://{tmp_path}/publish"
+    with zmq.Context() as context, context.socket(zmq.XPUB) as late, Subscriber(address, ["health"]) as subscriber:
+
+        def comes(record: logging.LogRecord) -> bool:
+            # asyncio logs too.
+            if not record.name.startswith("shearloop"):
+                return False
+            late.bind(address)
+            late.recv()
+            content = {"timestamp": 1.0, "t_mono_ns": 2, "source": "daemon", "seq": 0}
+            late.send_multipart([b"health", encode(content)])
+            return True
+
+        late.setsockopt(zmq.RCVTIMEO, 10_000)
+        caplog.handler.addFilter(comes)
+        try:
+            topic, _ = asyncio.run(anext(subscriber)) if with_asyncio else next(subscriber)
+        finally:
+            # All tests share the handler.
+            caplog.handler.removeFilter(comes)
+    assert topic == "health"
+    assert [record.getMessage() for record in caplog.records] == [
+        f"no message came from {address} in 0.02 s; waiting. Is a daemon running there?"
+    ]
 
 
 async def test_a_subscriber_is_iterated_with_and_without_asyncio(publisher, tmp_path):

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -51,7 +52,7 @@ async def examined(path: Path, seconds: float) -> dict[str, doctor.Finding]:
 
 def answering(monkeypatch, config, **changes):
     """Let a daemon answer with this configuration's rig, and some facts of it changed."""
-    facts = {"process": 4711, "folder": "/home/ann", **RunningRig.of(config, HOST).facts(), **changes}
+    facts = {"process": 4711, "folder": "/home/ann", **asdict(RunningRig.of(config, HOST)), **changes}
     tasks = {name: {"alive": True} for name in ("right", "load_cell", "robot", "gripper")}
     reply = {"ok": True, "tasks": tasks, "daemon": facts}
     monkeypatch.setattr(devices, "send_to_stop_socket", lambda *_: reply)

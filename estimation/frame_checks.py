@@ -37,8 +37,9 @@ class FrameTimer:
         self.gap = ""
         if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_PERIODS * period_s):
             if np.isfinite(step_s):
+                every = f" where one comes every {period_s:.2g} s" if np.isfinite(period_s) else ""
                 happened = (
-                    f"no frame came for {step_s:.1f} s (a loose cable or a busy computer)"
+                    f"no frame came for {step_s:.1f} s{every} (a loose cable or a busy computer)"
                     if step_s > 0
                     else "the frames' times step back"
                 )

@@ -152,7 +152,8 @@ def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(motion_c
     assert not process(tracker, shares, step_s=0.27)[-1].reasons
     after = [one.reasons for one in process(tracker, [1.0, 1.0], 0.27 * (len(shares) + lost), 0.27)]
     for (reason,), wanted in zip(after, (n_lags + 1, n_lags), strict=True):
-        found = re.fullmatch(r"no frame came for (\S+) s .* is not known: (\d+) more frames are needed", reason)
+        gap = r"no frame came for (\S+) s where one comes every 0\.27 s .* is not known: (\d+) more frames are needed"
+        found = re.fullmatch(gap, reason)
         assert float(found[1]) == pytest.approx(0.27 * (lost + 1), abs=0.051)
         assert int(found[2]) == wanted
 

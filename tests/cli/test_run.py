@@ -260,7 +260,7 @@ async def test_a_configured_experiment_waits_for_the_operator(waiting_config, lo
     begun: list[Path] = []
     answered = asyncio.Event()
 
-    async def start(path: Path, _digest: str | None = None) -> str | None:
+    async def start(path: Path, *_: object) -> str | None:
         begun.append(path)
         return None
 
@@ -288,7 +288,7 @@ async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, wait
     """Neither by the same one again, nor by the configured one after another."""
     ready, begun = asyncio.Event(), []
 
-    async def start(path: Path, _digest: str | None = None) -> str | None:
+    async def start(path: Path, *_: object) -> str | None:
         if not ready.is_set():
             return "the gripper is not ready"
         begun.append(path)

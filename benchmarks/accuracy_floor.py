@@ -19,10 +19,10 @@ from benchmarks.estimator_accuracy import FINGERTIPS, imported_stream
 from shearloop.bank.arrays import FloatArray
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.defaults import LOADED_NM
-from shearloop.estimation.fingertip_validator import channel_noise
 from shearloop.estimation.grips import segment_grip
 from shearloop.estimation.load_delay import find_load_delay
 from shearloop.estimation.twists import find_twists
+from shearloop.estimation.validator_fit import channel_noise
 from shearloop.studies.slices.series import read_slices
 from shearloop.tools.frame_series import series_of
 from shearloop.tools.recordings.frames import read_recording

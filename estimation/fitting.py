@@ -25,7 +25,6 @@ from shearloop.estimation.estimator import (
     Reading,
 )
 from shearloop.estimation.estimator_names import EstimatorName, estimator_class
-from shearloop.estimation.fingertip_validator import FingertipValidator, GripParts, too_few_frames
 from shearloop.estimation.gain import GainCorrection, ToolLaw
 from shearloop.estimation.grips import Grip, find_grips
 from shearloop.estimation.interval_regressor import IntervalRegressor
@@ -36,6 +35,7 @@ from shearloop.estimation.series import FrameSeries, check_finite, distinct
 from shearloop.estimation.session import Session
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.twists import LOADED_FRACTION, first_twists, loaded_log_gain
+from shearloop.estimation.validator_fit import GripParts, fit_validator, too_few_frames
 from shearloop.estimation.values import GripState, Measured
 from shearloop.words import counted
 
@@ -116,7 +116,7 @@ def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
         for grip in _clear_grips(recording, number, len(recordings))
     ]
     validators = tuple(
-        FingertipValidator.fit(
+        fit_validator(
             side,
             *(
                 GripParts(frames[grip.idle, layer], frames[grip.gripped, layer], frames[grip.released, layer])

@@ -12,8 +12,9 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.fingertip_validator import STEP_FRAMES, channel_noise, frame_steps
+from shearloop.estimation.fingertip_validator import STEP_FRAMES
 from shearloop.estimation.series import FrameSeries
+from shearloop.estimation.validator_fit import channel_noise, frame_steps
 
 # Torques above this fraction of the largest one count as a load.
 _LOADED_FRACTION = 0.1

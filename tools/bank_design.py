@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from shearloop.bank.design import ALLOWED, Design, MeasuredFrames, design_bank
 from shearloop.errors import UserError
-from shearloop.estimation.fingertip_validator import channel_noise
 from shearloop.estimation.grips import segment_grip
 from shearloop.estimation.series import FrameSeries
+from shearloop.estimation.validator_fit import channel_noise
 from shearloop.tools.bank_config import load_fingertip
 from shearloop.tools.banks import OWN_FINGERTIP
 from shearloop.tools.frame_series import read_series

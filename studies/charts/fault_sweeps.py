@@ -16,8 +16,8 @@ from shearloop.emulators.synthetic_frames import MEAN_V
 from shearloop.estimation import Calibration, Estimate, FrameSeries, Physics, Session, TactileFrame
 from shearloop.estimation.bank_match import ElectrodeNumbering
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.estimation.fingertip_validator import channel_noise
 from shearloop.estimation.twists import LOADED_FRACTION
+from shearloop.estimation.validator_fit import channel_noise
 from shearloop.studies.charts.chart_data import Split, fitted
 from shearloop.studies.slices.calibration import SliceCalibration
 from shearloop.studies.slices.reader import SliceReader

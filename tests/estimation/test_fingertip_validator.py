@@ -6,17 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.fingertip_validator import (
-    _JUMP_NOISES,
-    _JUMP_V,
-    MIN_NOISE_V,
-    FingertipSet,
-    FingertipValidator,
-    GripParts,
-    channel_noise,
-    compare_frames,
-)
+from shearloop.estimation.fingertip_validator import _JUMP_NOISES, _JUMP_V, MIN_NOISE_V, FingertipSet, compare_frames
 from shearloop.estimation.grips import segment_grip
+from shearloop.estimation.validator_fit import GripParts, channel_noise, fit_validator
 from tests.estimation.conftest import twisting
 
 ALL = np.ones((1, 896), dtype=bool)
@@ -24,9 +16,7 @@ ALL = np.ones((1, 896), dtype=bool)
 
 def guard_of(series, layer=0):
     idle, gripped, released = segment_grip(series)
-    return FingertipValidator.fit(
-        "right", GripParts(*(series.channels[part, layer] for part in (idle, gripped, released)))
-    )
+    return fit_validator("right", GripParts(*(series.channels[part, layer] for part in (idle, gripped, released))))
 
 
 def test_grip_and_release_are_found_in_a_recording(recorded):
@@ -104,7 +94,7 @@ def test_grip_is_about_one_gripped_and_zero_idle(recorded):
 def test_a_release_is_known_by_its_step_where_none_was_calibrated(recorded):
     idle, gripped, released = segment_grip(recorded)
     frames = recorded.channels[:, 0]
-    guard = FingertipValidator.fit("right", GripParts(frames[idle], frames[gripped], frames[:0]))
+    guard = fit_validator("right", GripParts(frames[idle], frames[gripped], frames[:0]))
     assert np.isfinite(guard.step_limit)
     opening, closing = int(released.start), int(gripped.start)
     assert guard.released(frames[opening + 2], frames[opening - 6], guard.idle) is True
@@ -115,9 +105,9 @@ def test_a_release_is_known_by_its_step_where_none_was_calibrated(recorded):
 def test_too_little_is_said_to_be(recorded):
     frames = recorded.channels[:, 0]
     with pytest.raises(CalibrationError, match="2 idle and 200 gripped frames are too few"):
-        FingertipValidator.fit("right", GripParts(frames[:2], frames[50:250], frames[:0]))
+        fit_validator("right", GripParts(frames[:2], frames[50:250], frames[:0]))
     with pytest.raises(CalibrationError, match="look like idle"):
-        FingertipValidator.fit("right", GripParts(frames[:12], frames[6:34], frames[:0]))
+        fit_validator("right", GripParts(frames[:12], frames[6:34], frames[:0]))
     for series, reason in (
         (replace(recorded, torque_nm=0.0 * recorded.torque_nm), "is 0 at all of these frames; record twists"),
         (replace(recorded, torque_t_s=recorded.torque_t_s + 1e4), "no torque is known for these frames"),

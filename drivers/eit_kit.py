@@ -96,6 +96,8 @@ class FrameError:
         return f"refused {read} at value {self.position + 1}: {self.kind.value}"
 
 
+# Lines without their ends, whose number is unknown.
+_LOST_BYTES = (FrameErrorKind.TOO_LONG, FrameErrorKind.WRONG_COUNT)
 # What remains of a line that was under way when the port was opened.
 _PARTIAL_ERRORS = (FrameErrorKind.WRONG_COUNT, FrameErrorKind.NOT_A_NUMBER)
 
@@ -177,8 +179,8 @@ class FrameClock:
         self.period_ns = nominal_period_ns
         self.learned = False
         self._exact_period_ns = float(nominal_period_ns)
-        # The number of the last frame.
-        self._number = 0
+        # The number of the last frame, and how many frames up to it waited for their reader.
+        self._number = self._waited_in_a_row = 0
         # (frame number, arrival) of the last frames that did not wait, across restarts, and the last spacings.
         self._latest: deque[tuple[int, int]] = deque(maxlen=SPACING_FRAMES + 1)
         self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
@@ -192,21 +194,22 @@ class FrameClock:
         """Forget the phase and keep the period: the board was restarted."""
         self._seen.clear()
 
-    def arrived(self, arrival_ns: int, rejected: int = 0, waited_since_ns: int | None = None) -> int:
+    def arrived(self, arrival_ns: int, rejected: int | None = 0, waited_since_ns: int | None = None) -> int:
         """Return when the next frame would have arrived at a reader that is never late.
 
-        `rejected` lines came before it. Then the number of periods follows from the time; otherwise a late frame is the
-        next one. `waited_since_ns`: its reader was away, and it may have arrived since then.
+        `rejected` lines came before it, None if bytes were lost and it is not known how many. Then the number of
+        periods follows from the time; otherwise a late frame is the next one. `waited_since_ns`: its reader was away,
+        and it may have arrived since then.
         """
         earliest_ns = arrival_ns if waited_since_ns is None else min(waited_since_ns, arrival_ns)
-        waited = earliest_ns < arrival_ns
+        self._waited_in_a_row = self._waited_in_a_row + 1 if earliest_ns < arrival_ns else 0
         if self._seen:
             self._count(arrival_ns, earliest_ns, rejected)
-        self._earliest_ns = earliest_ns
-        if waited and self._seen:
-            # It tells nothing of the board's pace.
-            self._latest.clear()
         else:
+            self._number += 1
+        self._earliest_ns = earliest_ns
+        # A frame that waited tells nothing of the board's pace, unless they all do.
+        if not self._seen or not 0 < self._waited_in_a_row <= PERIOD_WINDOW:
             self._seen.append((self._number, arrival_ns))
             self._latest.append((self._number, arrival_ns))
             if len(self._latest) > SPACING_FRAMES:
@@ -219,15 +222,15 @@ class FrameClock:
         self._straight_ns = round(straight_ns)
         return self._straight_ns
 
-    def _count(self, arrival_ns: int, earliest_ns: int, rejected: int) -> None:
+    def _count(self, arrival_ns: int, earliest_ns: int, rejected: int | None) -> None:
         """Count the periods until a frame that arrived between two times; restart where the board has paused."""
         elapsed, elapsed_at_least = (
             (t_ns - self._straight_ns) / self._exact_period_ns for t_ns in (arrival_ns, earliest_ns)
         )
-        steps = 1
-        if rejected and self.learned:
+        waited, steps = earliest_ns < arrival_ns, 1
+        if rejected != 0 and self.learned:
             steps = max(1, round(elapsed))
-            if earliest_ns < arrival_ns:
+            if waited and rejected is not None:
                 # Of frames that waited, the time tells only how many there can have been.
                 steps = min(steps, 1 + rejected)
         self._number += steps
@@ -236,7 +239,9 @@ class FrameClock:
         # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
         # board. Half a period early means that the last one was counted as two.
         paused = min(late, late_before) > 0.5 and late > late_before - 0.5
-        if elapsed_at_least > self._longest_gap or elapsed - steps < -0.5 or paused:
+        # Bytes are lost where nobody reads for long: what was kept comes before them, and this frame after.
+        lost = waited and rejected is None
+        if elapsed_at_least > self._longest_gap or elapsed - steps < -0.5 or paused or lost:
             self.restart()
 
     def _learn(self) -> None:
@@ -288,7 +293,8 @@ class FrameParser:
         self._zero_slots = zero_slots
         self._lines = LineSplitter(MAX_LINE_BYTES)
         self._first_line = True
-        self._rejected_since_frame = 0
+        # Lines; None once bytes were lost, which may be those of many.
+        self._rejected_since_frame: int | None = 0
         # Since when the next bytes may have waited for their reader; None if it was not away.
         self._waited_since_ns: int | None = None
         self._last_mid_ns = -(2**63)
@@ -358,7 +364,10 @@ class FrameParser:
     def _reject(self, error: FrameError) -> None:
         self.errors[error.kind] += 1
         self.last_error = error
-        self._rejected_since_frame += 1
+        if error.kind in _LOST_BYTES:
+            self._rejected_since_frame = None
+        elif self._rejected_since_frame is not None:
+            self._rejected_since_frame += 1
 
     def _frame(self, values: NDArray[np.float64], sent_ns: int, t_arrival_ns: int) -> Frame:
         channels = values[~self._zero_slots]

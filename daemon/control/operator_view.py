@@ -96,7 +96,10 @@ class OperatorView:
         return loaded_sentence(
             latest
             for name, latest in self.inputs.torques.items()
-            if not self.sources[name].from_robot and not (empty and self.sources[name].warm_up_s)
+            # Of a sensor that is lost, the last torque says nothing of the present.
+            if name not in self.inputs.lost
+            and not self.sources[name].from_robot
+            and not (empty and self.sources[name].warm_up_s)
         )
 
     def _turned(self) -> str:

@@ -127,6 +127,51 @@ def test_a_board_that_stopped_while_its_reader_was_away_is_followed(periods):
     assert max(map(abs, errors_ns)) < 1_000_000
 
 
+def test_a_board_that_sends_one_frame_after_each_opening_is_stamped():
+    """As with a loose cable. Its later connections are of the same clock."""
+    clock, t_ns = FrameClock(PERIOD_NS), 0
+    for _ in range(20):
+        clock.restart()
+        t_ns += 3 * PERIOD_NS
+        assert clock.arrived(t_ns) == t_ns
+    truth = t_ns + np.arange(1, 60) * PERIOD_NS
+    assert abs(straightened(truth, clock) - truth)[20:].max() < 4_000_000
+
+
+def test_the_period_is_learned_although_every_fourth_frame_waits():
+    """A search that takes longer than the reader may be away."""
+    period_ns = round(1.02 * PERIOD_NS)
+    truth = sent(200, period_ns).tolist()
+    clock = FrameClock(PERIOD_NS)
+    errors_ns = [
+        clock.arrived(t_ns + 250_000_000, 0, t_ns) - t_ns if n % 4 == 3 else clock.arrived(t_ns) - t_ns
+        for n, t_ns in enumerate(truth)
+    ]
+    assert clock.learned
+    assert max(map(abs, errors_ns[80:])) < 1_000_000
+
+
+def test_frames_that_all_wait_are_stamped_by_their_arrivals_in_the_end():
+    period_ns = round(1.02 * PERIOD_NS)
+    truth = sent(300, period_ns).tolist()
+    clock = FrameClock(PERIOD_NS)
+    errors_ns = [clock.arrived(t_ns + 250_000_000, 0, t_ns - 10_000_000) - t_ns for t_ns in truth]
+    assert max(map(abs, errors_ns[150:])) < 260_000_000
+
+
+def test_a_frame_after_lost_bytes_has_the_time_of_its_arrival():
+    """A buffer that was full joins two lines, and nobody knows how many are missing between them."""
+    truth = sent(80).tolist()
+    clock = FrameClock(PERIOD_NS)
+    for t_ns in truth[:40]:
+        clock.arrived(t_ns)
+    back_ns = truth[60] - 1_000_000
+    for n in range(40, 48):
+        assert clock.arrived(back_ns, 0, truth[39]) == pytest.approx(truth[n], abs=1_000_000)
+    assert clock.arrived(truth[60], None, truth[39]) == truth[60]
+    assert clock.arrived(truth[61]) == truth[61]
+
+
 def test_frames_queued_before_the_first_read_do_not_spoil_the_period():
     truth = sent(80)
     arrivals = np.maximum(truth, truth[5] + 50_000_000 * np.arange(80))

@@ -252,6 +252,17 @@ def test_a_turned_clamped_tool_becomes_no_zero_of_any_sensor_unless_the_operator
     assert operator.why_no_tare_step() is operator.tare_refusal() is None
 
 
+def test_the_last_torque_of_a_lost_sensor_is_no_load():
+    rig = clamped_rig()
+    rig.run(0.1)
+    loop = rig.control_loop
+    t_ns = loop.inputs.arm.t_ns
+    loop.on_torque(TorqueSample("load_cell", 0.2, "", t_ns, t_ns))
+    assert loop.operator.tare_refusal().startswith("load_cell measures +0.200 N·m")
+    loop.on_link("load_cell", "its cable is out", up=False)
+    assert loop.operator.tare_refusal() is None
+
+
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("torque_nm", [0.0, 0.08, 0.15])
 def test_a_step_takes_no_zero_of_the_wrench_under_a_clamped_tool_that_is_turned(known, torque_nm):

@@ -22,7 +22,7 @@ from benchmarks.stop_times import CAUSES, DEADLINE_S, RunningRig
 from shearloop.tools.recordings.frames import read_recording
 
 # Of the C library: larger buffers than this (bytes) go back to the system when they are freed. Without it the heap
-# keeps some of them, and the memory of the process grows by a step of 25 MB although nothing leaks.
+# keeps some of them, and the memory of the process grows in steps although nothing leaks.
 RETURNS_BUFFERS = {"MALLOC_MMAP_THRESHOLD_": str(1 << 20)}
 # The least of so many samples at this interval counts: the buffers of one frame are no leak.
 N_SAMPLES, SAMPLE_INTERVAL_S = 5, 0.02

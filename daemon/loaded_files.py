@@ -35,12 +35,11 @@ class _Loaded(NamedTuple):
 class LoadedFiles:
     """The configuration and the files that it names, as they were when the daemon began.
 
-    Experiments are read at each start, and these are not: a limit that was lowered in a file would not hold, and nobody
-    would know.
+    The daemon reads them once. A limit that is lowered in one of them later does not hold until a restart.
     """
 
     def __init__(self, paths: Iterable[Path]) -> None:
-        """Look at these files; what is no regular file, or cannot be read, is left out."""
+        """Look at these files; special files, and files that cannot be read, are left out."""
         self._loaded: dict[Path, _Loaded] = {}
         for path in paths:
             try:

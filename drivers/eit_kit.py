@@ -208,7 +208,7 @@ class FrameClock:
         else:
             self._number += 1
         self._earliest_ns = earliest_ns
-        # A frame that waited tells nothing of the board's pace, unless they all do.
+        # A frame that waited does not show the board's period, unless all frames wait.
         if not self._seen or not 0 < self._waited_in_a_row <= PERIOD_WINDOW:
             self._seen.append((self._number, arrival_ns))
             self._latest.append((self._number, arrival_ns))
@@ -231,7 +231,7 @@ class FrameClock:
         if rejected != 0 and self.learned:
             steps = max(1, round(elapsed))
             if waited and rejected is not None:
-                # Of frames that waited, the time tells only how many there can have been.
+                # The time is only an upper bound for the number of frames that waited.
                 steps = min(steps, 1 + rejected)
         self._number += steps
         late = elapsed_at_least - steps
@@ -239,7 +239,7 @@ class FrameClock:
         # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
         # board. Half a period early means that the last one was counted as two.
         paused = min(late, late_before) > 0.5 and late > late_before - 0.5
-        # Bytes are lost where nobody reads for long: what was kept comes before them, and this frame after.
+        # A buffer that is not read for long loses its newest bytes: this frame came after the reader was back.
         lost = waited and rejected is None
         if elapsed_at_least > self._longest_gap or elapsed - steps < -0.5 or paused or lost:
             self.restart()

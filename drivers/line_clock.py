@@ -43,7 +43,7 @@ class LineClock:
         # are in the number.
         self._seen: deque[tuple[int, int]] = deque(maxlen=WINDOW)
         self._together_ns = 0
-        # The same with the numbers by which the next line's time is told. They follow the board at once.
+        # The same with the numbers that give the next line's time. They follow the board at once.
         self._phase: deque[tuple[int, int]] = deque(maxlen=PHASE_ARRIVALS)
         self._slot = 0
         self._refused = 0

@@ -1,4 +1,4 @@
-"""What is known of a tool's angle and torque after each step of an experiment, before it runs.
+"""The known angle and torque of a tool after each step of an experiment, before it runs.
 
 An angle or a torque is known exactly, within an interval, or not at all. Of the tool these facts are used, and no more:
 
@@ -118,7 +118,7 @@ class Held(Enum):
 
 @dataclass(frozen=True, slots=True)
 class KnownTool:
-    """What is known between two steps; `origin_rad` is the wrist joint's angle at which the tool's angle is 0."""
+    """The known state between two steps; `origin_rad` is the wrist joint's angle at which the tool's angle is 0."""
 
     angle_rad: Interval = NONE
     torque_nm: Interval = NONE
@@ -127,14 +127,14 @@ class KnownTool:
     held: Held = Held.MAYBE
 
     def turned_to(self, angle_rad: float) -> "KnownTool":
-        """Return what is known after a turn to an angle from the grip."""
+        """Return the known state after a turn to an angle from the grip."""
         ways = self.angle_rad.ways_to(angle_rad)
         by_rad = Interval(angle_rad - self.angle_rad.high, angle_rad - self.angle_rad.low)
         wrist_rad = self.wrist_rad.plus(by_rad)
         return self._turned(exactly(angle_rad), wrist_rad, self._loaded(ways))
 
     def wrist_turned_to(self, wrist_rad: float) -> "KnownTool":
-        """Return what is known after a turn to an angle of the wrist joint."""
+        """Return the known state after a turn to an angle of the wrist joint."""
         ways = self.ways_of_wrist(wrist_rad)
         by_rad = Interval(wrist_rad - self.wrist_rad.high, wrist_rad - self.wrist_rad.low)
         origin_rad = self.origin_rad
@@ -148,18 +148,18 @@ class KnownTool:
         return self.wrist_rad.ways_to(wrist_rad)
 
     def returned(self, ways: Ways) -> "KnownTool":
-        """Return what is known after a turn in one of these directions, and back: slip may turn the torque back."""
+        """Return the known state after a turn in one of these directions, and back: slip may turn the torque back."""
         other_ways: Ways = frozenset(_OPPOSITE[way] for way in ways if way is not None)
         return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(other_ways))
 
     def torque_brought_to(self, torque_nm: float) -> "KnownTool":
-        """Return what is known after a turn until the torque has a value, and while it was held."""
+        """Return the known state after a turn until the torque has a value, and while it was held."""
         turns = self.torque_nm.ways_to(torque_nm)
         creeps: Ways = frozenset({direction_of(torque_nm)})
         return self._turned_beyond(turns | creeps, exactly(torque_nm))
 
     def tightened(self, step: TightenStep, *, reaches: bool) -> "KnownTool":
-        """Return what is known after a `tighten`; `reaches`: it ends near its torque or beyond, not at its angle."""
+        """Return the known state after a `tighten`; `reaches`: it ends near its torque or beyond, not at its angle."""
         sign, ways = SIGNS[step.direction], frozenset({step.direction})
         until_nm = sign * (1.0 - TORQUE_TOLERANCE) * step.until_torque_nm
         torque_nm = exactly(until_nm).beyond(ways) if reaches else self._loaded(ways)
@@ -167,11 +167,11 @@ class KnownTool:
         return self._turned(self.angle_rad.plus(by_rad), self.wrist_rad.plus(by_rad), torque_nm)
 
     def gripped(self, step: GripStep) -> "KnownTool":
-        """Return what is known after the fingers have closed; they close tighter on a held tool: its angle goes on."""
+        """Return the known state after the fingers have closed; a held tool is gripped tighter and keeps its angle."""
         held = Held.YES if step.expect_object else Held.MAYBE
-        anew = KnownTool(wrist_rad=self.wrist_rad, origin_rad=self.wrist_rad.exact, held=held)
+        another = KnownTool(wrist_rad=self.wrist_rad, origin_rad=self.wrist_rad.exact, held=held)
         if self.held is Held.NO:
-            return anew
+            return another
         # A sensor may read another torque in a tighter grip.
         tighter = replace(self.rescaled(), held=held)
         if self.held is Held.YES:
@@ -181,25 +181,25 @@ class KnownTool:
         return replace(tighter, angle_rad=angle_rad, origin_rad=origin_rad)
 
     def released(self) -> "KnownTool":
-        """Return what is known after the fingers have opened: the angle counts anew."""
+        """Return the known state after the fingers have opened: the angle counts from 0 again."""
         return KnownTool(wrist_rad=self.wrist_rad, origin_rad=self.wrist_rad.exact, held=Held.NO)
 
     def tared(self) -> "KnownTool":
-        """Return what is known after a tare, which is refused unless a tool is not held, or clamped and not turned."""
+        """Return the known state after a tare; it is refused with a held tool that is not clamped, or is turned."""
         angle_rad = self.angle_rad if self.held is Held.NO else self.angle_rad.within(UNTURNED_RAD)
         return replace(self, angle_rad=angle_rad, torque_nm=NONE)
 
     def moved(self) -> "KnownTool":
-        """Return what is known after a straight line, which may turn wrist 3 and load a held tool."""
+        """Return the known state after a straight line, which may turn wrist 3 and load a held tool."""
         torque_nm = self.torque_nm if self.held is Held.NO else UNKNOWN
         return replace(self, angle_rad=UNKNOWN, wrist_rad=UNKNOWN, torque_nm=torque_nm)
 
     def relaxed(self) -> "KnownTool":
-        """Return what is known after a rest, in which the torque may fall towards 0."""
+        """Return the known state after a rest, in which the torque may fall towards 0."""
         return replace(self, torque_nm=self.torque_nm.up_to(0.0))
 
     def rescaled(self) -> "KnownTool":
-        """Return what is known after a change of the measured torque's scale: only its direction stays."""
+        """Return the known state after a change of the measured torque's scale: only its direction stays."""
         directions = self.torque_nm.ways_to(0.0)
         opposite: Ways = frozenset(_OPPOSITE[way] for way in directions if way is not None)
         return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(opposite))
@@ -212,7 +212,7 @@ class KnownTool:
         return self._turned(self.angle_rad.beyond(ways), self.wrist_rad.beyond(ways), torque_nm)
 
     def _turned(self, angle_rad: Interval, wrist_rad: Interval, torque_nm: Interval) -> "KnownTool":
-        """Return what is known with another angle: the wrist joint's angle and the tool's differ by the origin."""
+        """Return the known state with another angle: the wrist joint's angle and the tool's differ by the origin."""
         origin_rad = self.origin_rad
         if origin_rad is not None:
             wrist_rad = angle_rad.plus(exactly(origin_rad))
@@ -229,7 +229,7 @@ NOTHING_KNOWN: Final = KnownTool(angle_rad=UNKNOWN, torque_nm=UNKNOWN)
 
 
 def known_at_start(*, loaded: bool, twisted_rad: float) -> KnownTool:
-    """Return what is known at a start; `loaded`: a tool may be held, turned by about `twisted_rad` since its grip."""
+    """Return the known state at a start; `loaded`: a tool may be held, turned by about `twisted_rad` since its grip."""
     if not loaded:
         return AT_REST
     if abs(twisted_rad) > UNTURNED_RAD:
@@ -238,7 +238,7 @@ def known_at_start(*, loaded: bool, twisted_rad: float) -> KnownTool:
 
 
 def knowledge(planned: Iterable[Step], start: KnownTool = AT_REST, *, reaches: bool = True) -> Iterator[KnownTool]:
-    """Yield what is known before each step; `reaches`: each `tighten` ends near its torque or beyond."""
+    """Yield the known state before each step; `reaches`: each `tighten` ends near its torque or beyond."""
     known = start
     for step in planned:
         yield known
@@ -246,7 +246,7 @@ def knowledge(planned: Iterable[Step], start: KnownTool = AT_REST, *, reaches: b
 
 
 def known_after(step: Step, known: KnownTool, *, reaches: bool = True) -> KnownTool:
-    """Return what is known after a step, from what is known before."""
+    """Return the known state after a step, from the one before it."""
     if isinstance(step, TwistingStep) and known.held is Held.NO:
         # Something else than the fingers may hold it.
         known = replace(known, held=Held.MAYBE)

@@ -186,7 +186,7 @@ class OperatorView:
         return f" At present {held}.{angle}"
 
     def known_at_start(self) -> KnownTool:
-        """Return what is known of the tool's angle and torque at a start."""
+        """Return the known angle and torque of the tool at a start."""
         return known_at_start(loaded=self.tool.may_be_loaded(), twisted_rad=self.tool.twisted_rad)
 
     def _clamped_turn(self) -> str:

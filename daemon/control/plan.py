@@ -156,7 +156,7 @@ def plan_of(
     """Return the plan of an experiment within the limits of the robot and the gripper, where they are known.
 
     `refused` has the reasons against each step by its index. `warm_up_s` passes after a grip or a tare until the first
-    torque. `start` is what is known of the tool at the start; None: it is assumed to be neither turned nor loaded.
+    torque. `start` is the known state of the tool at the start; None: it is assumed to be neither turned nor loaded.
     """
     speeds = speeds_of(robot)
     known = AT_REST if start is None else start
@@ -221,7 +221,7 @@ class _Ways(NamedTuple):
     if_tightened: frozenset[int]
 
     def notes(self, number: int, step: Step, turn: Turn) -> Iterator[str]:
-        """Yield what is to be said about a step's direction."""
+        """Yield the sentences about a step's direction."""
         if number in self.back:
             yield self.back[number]
         if turn.way_unknown:

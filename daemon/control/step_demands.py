@@ -54,7 +54,7 @@ def _travel_rad(angles_rad: Sequence[float]) -> float:
 
 
 class Before(NamedTuple):
-    """What a step begins at: what is known of the tool, and the tool's pose; None for an unknown one."""
+    """The known state of the tool before a step, and the tool's pose; None for an unknown one."""
 
     tool: KnownTool = AT_REST
     pose_m_rad: Sequence[float] | None = None

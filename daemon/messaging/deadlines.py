@@ -1,4 +1,4 @@
-"""How long after an operator's act its request may be carried out, whatever it passes stands still on its way.
+"""How long after an operator's act its request may be carried out, although a program on its way stood still.
 
 Each part on the way has a clock of its own, and no two are compared. A part gives out a reading of its clock before the
 act, and the request carries the reading back. The time since that reading is at least the age of the act.

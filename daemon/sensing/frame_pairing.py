@@ -42,7 +42,7 @@ class FramePairing(Generic[Timed]):
         waiting = self._waiting.get(side)
         if waiting is None:
             return None
-        # Times of a board that step back begin anew: nothing that comes later fits the frames before.
+        # Where the times of a board step back, pairing begins again: nothing that comes later fits the frames before.
         while waiting and waiting[-1].t_mid_ns >= frame.t_mid_ns:
             self._leave_out(side)
         waiting.append(frame)

@@ -1,4 +1,4 @@
-"""The moments that the viewer gives out to its pages: a click names the latest one, which tells the age of the click.
+"""The moments that the viewer gives out to its pages: a click names the latest one, which shows the age of the click.
 
 The page's clock is not compared with the viewer's. A tab, the connection or the viewer may have stood still since.
 """
@@ -14,7 +14,7 @@ class UnknownMomentError(ValueError):
 
 
 class Moments:
-    """Gives out moments, and tells how long ago it gave one out."""
+    """Gives out moments, and says how long ago it gave one out."""
 
     def __init__(self, now_ns: Callable[[], int] = boot_ns) -> None:
         self._now_ns = now_ns

@@ -116,7 +116,7 @@ def test_a_line_that_was_refused_while_the_reader_was_away_takes_one_period():
 
 @pytest.mark.parametrize("periods", [3.3, 5.5, 30.0])
 def test_a_board_that_stopped_while_its_reader_was_away_is_followed(periods):
-    """A board whose frames nobody reads blocks once the buffers are full: it goes on when it is read again."""
+    """A board that is not read blocks once the buffers are full, and goes on when it is read again."""
     truth, capacity = sent(80), 2
     away_ns = int(truth[40]) + 100_000_000
     blocked = truth[40 + capacity] + int(periods * PERIOD_NS)
@@ -160,7 +160,7 @@ def test_frames_that_all_wait_are_stamped_by_their_arrivals_in_the_end():
 
 
 def test_a_frame_after_lost_bytes_has_the_time_of_its_arrival():
-    """A buffer that was full joins two lines, and nobody knows how many are missing between them."""
+    """A full buffer joins two lines, and the number of lines between them is unknown."""
     truth = sent(80).tolist()
     clock = FrameClock(PERIOD_NS)
     for t_ns in truth[:40]:

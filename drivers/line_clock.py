@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from statistics import median
 
-from shearloop.drivers.eit_kit import slope_below
+from shearloop.drivers.frame_clock import slope_below
 
 # Arrivals behind the schedule, and those from which on it is learned.
 WINDOW, LEARN_FROM = 64, 32

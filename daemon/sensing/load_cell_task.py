@@ -47,6 +47,8 @@ class LoadCellTask:
         # small loads in one tare after the other would add up.
         self._judged_by: LoadCalibration | None = None
         self._latest: LoadSample | None = None
+        # Readings in a row that are beyond what it can measure.
+        self._overloaded = 0
 
     async def run(self) -> None:
         """Publish every sample and pass it on, until cancelled."""
@@ -64,7 +66,9 @@ class LoadCellTask:
         self._latest = sample
         if self._loop is not None:
             torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
-            load = "" if not sample.overloaded else "the reading is beyond what it can measure"
+            # A single one may be a line that was changed on its way.
+            self._overloaded = self._overloaded + 1 if sample.overloaded else 0
+            load = "the reading is beyond what it can measure" if self._overloaded > 1 else ""
             self._loop.on_torque(TorqueSample(LOAD_CELL, torque_nm, message.reason, sample.t_mid_ns, now_ns, load=load))
         self._take_zero(sample)
 

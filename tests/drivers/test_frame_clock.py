@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 
 from shearloop.drivers.connection import AWAY_NS
-from shearloop.drivers.eit_kit import FrameClock, slope_below
+from shearloop.drivers.frame_clock import FrameClock, slope_below
 
 PERIOD_NS = 541_200_000
 

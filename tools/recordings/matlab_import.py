@@ -22,7 +22,8 @@ from shearloop.daemon.recorder.schema import (
 )
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.eit_kit import ADC_REFERENCE_V, slope_below
+from shearloop.drivers.eit_kit import ADC_REFERENCE_V
+from shearloop.drivers.frame_clock import slope_below
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import measured_delay

@@ -1,0 +1,132 @@
+"""The clock of a board that sends a frame each period, from the arrivals of its frames. No I/O."""
+
+from collections import deque
+from collections.abc import Iterable
+from itertools import islice, pairwise
+from statistics import median
+
+# Frames behind the period: 35 s at 0.54 s, while a crystal drifts by microseconds.
+PERIOD_WINDOW = 64
+# Frames behind the phase: a board that paused is followed within 6 s.
+PHASE_WINDOW = 12
+# Spacings needed to learn a period. Each spans several frames, so that a burst of late ones does no harm.
+LEARN_FROM = 16
+SPACING_FRAMES = 4
+# A longer pause, in periods, means that the board stopped and has a new phase.
+LONGEST_GAP = 2.5
+# A period further from the usual spacing is a burst of late frames.
+PLAUSIBLE = 0.05
+
+
+class FrameClock:
+    """Straightens the arrival times of frames, causally, and learns the board's period.
+
+    A board with a steady period sends each frame as soon as it is complete. A busy reader or bus sees it later, never
+    earlier. The board's clock is therefore the line closest below all (frame number, arrival) points. That line is the
+    edge of their lower convex hull that spans the middle (Moon, Skelly and Towsley 1999, "Estimation and removal of
+    clock skew from network delay measurements"). Its slope is the period; its height over the last few frames is the
+    phase. All times are integer nanoseconds of one monotonic clock. The nominal period applies until the real one is
+    `learned`. After a pause of more than `longest_gap` periods the board counts as stopped; before, a frame is late. A
+    frame that may have waited for its reader says nothing of a pause: it came in time if it can have.
+    """
+
+    def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:
+        self._longest_gap = longest_gap
+        # The learned period, or the nominal one until it is learned.
+        self.period_ns = nominal_period_ns
+        self.learned = False
+        self._exact_period_ns = float(nominal_period_ns)
+        # The number of the last frame, and how many frames up to it waited for their reader.
+        self._number = self._waited_in_a_row = 0
+        # (frame number, arrival) of the last frames that did not wait, across restarts, and the last spacings.
+        self._latest: deque[tuple[int, int]] = deque(maxlen=SPACING_FRAMES + 1)
+        self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
+        # (frame number, arrival) of the frames that did not wait, since the last restart.
+        self._seen: deque[tuple[int, int]] = deque(maxlen=PERIOD_WINDOW)
+        # When the last frame may have arrived at the earliest, and when it would have at a reader that is never late.
+        self._earliest_ns = 0
+        self._straight_ns = 0
+
+    def restart(self) -> None:
+        """Forget the phase and keep the period: the board was restarted."""
+        self._seen.clear()
+
+    def arrived(self, arrival_ns: int, rejected: int | None = 0, waited_since_ns: int | None = None) -> int:
+        """Return when the next frame would have arrived at a reader that is never late.
+
+        `rejected` lines came before it, None if bytes were lost and it is not known how many. Then the number of
+        periods follows from the time; otherwise a late frame is the next one. `waited_since_ns`: its reader was away,
+        and it may have arrived since then.
+        """
+        earliest_ns = arrival_ns if waited_since_ns is None else min(waited_since_ns, arrival_ns)
+        self._waited_in_a_row = self._waited_in_a_row + 1 if earliest_ns < arrival_ns else 0
+        if self._seen:
+            self._count(arrival_ns, earliest_ns, rejected)
+        else:
+            self._number += 1
+        self._earliest_ns = earliest_ns
+        # A frame that waited does not show the board's period, unless all frames wait.
+        if not self._seen or not 0 < self._waited_in_a_row <= PERIOD_WINDOW:
+            self._seen.append((self._number, arrival_ns))
+            self._latest.append((self._number, arrival_ns))
+            if len(self._latest) > SPACING_FRAMES:
+                (n, before_ns), (m, _) = self._latest[0], self._latest[-1]
+                self._spacings.append((arrival_ns - before_ns) / (m - n))
+            self._learn()
+        straight_ns = float(arrival_ns)
+        for n, seen_ns in islice(reversed(self._seen), PHASE_WINDOW):
+            straight_ns = min(straight_ns, seen_ns + (self._number - n) * self._exact_period_ns)
+        self._straight_ns = round(straight_ns)
+        return self._straight_ns
+
+    def _count(self, arrival_ns: int, earliest_ns: int, rejected: int | None) -> None:
+        """Count the periods until a frame that arrived between two times; restart where the board has paused."""
+        elapsed, elapsed_at_least = (
+            (t_ns - self._straight_ns) / self._exact_period_ns for t_ns in (arrival_ns, earliest_ns)
+        )
+        waited, steps = earliest_ns < arrival_ns, 1
+        if rejected != 0 and self.learned:
+            steps = max(1, round(elapsed))
+            if waited and rejected is not None:
+                # The time is only an upper bound for the number of frames that waited.
+                steps = min(steps, 1 + rejected)
+        self._number += steps
+        late = elapsed_at_least - steps
+        late_before = (self._earliest_ns - self._straight_ns) / self._exact_period_ns
+        # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
+        # board. Half a period early means that the last one was counted as two.
+        paused = min(late, late_before) > 0.5 and late > late_before - 0.5
+        # A buffer that is not read for long loses its newest bytes: this frame came after the reader was back.
+        lost = waited and rejected is None
+        if elapsed_at_least > self._longest_gap or elapsed - steps < -0.5 or paused or lost:
+            self.restart()
+
+    def _learn(self) -> None:
+        if len(self._spacings) < LEARN_FROM:
+            return
+        spacing = median(self._spacings)
+        if spacing <= 0:
+            return
+        if abs(self._exact_period_ns - spacing) > PLAUSIBLE * spacing:
+            self._exact_period_ns, self.learned = spacing, True
+        if len(self._seen) >= LEARN_FROM:
+            slope = slope_below(self._seen)
+            if abs(slope - spacing) <= PLAUSIBLE * spacing:
+                self._exact_period_ns, self.learned = slope, True
+        self.period_ns = round(self._exact_period_ns)
+
+
+def slope_below(points: Iterable[tuple[int, int]]) -> float:
+    """Return the slope of the line closest below all points, which are in order of their abscissa."""
+    points = list(points)
+    hull: list[tuple[int, int]] = []
+    for n, t in points:
+        # Drop a corner on or above the chord past it.
+        while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (n - hull[-2][0]) >= (t - hull[-2][1]) * (
+            hull[-1][0] - hull[-2][0]
+        ):
+            hull.pop()
+        hull.append((n, t))
+    middle = sum(n for n, _ in points) / len(points)
+    (n0, t0), (n1, t1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
+    return (t1 - t0) / (n1 - n0)

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from shearloop.cli.registry import COMMANDS, GROUPS, MOVING, OTHER_SPELLINGS, command_module
 from shearloop.daemon.errors import USER_ERRORS
-from shearloop.daemon.messaging.deadlines import boot_ns, process_began_ns
+from shearloop.daemon.messaging.deadlines import boot_ns
 from shearloop.daemon.process import interrupt_status, raise_ending_signals
 from shearloop.errors import UserError
 from shearloop.printable import OutputError, open_closed_streams, printable_output, silence
@@ -20,6 +20,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Colours are control characters, which the output escapes (help of Python 3.14, log outside of `logging_to_stderr`).
 os.environ.setdefault("NO_COLOR", "1")
 
+# A person typed the command before the process loaded this module.
+_LOADED_NS = boot_ns()
 # Commands of the daemon that are named, and not carried out, without the word `command`.
 _OF_COMMAND = (MOVING - COMMANDS.keys()) | {"tare"}
 EXIT_OK, EXIT_USAGE = 0, 2
@@ -116,9 +118,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
-    # A person typed it before this process began. With words that are given, it is called from a longer process.
-    called_ns = boot_ns()
-    began_ns = process_began_ns if argv is None else lambda: called_ns
+    # With words that are given, it is called from a longer process.
+    began_ns = _LOADED_NS if argv is None else boot_ns()
     if arguments[:1] in ([], ["help"]):
         arguments = [*arguments[1:2], "--help"]
     program, interrupt_is_end = "shearloop", False

@@ -115,7 +115,7 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
         if not status.get("ok"):
             return status
         # Ctrl-Z or a suspended computer may have held this program up.
-        age_s = 0.0 if args.name in NEVER_LATE else (boot_ns() - args.began_ns()) / 1e9
+        age_s = 0.0 if args.name in NEVER_LATE else (boot_ns() - args.began_ns) / 1e9
         request |= meant_for(status, age_s, TYPED_WITHIN_S)
         if args.name == "unlock":
             request |= _acknowledged(status.get("loop", {}))

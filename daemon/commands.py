@@ -255,8 +255,13 @@ class Commands:
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()
-        daemon = {"process": os.getpid(), "instance": self.instance, "folder": os.getcwd(), **asdict(self.running_rig)}
-        daemon |= {"now_ns": self.now_ns()}
+        daemon = {
+            "process": os.getpid(),
+            "instance": self.instance,
+            "folder": os.getcwd(),
+            "now_ns": self.now_ns(),
+            **asdict(self.running_rig),
+        }
         if self.rig is None:
             return {"tasks": tasks, "daemon": daemon}
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}

@@ -11,7 +11,6 @@ An angle or a torque is known exactly, within an interval, or not at all. Of the
 """
 
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final, NamedTuple, TypeAlias
@@ -173,12 +172,13 @@ class KnownTool:
         if self.held is Held.NO:
             return another
         # A sensor may read another torque in a tighter grip.
-        tighter = replace(self.rescaled(), held=held)
+        tighter = self.rescaled()
         if self.held is Held.YES:
             return replace(tighter, held=Held.YES)
         angle_rad = self.angle_rad.up_to(0.0)
-        origin_rad = self.origin_rad if angle_rad == self.angle_rad == NONE else None
-        return replace(tighter, angle_rad=angle_rad, origin_rad=origin_rad)
+        was_unturned = self.angle_rad == NONE
+        origin_rad = self.origin_rad if was_unturned else None
+        return replace(tighter, held=held, angle_rad=angle_rad, origin_rad=origin_rad)
 
     def released(self) -> "KnownTool":
         """Return the known state after the fingers have opened: the angle counts from 0 again."""
@@ -235,14 +235,6 @@ def known_at_start(*, loaded: bool, twisted_rad: float) -> KnownTool:
     if abs(twisted_rad) > UNTURNED_RAD:
         return NOTHING_KNOWN
     return replace(NOTHING_KNOWN, angle_rad=UNKNOWN.within(UNTURNED_RAD))
-
-
-def knowledge(planned: Iterable[Step], start: KnownTool = AT_REST, *, reaches: bool = True) -> Iterator[KnownTool]:
-    """Yield the known state before each step; `reaches`: each `tighten` ends near its torque or beyond."""
-    known = start
-    for step in planned:
-        yield known
-        known = known_after(step, known, reaches=reaches)
 
 
 def known_after(step: Step, known: KnownTool, *, reaches: bool = True) -> KnownTool:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
-from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool
+from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool, way_from
 from shearloop.daemon.control.step_demands import Demand, demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare, opens_to
 from shearloop.daemon.control.turns import Turn, reversals, turns
@@ -326,7 +326,7 @@ def _turns_back(step: Step, begins: steps.Direction | None) -> bool:
             return True
         case steps.TwistStep(angles_rad=angles_rad):
             rounds = angles_rad * min(step.repeats, 2)
-            ways = {begins} | {steps.direction_of(later - earlier) for earlier, later in pairwise(rounds)}
+            ways = {begins} | {way_from(earlier, later) for earlier, later in pairwise(rounds)}
             return len(ways - {None}) > 1
     return False
 

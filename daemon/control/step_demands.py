@@ -150,4 +150,5 @@ def _twist_demand(step: TwistStep, angles_rad: Sequence[float], speeds: Speeds, 
         travel_rad = reach[0] + step.repeats * _travel_rad(angles_rad)
         travel_rad += (step.repeats - 1) * between_rounds_rad
     moves_s = travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s) + SETTLES_S * moves
-    return Demand(0.0, 0.0 if step.absolute else max(map(abs, angles_rad)), stands_s, moves_s)
+    most_rad = 0.0 if step.absolute else max(abs(angle_rad) for angle_rad in angles_rad)
+    return Demand(0.0, most_rad, stands_s, moves_s)

@@ -4,9 +4,7 @@ Each part on the way has a clock of its own, and no two are compared. A part giv
 act, and the request carries the reading back. The time since that reading is at least the age of the act.
 """
 
-import os
 import time
-from pathlib import Path
 from typing import Final
 
 # The page's clicks, and commands that are typed, whose program takes a while to begin on a busy computer.
@@ -14,19 +12,11 @@ CLICK_WITHIN_S: Final = 2.0
 TYPED_WITHIN_S: Final = 5.0
 # They let nothing move: they are never too late.
 NEVER_LATE: Final = ("status", "stop", "pause")
-# The place of a process's first clock tick in /proc/self/stat (proc(5)), after the name, which may have spaces.
-_STARTED = 19
 
 
 def boot_ns() -> int:
     """Return a clock that goes on while the computer is suspended, in ns."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-
-
-def process_began_ns() -> int:
-    """Return when this process began, in ns of `boot_ns`."""
-    facts = Path("/proc/self/stat").read_text(errors="replace").rpartition(")")[2].split()
-    return int(facts[_STARTED]) * 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 
 
 def why_late(age_s: float, within_s: float) -> str | None:

@@ -5,6 +5,7 @@ import { byId, put, putLines, show } from "./text.js";
 
 const KEY = "shearloop-token";
 const TOKEN_NEEDED = "needs the token: open the address that `shearloop view` printed";
+const NOTHING_RECEIVED = "nothing was received from the daemon yet";
 // A daemon answers within milliseconds; `start`, `unlock` and `release` may take 150 s.
 const LATE_MS = 155000;
 const LIST_LATE_MS = 10000;
@@ -122,7 +123,9 @@ export class Controls {
     const names = new Map();
     for (const button of this.buttons()) {
       const { command } = button.dataset;
-      const reason = token ? this.reasons[command] ?? "" : TOKEN_NEEDED;
+      let reason = this.reasons[command] ?? "";
+      if (!token) reason = TOKEN_NEEDED;
+      else if (!this.link) reason = NOTHING_RECEIVED;
       if (button.disabled !== (reason !== "")) button.disabled = reason !== "";
       if (button.title !== reason) button.title = reason;
       if (reason) names.set(reason, [...(names.get(reason) ?? []), command]);

@@ -189,14 +189,11 @@ def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
         for other, before in last.items():
             if turn.begins - STILL - {other}:
                 against.append((before, other))
-        # A step that may not turn may not turn back either.
-        is_certain = way is not None and None not in turn.begins
-        loads_other_side = way is not None and loaded is not None and way == turn.loads and way != loaded[1]
-        if way is not None and is_certain and len(last) == 1 and against:
+        if way is not None and len(last) == 1 and against:
             known.append(Reversal(number, way, *against[0]))
-        elif way is not None and is_certain and loaded is not None and loads_other_side:
+        elif way is not None and loaded is not None and way == turn.loads and way != loaded[1]:
             known.append(Reversal(number, way, *loaded))
-        elif loads_other_side or against:
+        elif against:
             possible.append(number)
         if None not in turn.leaves:
             last = {}

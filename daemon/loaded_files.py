@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shearloop.daemon.config import DaemonConfig
+from shearloop.drivers.errors import system_reason
 
 # Of a larger file, such as a bank, only the time and the size tell that it has changed.
 _MAX_HASHED_BYTES = 32 << 20
@@ -58,14 +59,17 @@ class LoadedFiles:
     def why_outdated(self) -> str:
         """Return which file has changed since the daemon's start; empty if none has. It reads the files that may have.
 
-        A file that cannot be read now counts as unchanged: the daemon goes on with what the operator last saw.
+        A file that is gone, or cannot be read, may have changed.
         """
         for path, loaded in self._loaded.items():
             try:
                 stamp = _Stamp.of(path)
                 same = stamp == loaded.stamp or (loaded.digest is not None and _digest(path, stamp) == loaded.digest)
-            except OSError:
-                continue
+            except OSError as error:
+                return (
+                    f"{path} cannot be read ({system_reason(error)}), and may have changed since the daemon began; "
+                    "restore the file, or restart the daemon"
+                )
             if not same:
                 return (
                     f"{path} has changed since the daemon began, and the daemon goes on with what it read then; "

@@ -71,8 +71,14 @@ def test_of_a_large_file_time_and_size_count(rig, monkeypatch):
     assert OUTDATED in loaded.why_outdated()
 
 
-def test_what_cannot_be_read_counts_as_unchanged(rig):
+def test_a_file_that_is_gone_may_have_changed(rig):
     loaded = LoadedFiles([rig, rig.parent, Path("/dev/null"), rig.parent / "missing"])
-    rig.unlink()
     (rig.parent / "missing").write_text("new")
+    assert loaded.why_outdated() == "", "it was not read at the start"
+    kept = rig.rename(rig.with_suffix(".away"))
+    assert loaded.why_outdated().startswith(f"{rig} cannot be read (No such file or directory), and may have changed")
+    rig.mkdir()
+    assert loaded.why_outdated().startswith(f"{rig} ")
+    rig.rmdir()
+    kept.rename(rig)
     assert loaded.why_outdated() == ""

@@ -9,6 +9,7 @@ const NOTHING_RECEIVED = "nothing was received from the daemon yet";
 // A daemon answers within milliseconds; `start`, `unlock` and `release` may take 150 s.
 const LATE_MS = 155000;
 const LIST_LATE_MS = 10000;
+const LIST_AGAIN_MS = 2000;
 const STOP_LATE_MS = 4000;
 const NO_VIEWER = "the viewer on the rig's computer does not answer";
 // An answer disappears after this time; an unconfirmed stop stays.
@@ -27,6 +28,8 @@ export class Controls {
     this.reasons = {};
     // Why the daemon has no list of experiments to pick from.
     this.unlisted = "";
+    // When the list was last asked for.
+    this.offered = -Infinity;
     // Counts what was clicked: an answer to an earlier click does not replace what is said of a later one.
     this.clicks = 0;
     byId("stop").addEventListener("click", () => this.stop());
@@ -69,11 +72,10 @@ export class Controls {
     const loop = link.get("loop.state")?.content;
     const received = link.state() === "live" && loop !== undefined;
     const busy = received && ACTIVE.has(loop.phase);
-    // While an experiment runs, the daemon may have no list yet.
-    const ended = this.busy && !busy;
-    if (received && (!this.received || (ended && !this.listed))) this.offer();
+    // While an experiment runs, the daemon may have no list yet. A daemon that was busy or stood still is asked again.
+    const unlisted = !busy && !this.listed && performance.now() > this.offered + LIST_AGAIN_MS;
+    if (received && (!this.received || unlisted)) this.offer();
     this.received = received;
-    this.busy = busy;
     // An unlock acknowledges the stop that is shown, and no other.
     this.stopShown = loop?.stop;
     this.watch(loop);
@@ -101,6 +103,7 @@ export class Controls {
 
   // Fill the picker with the experiments that the daemon offers.
   async offer() {
+    this.offered = performance.now();
     const picker = byId("experiment");
     let reply;
     try {

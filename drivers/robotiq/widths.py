@@ -116,16 +116,11 @@ class WidthCalibration(CalibrationModel):
     @classmethod
     def _bowed(cls, counts: NDArray[np.float64], widths: NDArray[np.float64], model: GripperModel) -> Self | None:
         """Return the parabola through counts (n,) and widths (n,), or None where it does not fall over the stroke."""
-        curve = np.polynomial.Polynomial.fit(counts, widths, 2).convert()
+        # `polyfit` keeps a bend of exactly 0, which `Polynomial.fit(…).convert()` drops.
+        curve = np.polynomial.Polynomial(np.polyfit(counts, widths, 2)[::-1])
         residuals = widths - curve(counts)
-        # The vertex lies to the right of a parabola that opens upward, and the stroke to the left of it.
-        bend, slope = float(curve.coef[2]), float(curve.coef[1])
-        vertex = -slope / (2 * bend) if bend else math.inf
-        roots = [(curve - width).roots() for width in (model.stroke_mm, 0.0)]
-        if any(np.iscomplex(ends).any() for ends in roots):
-            return None
-        opened, closed = (float(ends.real.min() if bend > 0 else ends.real.max()) for ends in roots)
-        if not (opened < closed and (vertex > closed if bend > 0 else vertex < opened)):
+        opened, closed = (_falls_through(curve, width_mm) for width_mm in (model.stroke_mm, 0.0))
+        if opened is None or closed is None or opened >= closed:
             return None
         try:
             return cls(
@@ -159,3 +154,20 @@ class WidthCalibration(CalibrationModel):
     def width_std_mm(self) -> float:
         """The standard deviation of a measured width, mm: of the curve and of the encoder's step."""
         return math.hypot(self.std_mm, self.mm_per_count / math.sqrt(12))
+
+
+def _falls_through(parabola: np.polynomial.Polynomial, width_mm: float) -> float | None:
+    """Return the counts at which a x² + b x + c falls through a width, mm, or None where it nowhere does.
+
+    The slope there is -sqrt(b² - 4 a (c - width)). The root has two forms. In each branch stands the one that does not
+    subtract nearly equal numbers: the other one loses all digits where the parabola is almost straight.
+    """
+    c, b, a = (float(value) for value in parabola.coef)
+    c -= width_mm
+    squared = b**2 - 4 * a * c
+    if squared <= 0:
+        return None
+    steepness = math.sqrt(squared)
+    if b < 0:
+        return 2 * c / (steepness - b)
+    return -(b + steepness) / (2 * a) if a else None

@@ -148,6 +148,20 @@ def test_gauges_of_each_model_give_its_stroke_its_first_count_and_its_bow(model,
     assert all(abs(found.width_mm(found.counts(width)) - width) <= step_mm for width in widths)
 
 
+@given(
+    st.floats(-80, 20),
+    st.floats(200, 255),
+    st.lists(st.integers(5, 135), min_size=4, max_size=8, unique=True).filter(lambda all_mm: np.ptp(all_mm) > 70),
+)
+def test_straight_gauges_make_no_other_curve_than_their_line(opened, closed, widths_mm):
+    """The bow of the best parabola is rounding noise there, which differs between processors."""
+    truth = WidthCalibration(model="2F-140", open_counts=opened, open_mm=140.0, closed_counts=closed, std_mm=1.0)
+    gauges = [(truth.closed_counts + width / truth.mm_per_count, float(width)) for width in widths_mm]
+    found = WidthCalibration.of_gauges(gauges, "2F-140")
+    counts = np.linspace(opened, closed, 20)
+    assert [found.width_mm(one) for one in counts] == pytest.approx([truth.width_mm(one) for one in counts], abs=1e-6)
+
+
 def test_few_gauges_cannot_see_a_bow_and_say_so():
     fingers = Fingers(MODELS["2F-85"], bow_mm=2.0)
     found = WidthCalibration.of_gauges([(fingers.counts(width), width) for width in (5.0, 80.0)], "2F-85")

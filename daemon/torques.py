@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from statistics import fmean
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
@@ -16,7 +16,9 @@ LONGEST_TARE_S = 30.0
 LARGEST_DRIFT_NM = 0.05
 # A stretch within the noise may be a load if its mean exceeds this fraction of the noise. Noise has a smaller mean.
 _LOAD_IN_NOISE = 0.5
-CONFIRM_TARE = "take the load off, or confirm with `shearloop command tare --yes` that there is none"
+UNLOAD = "take the load off (turn the tool back, or free it), then tare again"
+# Only a person can know that a measured load is the drift of a zero.
+CONFIRM_TARE = f"{UNLOAD}; only if nothing touches the sensor, confirm it with `shearloop command tare --yes`"
 # The sources of the robot's own torque, and of the load cell's.
 WRENCH, LOAD_CELL = "wrench", "load_cell"
 
@@ -26,8 +28,9 @@ class TorqueSample:
     """One torque of one source, with the time of its measurement (`t_mid_ns`) and of its arrival (`t_ns`).
 
     `torque_nm` is None if it is not valid, for `reason`. `low_nm` and `high_nm` bound the friction band that
-    hides the torque. A torque beyond `loaded_nm` is a load; a smaller one may be drift of the zero. `load` says by what
-    else a source knows that it is loaded, for instance where the load is too large for a torque; empty if it is not.
+    hides the torque. A torque beyond `loaded_nm` is a load; a smaller one may be drift of the zero. `loading` is a load
+    in the source's own unit, of a source that gives no torque. `load` says why no zero can be taken under the present
+    load, for instance where it is too large for a torque; empty if one can.
     """
 
     source: str
@@ -38,6 +41,7 @@ class TorqueSample:
     low_nm: float | None = None
     high_nm: float | None = None
     loaded_nm: float = LARGEST_DRIFT_NM
+    loading: str = ""
     load: str = ""
 
     def __post_init__(self) -> None:
@@ -132,10 +136,10 @@ class LatestTorques:
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken now, or None; `confirmed`: the operator says that nothing is loaded."""
-        loaded = loaded_sentence(self._torques.values())
-        if confirmed or not loaded:
+        loaded = load_of(self._torques.values())
+        if confirmed or loaded is None:
             return None
-        return f"{loaded}, which would become the zero; {CONFIRM_TARE}"
+        return f"{loaded.sentence}, which would become the zero; {loaded.cure}"
 
 
 def beyond_noise(times_ns: Sequence[int], torques_nm: Sequence[float], noise_nm: float) -> list[float]:
@@ -159,14 +163,29 @@ def beyond_noise(times_ns: Sequence[int], torques_nm: Sequence[float], noise_nm:
     return found
 
 
-def loaded_sentence(torques: Iterable[TorqueSample]) -> str:
-    """Return which source measures a load that does not come from its drift, or an empty string."""
+class SensorLoad(NamedTuple):
+    """A sensor's load, as a sentence; `may_be_drift`: a confirmed tare could make it the zero."""
+
+    sentence: str
+    may_be_drift: bool
+
+    @property
+    def cure(self) -> str:
+        """What the operator does before a tare. Under a load that is no drift, a confirmed one costs the good zero."""
+        return CONFIRM_TARE if self.may_be_drift else UNLOAD
+
+
+def load_of(torques: Iterable[TorqueSample]) -> SensorLoad | None:
+    """Return the first load that is beyond the usual drift, or None."""
     for torque in torques:
+        measured = torque.loading
         if torque.torque_nm is not None and abs(torque.torque_nm) > torque.loaded_nm:
-            return f"{torque.source} measures {torque.torque_nm:+.3f} N·m"
+            measured = f"{torque.torque_nm:+.3f} N·m"
+        if measured:
+            return SensorLoad(f"{torque.source} measures {measured}", may_be_drift=not torque.load)
         if torque.load:
-            return f"{torque.source} is loaded: {torque.load}"
-    return ""
+            return SensorLoad(f"{torque.source} is loaded: {torque.load}", may_be_drift=False)
+    return None
 
 
 class Tareable(Protocol):

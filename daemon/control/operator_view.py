@@ -11,7 +11,7 @@ from shearloop.daemon.control.inputs import LatestInputs
 from shearloop.daemon.control.known_tool import UNTURNED_RAD, KnownTool, known_at_start
 from shearloop.daemon.control.safety import SafetyMonitor
 from shearloop.daemon.control.step_motions import first_gripper_step, first_motion_before_grip, first_turn_before_tare
-from shearloop.daemon.torques import CONFIRM_TARE, TorqueSource, loaded_sentence
+from shearloop.daemon.torques import CONFIRM_TARE, SensorLoad, TorqueSource, load_of
 
 # The way out for a clamped tool, also without a known zero.
 CLAMPED_CURE = (
@@ -72,8 +72,8 @@ class OperatorView:
             return None
         if (uncertain := self.tool.uncertain) is not None:
             return f"{uncertain}; {CONFIRM_TARE}"
-        if loaded := self._loaded():
-            return f"{loaded}, which would become the zero; {CONFIRM_TARE}"
+        if (loaded := self._load()) is not None:
+            return f"{loaded.sentence}, which would become the zero; {loaded.cure}"
         if turned := self._turned():
             return f"{turned}, and its load would become the zero; {CONFIRM_TARE}"
         return None
@@ -82,25 +82,25 @@ class OperatorView:
         """Return why a step `tare` cannot take a zero at present, or None; no operator confirms a step."""
         if (reason := self.tool.held or self.tool.uncertain) is not None:
             return f"{reason}; put a `release` before it"
-        if loaded := self._loaded():
-            cure = "if nothing is loaded, `shearloop command tare --yes` takes the zero before the start"
-            return f"{loaded}, which would become the zero; take the load off ({cure})"
+        if (loaded := self._load()) is not None:
+            cure = "take the load off: turn the tool back, or free it"
+            if loaded.may_be_drift:
+                cure += "; only if nothing touches the sensor, take the zero before the start: "
+                cure += "`shearloop command tare --yes`"
+            return f"{loaded.sentence}, which would become the zero; {cure}"
         if turned := self._turned():
             return f"{turned}, and its load would become the zero; {CLAMPED_CURE}"
         return None
 
-    def _loaded(self) -> str:
-        """Return which sensor measures a load, as a sentence; empty without one. Drift does not count."""
+    def _load(self) -> SensorLoad | None:
+        """Return a sensor's load beyond the usual drift, or None."""
         # Empty fingers of the gripper do not load a fingertip, so its torque is drift.
         empty = self.tool.has_gripper and self.inputs.gripper is not None
-        return loaded_sentence(
-            latest
-            for name, latest in self.inputs.torques.items()
-            # Of a sensor that is lost, the last torque says nothing of the present.
-            if name not in self.inputs.lost
-            and not self.sources[name].from_robot
-            and not (empty and self.sources[name].warm_up_s)
-        )
+        # A skin without a radius is no source of torques, but has a load.
+        uncounted = {name for name, one in self.sources.items() if one.from_robot or (empty and one.warm_up_s)}
+        # Of a sensor that is lost, the last torque says nothing of the present.
+        uncounted.update(self.inputs.lost)
+        return load_of(latest for name, latest in self.inputs.torques.items() if name not in uncounted)
 
     def _turned(self) -> str:
         """Return how far a clamped tool is turned, which may load the sensors; empty where it is not.

@@ -10,14 +10,7 @@ from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest
-from shearloop.daemon.torques import (
-    CONFIRM_TARE,
-    LARGEST_DRIFT_NM,
-    LOAD_CELL,
-    SensorListener,
-    TorqueSample,
-    loaded_sentence,
-)
+from shearloop.daemon.torques import LARGEST_DRIFT_NM, LOAD_CELL, SensorListener, TorqueSample, load_of
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 
 # Two seconds at 10.9 Hz.
@@ -160,9 +153,9 @@ class LoadCellTask:
             self._judged_by = calibration
         now_ns = self._clock.now_ns()
         torque = TorqueSample(LOAD_CELL, self._judged_by.torque_nm(raw), "", now_ns, now_ns)
-        loaded = loaded_sentence([torque])
-        if loaded and not self._confirmed:
-            return f"{loaded}, counted from the last confirmed tare or the daemon's start; {CONFIRM_TARE}"
+        loaded = load_of([torque])
+        if loaded is not None and not self._confirmed:
+            return f"{loaded.sentence}, counted from the last confirmed tare or the daemon's start; {loaded.cure}"
         return ""
 
 

@@ -33,6 +33,7 @@ SKIN_SOURCES = SKIN, SKIN_CURRENT, SKIN_DAQ
 MAX_WARMING_K = 5.0
 # The recorded data of a zero that is given up before its time is over, because its step has ended.
 GIVEN_UP = b"given up"
+_NO_RADIUS = "it has no torque without `skin.tool_radius_mm`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,11 +173,19 @@ class SkinTask:
         message = shear_message(sample, reading, self._radius_m, now_ns)
         self._reason = message.reason
         self._valid += reading.valid
-        if self._radius_m is not None and self._loop is not None:
-            torque = skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns)
-            loaded_nm = self._estimator.loaded_n * self._radius_m
-            self._loop.on_torque(replace(torque, loaded_nm=loaded_nm, load=self._estimator.why_not_at_rest(sample)))
+        if self._loop is not None:
+            self._loop.on_torque(self._judged_torque(sample, reading, now_ns))
         self._publisher.publish(message)
+
+    def _judged_torque(self, sample: SkinSample, reading: SkinReading, now_ns: int) -> TorqueSample:
+        """Return the torque with what tells a load from drift; without a radius the load is a force."""
+        load, loaded_n = self._estimator.why_not_at_rest(sample), self._estimator.loaded_n
+        if self._radius_m is not None:
+            torque = skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns)
+            return replace(torque, loaded_nm=loaded_n * self._radius_m, load=load)
+        shear_n = reading.shear_n
+        loading = f"{shear_n:+.2f} N" if shear_n is not None and abs(shear_n) > loaded_n else ""
+        return TorqueSample(SKIN, None, _NO_RADIUS, sample.t_mid_ns, now_ns, loading=loading, load=load)
 
 
 def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | None, now_ns: int) -> SkinShear:

@@ -315,6 +315,18 @@ def test_a_load_that_is_too_large_for_a_torque_becomes_no_zero_by_a_step_or_a_co
     assert loop.operator.tare_refusal(confirmed=True) is None
 
 
+@pytest.mark.parametrize("load", [{"torque_nm": 0.1}, {"torque_nm": None, "loading": "+0.30 N"}])
+@pytest.mark.parametrize("no_zero", ["", "its range has ended"])
+def test_a_confirmation_is_advised_only_where_the_load_may_be_drift(load, no_zero):
+    """A confirmed tare gives up the good zero, and under such a load there is no new one."""
+    loop = ControlLoop(LoopConfig(), {"load_cell": LOAD}, ("robot",))
+    loop.on_torque(TorqueSample("skin", reason="", t_mid_ns=0, t_ns=0, load=no_zero, **load))
+    measured = "skin measures +0.100 N·m" if load["torque_nm"] else "skin measures +0.30 N"
+    for refusal in (loop.operator.why_no_tare_step(), loop.operator.tare_refusal()):
+        assert refusal.startswith(f"{measured}, which would become the zero; take the load off")
+        assert ("--yes" in refusal) is (not no_zero)
+
+
 def test_a_running_experiment_refuses_a_tare():
     rig = started(Rig(new_loop()), WAIT)
     assert "is running" in (rig.control_loop.operator.tare_refusal(confirmed=True) or "")

@@ -161,6 +161,7 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path):
         # A working load of this skin, which another sensor would count as drift.
         refused = await bench.command("tare", source="skin")
         assert refused["reason"].startswith("skin measures +0.01")
+        assert "--yes" not in refused["reason"], "it would cost the good zero"
         await bench.until(lambda content: content["valid"] and content["torque_nm"] > 0.01)
         # Beyond the calibrated curve there is no torque, and all the more a load.
         bench.skin.push(6.0)
@@ -168,6 +169,7 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path):
         refused = await bench.command("tare", source="skin")
         assert refused["reason"].startswith("skin is loaded: R₁ ")
         assert "would look like that, which would become the zero; take the load off" in refused["reason"]
+        assert "--yes" not in refused["reason"]
         bench.skin.push(0.8)
         await bench.until(lambda content: content["valid"] and content["torque_nm"] > 0.01)
         assert await bench.command("tare", source="skin", confirmed=True) == {"ok": True, "taring": ["skin"]}
@@ -180,6 +182,20 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path):
         await tare_all(bench.daemon.sensors.tareable.values())
         refused = await bench.command("tare", source="left")
         assert refused == {"ok": False, "reason": "there is no sensor 'left' to tare; there are skin"}
+
+
+async def test_a_skin_without_a_radius_is_no_more_tared_under_load_than_one_with_a_radius(tmp_path):
+    async with played(tmp_path, tool_radius_mm=None) as bench:
+        await bench.valid()
+        bench.skin.push(0.8)
+        await bench.until(lambda content: (content["shear_n"] or 0.0) > 0.7)
+        refused = await bench.command("tare", source="skin")
+        assert refused["reason"].startswith("skin measures +0."), "a force in newtons"
+        assert " N, which would become the zero; take the load off" in refused["reason"]
+        await bench.valid()
+        bench.skin.push(0.0)
+        await bench.until(lambda content: content["valid"] and abs(content["shear_n"]) < 0.1)
+        assert await bench.command("tare", source="skin") == {"ok": True, "taring": ["skin"]}
 
 
 async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path, monkeypatch):

@@ -11,8 +11,10 @@ An angle or a torque is known exactly, within an interval, or not at all. Of the
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import pairwise
 from typing import Final, NamedTuple, TypeAlias
 
 from shearloop.daemon.control.experiment_schema import (
@@ -44,6 +46,7 @@ _ROUNDING: Final = 1e-9
 # The directions in which something may turn; None: it may not turn at all.
 Ways: TypeAlias = frozenset[Direction | None]
 STILL: Final[Ways] = frozenset({None})
+_OPPOSITE: Final[dict[Direction, Direction]] = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
 
 
 def only_way(ways: Ways) -> Direction | None:
@@ -60,6 +63,17 @@ def either_way(ways: Ways) -> bool:
 def way_from(start: float, end: float) -> Direction | None:
     """Return the direction from an angle or a torque to another; None if they differ by rounding only."""
     return None if abs(end - start) <= _ROUNDING else direction_of(end - start)
+
+
+def ways_between(values: Iterable[float]) -> list[Direction]:
+    """Return the directions of the turns from each angle to the next, in order; equal angles have no turn between."""
+    ways = (way_from(earlier, later) for earlier, later in pairwise(values))
+    return [way for way in ways if way is not None]
+
+
+def opposite(ways: Ways) -> Ways:
+    """Return the opposite directions; the opposite of no turn is left out."""
+    return frozenset(_OPPOSITE[way] for way in ways if way is not None)
 
 
 class Interval(NamedTuple):
@@ -148,8 +162,7 @@ class KnownTool:
 
     def returned(self, ways: Ways) -> "KnownTool":
         """Return the known state after a turn in one of these directions, and back: slip may turn the torque back."""
-        other_ways: Ways = frozenset(_OPPOSITE[way] for way in ways if way is not None)
-        return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(other_ways))
+        return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(opposite(ways)))
 
     def torque_brought_to(self, torque_nm: float) -> "KnownTool":
         """Return the known state after a turn until the torque has a value, and while it was held."""
@@ -200,9 +213,8 @@ class KnownTool:
 
     def rescaled(self) -> "KnownTool":
         """Return the known state after a change of the measured torque's scale: only its direction stays."""
-        directions = self.torque_nm.ways_to(0.0)
-        opposite: Ways = frozenset(_OPPOSITE[way] for way in directions if way is not None)
-        return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(opposite))
+        load_ways = opposite(self.torque_nm.ways_to(0.0))
+        return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(load_ways))
 
     def _loaded(self, ways: Ways) -> Interval:
         """Return the torque after a turn in one of these directions; a tool that breaks loose may lose all of it."""
@@ -220,8 +232,6 @@ class KnownTool:
             origin_rad = wrist_rad.exact - angle_rad.exact
         return replace(self, angle_rad=angle_rad, wrist_rad=wrist_rad, torque_nm=torque_nm, origin_rad=origin_rad)
 
-
-_OPPOSITE: Final[dict[Direction, Direction]] = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
 
 # A tool as a fresh grip leaves it, and one of which nothing is known.
 AT_REST: Final = KnownTool()

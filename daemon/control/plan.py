@@ -3,12 +3,11 @@
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
-from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool, way_from
+from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool, either_way, ways_between
 from shearloop.daemon.control.step_demands import Demand, demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare, opens_to
 from shearloop.daemon.control.turns import Turn, reversals, turns
@@ -115,8 +114,8 @@ class Plan:
             "the grip"
         )
         yield f"  {self._reversals()}"
-        if either_way := _listed(step for step in self.steps if step.way_unknown):
-            yield f"  turning a held tool in a direction that is not known before: step {either_way}"
+        if unknown_ways := _listed(step for step in self.steps if step.way_unknown):
+            yield f"  turning a held tool in a direction that is not known before: step {unknown_ways}"
         if both_ways := _listed(step for step in self.steps if step.turns_back):
             yield f"  turning back within themselves: step {both_ways}"
         yield "  clockwise and counterclockwise are for an eye that faces the gripper"
@@ -326,8 +325,7 @@ def _turns_back(step: Step, begins: steps.Direction | None) -> bool:
             return True
         case steps.TwistStep(angles_rad=angles_rad):
             rounds = angles_rad * min(step.repeats, 2)
-            ways = {begins} | {way_from(earlier, later) for earlier, later in pairwise(rounds)}
-            return len(ways - {None}) > 1
+            return either_way(frozenset({begins, *ways_between(rounds)}))
     return False
 
 

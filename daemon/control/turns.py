@@ -1,7 +1,6 @@
 """Which way each step of an experiment turns the tool, and which steps turn it back."""
 
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import NamedTuple
 
 from shearloop.daemon.control.experiment_schema import (
@@ -27,7 +26,7 @@ from shearloop.daemon.control.known_tool import (
     either_way,
     known_after,
     only_way,
-    way_from,
+    ways_between,
 )
 
 
@@ -114,9 +113,9 @@ def _first_ways(to_first: Ways, angles_rad: tuple[float, ...]) -> Ways:
     """Return the directions of a twist's first turn; it is to a later angle if the tool stands at the first one."""
     if None not in to_first:
         return to_first
-    ways = [way_from(earlier, later) for earlier, later in pairwise(angles_rad)]
-    later = next((way for way in ways if way is not None), None)
-    return (to_first - STILL) | {later}
+    later_ways = ways_between(angles_rad)
+    first_later = later_ways[0] if later_ways else None
+    return (to_first - STILL) | {first_later}
 
 
 def _tightens(direction: Direction, until_nm: float, torque_nm: Interval) -> Ways:
@@ -141,8 +140,8 @@ def _reach(step: TwistStep, before: KnownTool, after: KnownTool) -> Interval:
 
 def _last_way(angles_rad: tuple[float, ...]) -> Direction | None:
     """Return the direction of the last turn from angle to angle; None where all are one."""
-    ways = [way_from(earlier, later) for earlier, later in pairwise(angles_rad)]
-    return next((way for way in reversed(ways) if way is not None), None)
+    ways = ways_between(angles_rad)
+    return ways[-1] if ways else None
 
 
 class Reversal(NamedTuple):

@@ -28,7 +28,7 @@ DAEMON_COMMANDS = {
     "unlock": "allow motion again after a stop, when no person is within reach; --yes where it opens the gripper",
 }
 # `stop` is never refused, and the others change nothing.
-_ACTS_ON_NOTHING_SHOWN = ("stop", "status", "experiments")
+_ACTS_ON_NOTHING_SHOWN = ("stop", *addresses.READ_ONLY)
 # Their replies are shown as tables.
 _TABLES = ("status", "experiments")
 

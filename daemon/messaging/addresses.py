@@ -23,6 +23,8 @@ COMMAND_TIMEOUT_S = 2.0
 UNLOCK_TIMEOUT_S = 150.0
 # Commands that take longer than an answer: `start` reads a file, which a network drive may delay, and enables motion.
 SLOW = ("start", "unlock", "release")
+# Commands that change nothing.
+READ_ONLY = ("status", "experiments")
 
 
 def expanded(address: str) -> str:

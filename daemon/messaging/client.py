@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import zmq
 import zmq.asyncio
 
-from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, has_valid_port, needs_keys
+from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, READ_ONLY, has_valid_port, needs_keys
 from shearloop.daemon.messaging.deadlines import why_late
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
@@ -152,7 +152,7 @@ async def ask(
     context: zmq.asyncio.Context, address: str, content: Mapping[str, Any], timeout_s: float, keys: ClientKeys | None
 ) -> dict[str, Any]:
     """Send one command and return the daemon's reply; raises UserError if no reply comes in time."""
-    may_act = content.get("command") not in ("status", "experiments") and not content.get("ask")
+    may_act = content.get("command") not in READ_ONLY and not content.get("ask")
     with context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         # Nothing waits in this socket for a daemon that begins later.

@@ -14,6 +14,7 @@ import structlog
 import zmq
 import zmq.asyncio
 
+from shearloop.daemon.messaging.addresses import READ_ONLY
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.deadlines import NEVER_LATE, boot_ns
 from shearloop.daemon.messaging.keys import KeyPair
@@ -125,7 +126,7 @@ class RequestExecutor:
         finally:
             self._running -= 1
         # Pages and scripts ask for the status every second. A question before a command carries nothing out.
-        quiet = name in (STATUS, EXPERIMENTS) or request.get("ask")
+        quiet = name in READ_ONLY or request.get("ask")
         (log.debug if quiet else log.info)("command executed", command=name)
         return {"ok": True, **reply}
 

@@ -7,6 +7,7 @@ import socket
 from urllib.parse import urlsplit
 
 from shearloop.files import expanded_path
+from shearloop.words import is_whole_number
 
 PUBLISH_ADDRESS = "tcp://127.0.0.1:7761"
 COMMAND_ADDRESS = "tcp://127.0.0.1:7762"
@@ -55,7 +56,7 @@ def has_valid_port(address: str) -> bool:
     port = address.rpartition(":")[2]
     if not address.startswith("tcp://") or port == "*":
         return True
-    return port.isascii() and port.isdecimal() and len(port) <= len(str(LARGEST_PORT)) and int(port) <= LARGEST_PORT
+    return is_whole_number(port, len(str(LARGEST_PORT))) and int(port) <= LARGEST_PORT
 
 
 def names_localhost(address: str) -> bool:

@@ -7,6 +7,10 @@ import secrets
 from collections.abc import Callable
 
 from shearloop.daemon.messaging.deadlines import boot_ns
+from shearloop.words import is_whole_number
+
+# Of a clock's nanoseconds in 64 bits.
+_MAX_DIGITS = len(str(1 << 63))
 
 
 class UnknownMomentError(ValueError):
@@ -28,7 +32,7 @@ class Moments:
     def age_s(self, moment: str) -> float:
         """Return how long ago a moment was given out; raises UnknownMomentError."""
         own, _, digits = moment.partition("-")
-        if own != self._own or not (digits.isascii() and digits.isdecimal() and len(digits) <= len(str(1 << 63))):
+        if own != self._own or not is_whole_number(digits, _MAX_DIGITS):
             raise UnknownMomentError(moment)
         age_s = (self._now_ns() - int(digits)) / 1e9
         if age_s < 0.0:

@@ -39,6 +39,7 @@ from shearloop.daemon.web.message_store import MessageStore
 from shearloop.daemon.web.moments import Moments, UnknownMomentError
 from shearloop.errors import UserError
 from shearloop.timeouts import timeout
+from shearloop.words import is_whole_number
 
 HOST = "127.0.0.1"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
@@ -388,7 +389,7 @@ class _Page:
         arguments: dict[str, bool | int | str] = {**own_words}
         if "stop" in arguments:
             number = request.query["stop"]
-            if not (number.isascii() and number.isdecimal() and len(number) <= _MAX_DIGITS):
+            if not is_whole_number(number, _MAX_DIGITS):
                 return self._refuse(400, f"`stop` is {number[:40]!r}, and has to be a whole number")
             arguments["stop"] = int(number)
         # The first press asks the question, the second press confirms it.

@@ -11,6 +11,7 @@ from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError, system_reason
 from shearloop.drivers.refused_lines import shown
 from shearloop.drivers.robotiq import messages
+from shearloop.words import is_whole_number
 
 # A reply takes some milliseconds; the controller serves the socket with a low priority.
 REPLY_DEADLINE_S = 0.5
@@ -71,7 +72,7 @@ def value_of(variable: str, text: str) -> int | None:
             "in the URCap's installation page; on an e-Series set Tool I/O, Controlled by, to the Robotiq URCap, and "
             "uninstall an RS-485 URCap."
         )
-    if not (text.isascii() and text.isdigit() and int(text) <= 255):
+    if not (is_whole_number(text, MAX_REPLY_BYTES) and int(text) <= 255):
         raise ProtocolError(f"The gripper's socket gave {variable} as {text!r}, which is no number from 0 to 255.")
     return int(text)
 

@@ -1,4 +1,4 @@
-"""Numbers in the words of a sentence, and sentences that differ in their numbers alone."""
+"""Numbers in words and in digits, and sentences that differ in their numbers alone."""
 
 
 def times(count: int) -> str:
@@ -9,6 +9,12 @@ def times(count: int) -> str:
 def counted(count: int, one: str, many: str = "") -> str:
     """Return a number with its noun, and the verb if the noun brings one: 1 frame is, 2 frames are."""
     return f"{count} {one if count == 1 else many or f'{one}s'}"
+
+
+def is_whole_number(text: str, most_digits: int) -> bool:
+    """Return whether a text is a number of ASCII digits alone, and not of more than `most_digits`."""
+    # `int` accepts signs, blanks, underscores and the digits of every script, and takes long for many.
+    return text.isascii() and text.isdecimal() and len(text) <= most_digits
 
 
 def without_digits(text: str) -> str:

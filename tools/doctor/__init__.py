@@ -23,10 +23,10 @@ from shearloop.errors import UserError
 from shearloop.tools.check import OPEN_KEYS, CheckEmulators, check_parts
 from shearloop.tools.doctor.devices import (
     DAEMON_TIMEOUT_S,
-    another_rig,
     ask_status,
     check_daemon,
     check_devices,
+    differing_keys,
     listen_for_frames,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, split_cure, trouble
@@ -93,26 +93,28 @@ def examine(
 def check_daemon_and_devices(config: DaemonConfig, config_path: Path, seconds: float) -> Iterator[Finding]:
     """Examine the devices, through the daemon that has them if it is this configuration's."""
     reply = ask_status(config.commands)
+    differing = differing_keys(config, reply) if reply else []
+    if reply and not differing:
+        holds = f"answers at {config.commands}: {whose_daemon(reply)}; it holds the devices and reports on them"
+        yield good("daemon", holds)
+        received = {} if "publish" in config.network_addresses else listen_for_frames(config.publish, seconds)
+        yield from check_daemon(config, reply.get("tasks", {}), received)
+        return
     if reply is None:
         yield good("daemon", "not running with this configuration: the devices are free")
     elif not reply:
         found = f"a daemon has the address {config.commands} and does not answer within {DAEMON_TIMEOUT_S:g} s"
         means = "it hangs, or the computer is too busy; it may be this configuration's, and have the devices"
         yield trouble("daemon", found, means, "look at its log; end it, then run the doctor again")
-    elif differs := another_rig(config, reply):
-        means = f"this configuration's daemon cannot start while it runs; the two differ in {differs}"
+    else:
+        keys = ", ".join(f"`{key}`" for key in differing)
+        means = f"this configuration's daemon cannot start while it runs; the two differ in {keys}"
         cure = (
             "end it, or restart it if the file has changed since its start; to run both, give one of them other "
             "values of `publish` and `commands`"
         )
         found = f"a daemon of another configuration answers at {config.commands}: {whose_daemon(reply)}"
         yield trouble("daemon", found, means, cure)
-    else:
-        holds = f"answers at {config.commands}: {whose_daemon(reply)}; it holds the devices and reports on them"
-        yield good("daemon", holds)
-        received = {} if "publish" in config.network_addresses else listen_for_frames(config.publish, seconds)
-        yield from check_daemon(config, reply.get("tasks", {}), received)
-        return
     if config.emulators:
         means = "they exist only while the daemon runs"
         cure = f"`shearloop run {shlex.quote(str(config_path))}`, then run the doctor again"

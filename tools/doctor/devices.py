@@ -169,8 +169,8 @@ def ask_status(address: str) -> Mapping[str, Any] | None:
     return None
 
 
-def another_rig(config: DaemonConfig, reply: Mapping[str, Any]) -> str:
-    """Return how the rig of the daemon that gave this reply to `status` differs, or an empty string."""
+def differing_keys(config: DaemonConfig, reply: Mapping[str, Any]) -> list[str]:
+    """Return the configuration's keys in which the daemon that gave this reply to `status` has another rig."""
     host = None
     if config.robot is not None:
         # The mistakes in the settings are among the findings on files.
@@ -180,7 +180,7 @@ def another_rig(config: DaemonConfig, reply: Mapping[str, Any]) -> str:
     keys = [key for fact, key in _COMPARED.items() if own[fact] != theirs.get(fact)]
     devices, others = own["devices"], theirs.get("devices") or {}
     keys += [key for key in sorted({*devices, *others}) if devices.get(key) != others.get(key)]
-    return ", ".join(f"`{key}`" for key in keys)
+    return keys
 
 
 def listen_for_frames(address: str, seconds: float) -> dict[str, list[Mapping[str, Any]]]:

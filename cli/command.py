@@ -11,7 +11,7 @@ from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.callers import caller
 from shearloop.daemon.messaging.deadlines import NEVER_LATE, TYPED_WITHIN_S, boot_ns
-from shearloop.daemon.running_rig import EMULATED, HEADING
+from shearloop.daemon.running_rig import EMULATED, EMULATED_HEADING
 
 if TYPE_CHECKING:
     from shearloop.daemon.messaging.keys import ClientKeys
@@ -139,7 +139,7 @@ def _told(args: argparse.Namespace, reply: dict[str, Any]) -> int:
         shown = {key: value for key, value in reply.items() if key != "emulated"}
         lines = _lines(args.name, shown)
         # A table keeps its columns.
-        lines = [HEADING, *lines] if label and args.name in _TABLES else [f"{label}{lines[0]}", *lines[1:]]
+        lines = [EMULATED_HEADING, *lines] if label and args.name in _TABLES else [f"{label}{lines[0]}", *lines[1:]]
         print(with_connection("\n".join(lines), args, addresses.COMMAND_ADDRESS))
     else:
         reason = with_connection(str(reply.get("reason")), args, addresses.COMMAND_ADDRESS)

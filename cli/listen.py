@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, positive
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
-from shearloop.daemon.running_rig import HEADING
+from shearloop.daemon.running_rig import EMULATED_HEADING
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         for number, (topic, content) in enumerate(received, start=1):
             if number == 1 and _is_emulated(health):
                 # `health` says it in JSON.
-                print(HEADING, file=sys.stderr if args.json else sys.stdout, flush=True)
+                print(EMULATED_HEADING, file=sys.stderr if args.json else sys.stdout, flush=True)
             print(write(topic, content), flush=True)
             if number == args.count:
                 break

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.messaging.publisher import Listener
 
 
-HEADING = f"{EMULATED}: every device was emulated on this computer."
+SUMMARY_HEADING = f"{EMULATED}: every device was emulated on this computer."
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -140,7 +140,7 @@ def _run_config(
         shown = out if args.show or args.emulate or config.recording is not None else None
         # If the daemon ends with its experiment, the summary comes after all that it logs.
         at_end = shown if config.stop_when_done else None
-        summary = RunSummary(None if at_end else shown, emulated, heading=HEADING if config.emulated else "")
+        summary = RunSummary(None if at_end else shown, emulated, heading=SUMMARY_HEADING if config.emulated else "")
         try:
             finished = asyncio.run(run_daemon(config, tuple(listeners), on_ready, summary))
         finally:

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import DaemonConfig
 
 EMULATED: Final = "EMULATED"
-HEADING: Final = f"{EMULATED}: every device of this rig is emulated."
+EMULATED_HEADING: Final = f"{EMULATED}: every device of this rig is emulated."
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,11 +79,11 @@ class Session:
         self.set_tool(None)
         self.reset()
 
-    def prepare(self, before: BeforeFrame) -> Adaptation | Exception | None:
-        """Apply what comes before the next frame: first the tare, then the tool, then the gain.
+    def prepare(self, before: BeforeFrame) -> None:
+        """Apply what comes before the next frame: first the tare, then the tool.
 
-        Return the correction of the gain, if there is one, or why it failed: the frame does not depend on that. Give
-        `before.fingers_moved` to `estimate`, as a part of the frame.
+        Give `before.known_torques` to `adapt` after that, and `before.fingers_moved` to `estimate`, as a part of the
+        frame.
         """
         if before.begins_tare:
             self.tare()
@@ -91,12 +91,6 @@ class Session:
             self.give_up_tare()
         if before.tool is not None:
             self.set_tool(before.tool.diameter)
-        if before.known_torques is None:
-            return None
-        try:
-            return self.adapt(before.known_torques.torque_nm)
-        except Exception as error:  # noqa: BLE001 - it is the result of the step that waits
-            return error
 
     def set_tool(self, tool: Measured | None) -> None:
         """Set the diameter in mm of the held tool, None where unknown."""

@@ -72,7 +72,7 @@ class KnownTorques:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeforeFrame:
-    """What a session has to know before a frame, and the frame does not contain. `Session.prepare` applies it.
+    """What a session has to know before a frame, and the frame does not contain; `Session.prepare` says who applies it.
 
     begins_tare: the next frames are of untouched fingertips and make the idle frame. gives_up_tare: they do not, or not
     any longer. tool: it has changed; None if not. fingers_moved: during a part of the frame's acquisition.

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import structlog
@@ -62,6 +62,13 @@ class ToolHolder(Protocol):
         """Return whether the fingers moved at any time of an interval, as far as is known."""
 
 
+class _AdaptingStep(NamedTuple):
+    """A step that corrects the gain by the torque of a source, and waits for the end."""
+
+    reference: str
+    ended: asyncio.Future[None]
+
+
 @dataclass(slots=True)
 class FingertipTask:
     """The I/O of one session: frames of one fingertip or of several together in, estimates out.
@@ -87,8 +94,8 @@ class FingertipTask:
     _held: Measured | None = None
     # Whether an idle frame was taken without a request, before the gripper has reported that it held nothing.
     _unconfirmed: bool = field(init=False)
-    # The source of the known torque of a correction that waits for the next frame, and its result.
-    _adapting: tuple[str, asyncio.Future[None]] | None = None
+    # The step that waits for a correction of the gain, which the next frame makes.
+    _adapting: _AdaptingStep | None = None
 
     def __post_init__(self) -> None:
         """Begin: a session of the paper's method takes an idle frame without a request."""
@@ -98,13 +105,14 @@ class FingertipTask:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
         now_ns = self.clock.now_ns()
         before = self._before(frames, now_ns)
-        corrected = self.session.prepare(before)
-        if isinstance(corrected, Exception):
-            # The gain is as before, for a replay too.
-            before = replace(before, known_torques=None)
-        self._record(frames, before, now_ns)
-        if corrected is not None:
-            self._end_correction(frames, corrected)
+        self.session.prepare(before)
+        corrected = self._correct_gain()
+        if corrected is None:
+            self._record(frames, before, now_ns)
+        else:
+            known, correction = corrected
+            self._record(frames, replace(before, known_torques=known), now_ns)
+            self.publisher.publish(adapted_message(self.name, frames, known.reference, correction))
         estimate = await estimate_frames(self.session, frames, fingers_moved=before.fingers_moved)
         now_ns = self.clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
@@ -145,7 +153,6 @@ class FingertipTask:
             gives_up_tare=gives_up,
             tool=self._changed_tool(now_ns),
             fingers_moved=self._fingers_moved(frames),
-            known_torques=self._known_torques(),
         )
 
     def _follow_request(self, began_ns: int) -> tuple[bool, bool]:
@@ -197,30 +204,24 @@ class FingertipTask:
         ended_ns = max(2 * frame.t_mid_ns - frame.t_begin_ns for frame in frames)
         return self.gripper.moved_between(min(frame.t_begin_ns for frame in frames), ended_ns)
 
-    def _known_torques(self) -> KnownTorques | None:
-        """Return the torques for the correction of the gain that a step waits for, None without one."""
-        if self._adapting is None or self._adapting[1].done():
-            return None
-        reference, ended = self._adapting
-        try:
-            times_ns, torques_nm = self.loop.torques_of(reference) if self.loop is not None else ([], [])
-            of_grip = torque_at(self.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
-        except Exception as error:  # noqa: BLE001 - it fails the step, and the frames go on
-            ended.set_exception(error)
-            return None
-        return KnownTorques(reference, of_grip)
+    def _correct_gain(self) -> tuple[KnownTorques, Adaptation] | None:
+        """Correct the gain for the step that waits for it, and give it the result.
 
-    def _end_correction(self, frames: tuple[Frame, ...], corrected: Adaptation | Exception) -> None:
-        """Publish a correction of the gain that begins with these frames; give its result to the waiting step."""
-        if self._adapting is None:
-            raise RuntimeError("no step waits for a correction of the gain")
-        reference, ended = self._adapting
-        if isinstance(corrected, Exception):
-            # It fails the step, and the frames go on.
-            ended.set_exception(corrected)
-            return
-        self.publisher.publish(adapted_message(self.name, frames, reference, corrected))
-        ended.set_result(None)
+        Return the known torques and the correction. None without such a step, and where it fails: the gain is then as
+        before, for a replay too.
+        """
+        step = self._adapting
+        if step is None or step.ended.done():
+            return None
+        try:
+            times_ns, torques_nm = self.loop.torques_of(step.reference) if self.loop is not None else ([], [])
+            of_grip = torque_at(self.session.grip_t_s, np.array(times_ns) / 1e9, np.array(torques_nm))
+            correction = self.session.adapt(of_grip)
+        except Exception as error:  # noqa: BLE001 - it fails the step that waits, and the frames go on
+            step.ended.set_exception(error)
+            return None
+        step.ended.set_result(None)
+        return KnownTorques(step.reference, of_grip), correction
 
     @property
     def _refused_frames(self) -> str:
@@ -237,7 +238,7 @@ class FingertipTask:
     async def adapt(self, reference: str) -> None:
         """Correct the gain by this source's torque during this grip; raises ActionError."""
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._adapting = reference, ended
+        self._adapting = _AdaptingStep(reference, ended)
         try:
             async with timeout(_LONGEST_WAIT_S):
                 await ended

@@ -10,7 +10,6 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import (
     TRUSTED,
-    Adaptation,
     BeforeFrame,
     Estimate,
     FrameSeries,
@@ -448,7 +447,7 @@ def test_a_session_settles_with_one_twist_and_adapts_by_the_next(motion_calibrat
     assert correction.factors.mean() == pytest.approx(1.3, abs=0.1)
 
 
-def test_what_comes_before_a_frame_is_applied_tool_first_and_gain_last(motion_calibration):
+def test_a_gain_is_corrected_with_the_tool_that_comes_before_the_frame(motion_calibration):
     whole = twisting(seed=5)
     half = len(whole.t_s) // 2
     sessions = [Session(replace(motion_calibration, tools=LAW)) for _ in range(2)]
@@ -460,8 +459,8 @@ def test_what_comes_before_a_frame_is_applied_tool_first_and_gain_last(motion_ca
     tool = Measured(30.0, 0.5)
     apart.set_tool(tool)
     expected = apart.adapt(known.torque_nm)
-    found = together.prepare(BeforeFrame(tool=HeldTool(tool), known_torques=known))
-    assert isinstance(found, Adaptation)
+    together.prepare(BeforeFrame(tool=HeldTool(tool)))
+    found = together.adapt(known.torque_nm)
     assert (found.correction.factors == expected.correction.factors).all()
     rest = whole.between(half, len(whole.t_s))
     assert follow(together, rest) == follow(apart, rest)
@@ -473,11 +472,11 @@ def test_torques_of_a_grip_that_a_tare_ends_correct_no_gain(motion_calibration):
     whole = twisting(seed=5)
     follow(session, whole.between(0, 60))
     known = KnownTorques("load_cell", np.interp(session.grip_t_s, whole.torque_t_s, whole.torque_nm))
-    failed = session.prepare(BeforeFrame(begins_tare=True, known_torques=known))
-    assert isinstance(failed, CalibrationError)
-    assert "known torques do not match the 0 frames of this grip" in str(failed)
+    session.prepare(BeforeFrame(begins_tare=True))
+    with pytest.raises(CalibrationError, match="known torques do not match the 0 frames of this grip"):
+        session.adapt(known.torque_nm)
     assert session.taring, "the tare does not depend on that"
-    assert session.prepare(BeforeFrame(gives_up_tare=True)) is None
+    session.prepare(BeforeFrame(gives_up_tare=True))
     assert not session.taring
     session.prepare(BeforeFrame(begins_tare=True, gives_up_tare=True))
     assert not session.taring, "the idle frame would be of a held tool"

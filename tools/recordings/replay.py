@@ -424,16 +424,14 @@ class Replay:
         session, number = self._sessions[source], frames[0].seq
         before = self._events.before_frames[source].of(number, self._latest_frame.get(source, -1))
         self._latest_frame[source] = number
+        session.prepare(before)
         known = before.known_torques
         if known is not None and len(known.torque_nm) != len(session.grip_t_s):
             reason = "the recording begins in the middle of the grip, so the correction of its gain is left out"
             structlog.get_logger().warning(reason, source=source, frame=number)
-            before = replace(before, known_torques=None)
-        corrected = session.prepare(before)
-        if isinstance(corrected, Exception):
-            raise corrected
-        if known is not None and corrected is not None:
-            self._publisher.publish(adapted_message(source, frames, known.reference, corrected))
+        elif known is not None:
+            correction = session.adapt(known.torque_nm)
+            self._publisher.publish(adapted_message(source, frames, known.reference, correction))
         estimate = await estimate_frames(session, frames, fingers_moved=before.fingers_moved)
         # The replayed latency is 0; the recording holds the live one.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)

@@ -27,7 +27,7 @@ from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperState, ObjectStatus, fault_of
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import ActionError
-from shearloop.estimation import Estimate, Session, TactileFrame
+from shearloop.estimation import Estimate, Measured, Session, TactileFrame
 from tests.running import running
 
 MS = 1_000_000
@@ -338,6 +338,35 @@ async def test_a_gain_that_no_twist_shows_is_left_with_the_reason():
     with pytest.raises(ActionError, match="right against load_cell: no twist in 0 frames"):
         await adapting
     assert publisher.messages == [("eit.estimate", "right", 1)]
+
+
+async def test_the_gain_is_corrected_after_the_tare_and_the_tool_before_a_frame():
+    applied: list[str] = []
+
+    class Ordered(FakeSession):
+        grip_t_s = np.zeros(0)
+
+        def tare(self) -> None:
+            applied.append("tare")
+
+        def set_tool(self, _tool: Measured | None) -> None:
+            applied.append("tool")
+
+        def adapt(self, _torque_nm: np.ndarray) -> None:
+            applied.append("gain")
+            raise CalibrationError("no twist")
+
+    gripper = resting_gripper()
+    gripper.held_tool, gripper.is_holding = (lambda _: Measured(20.0, 0.5)), False
+    clock = FixedClock()
+    task = estimates("right", RecordingPublisher(), Ordered(), clock, gripper=gripper)
+    task.tare()
+    adapting = asyncio.create_task(task.adapt("load_cell"))
+    await asyncio.sleep(0)
+    await task.process(frame(1, clock.t_ns + 2 * PERIOD_NS))
+    assert applied == ["tare", "tool", "gain"]
+    with pytest.raises(ActionError):
+        await adapting
 
 
 async def test_a_correction_that_crashes_fails_its_step_and_not_the_fingertip():

@@ -4,13 +4,14 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, with_connection
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.callers import caller
-from shearloop.daemon.messaging.deadlines import NEVER_LATE, TYPED_WITHIN_S, boot_ns
+from shearloop.daemon.messaging.deadlines import NEVER_LATE, TYPED_WITHIN_S, LateRequestError, boot_ns, meant_for
 from shearloop.daemon.running_rig import EMULATED, EMULATED_HEADING
 
 if TYPE_CHECKING:
@@ -66,6 +67,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Send one command and print its reply; status 1 if the daemon refused it."""
     request = _request(args)
+    reply = _asked(args, request)
+    if reply.get("idle"):
+        # Nothing moves. Only a stop that names its age ends the daemon, and its first one waited for no clock.
+        with suppress(LateRequestError):
+            reply = _asked(args, request | meant_for(reply, _age_s(args), TYPED_WITHIN_S))
+    return _told(args, reply)
+
+
+def _asked(args: argparse.Namespace, request: dict[str, Any]) -> dict[str, Any]:
+    """Send a request, a `stop` or `status` by the stop socket where that can be; return the reply."""
     reply = None
     on_this_computer = not addresses.needs_keys(args.connect) or stop_client.is_here(args.connect)
     if args.name in ("stop", "status") and args.key is None and on_this_computer:
@@ -77,10 +88,13 @@ def run(args: argparse.Namespace) -> int:
             print(f"shearloop command: {error}; `{args.name}` is sent to the command address instead", file=sys.stderr)
         except TimeoutError:
             # The daemon may have stopped the motion by now. A second `stop` must not end the daemon.
-            request["spare_daemon"] = True
-    if reply is None:
-        reply = _sent(args, request, client_keys(args))
-    return _told(args, reply)
+            request = {**request, "spare_daemon": True}
+    return _sent(args, request, client_keys(args)) if reply is None else reply
+
+
+def _age_s(args: argparse.Namespace) -> float:
+    """Return how long ago the program began. Ctrl-Z or a suspended computer may have held it up."""
+    return float(boot_ns() - args.began_ns) / 1e9
 
 
 def _request(args: argparse.Namespace) -> dict[str, Any]:
@@ -103,7 +117,7 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
     waits there.
     """
     # It imports too much for a `stop` on a busy computer.
-    from shearloop.daemon.messaging.client import meant_for, send_command
+    from shearloop.daemon.messaging.client import send_command
 
     timeout_s = args.timeout
     if timeout_s is None:
@@ -114,9 +128,7 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
         status = send_command(args.connect, {"command": "status"}, status_s, keys)
         if not status.get("ok"):
             return status
-        # Ctrl-Z or a suspended computer may have held this program up.
-        age_s = 0.0 if args.name in NEVER_LATE else (boot_ns() - args.began_ns) / 1e9
-        request |= meant_for(status, age_s, TYPED_WITHIN_S)
+        request |= meant_for(status, 0.0 if args.name in NEVER_LATE else _age_s(args), TYPED_WITHIN_S)
         if args.name == "unlock":
             request |= _acknowledged(status.get("loop", {}))
     return send_command(args.connect, request, timeout_s, keys)
@@ -207,6 +219,9 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
         if reply.get("ended_by_itself"):
             ended = f"{reply['ended_by_itself']!r} had just ended by itself"
             return [f"stop: nothing was moving, because {ended}; after 5 s, a further stop ends the daemon"]
+        if reply.get("idle"):
+            continues = "the daemon continues, because the stop came too late to end it"
+            return [f"stop: nothing was moving; {continues}. Send it again to end the daemon"]
         return [f"stop: stopped {reply['stopped']}" if reply.get("stopped") else "stop: nothing was moving"]
     values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
     return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

@@ -273,7 +273,7 @@ class Commands:
     def _stopped(self, request: Request) -> Reply:
         """Stop a motion or the beginning of one, else the daemon; return what was stopped."""
         # An unknown argument may be a misspelt `spare_daemon`.
-        spare_daemon = bool(request.get("spare_daemon") or request.keys() - {"command", "by", "spare_daemon"})
+        spare_daemon = bool(request.get("spare_daemon") or request.keys() - {"command", "by", "spare_daemon", *_OF_ALL})
         held = self.rig.control_loop.tool.held_or_unknown if self.rig is not None else None
         stopped = None
         if self.rig is not None:
@@ -290,9 +290,19 @@ class Commands:
             return {"stopped": "", "held": held}
         if self.rig is not None and (ended := self.rig.runner.ended_unseen()) is not None:
             return {"stopped": "", "ended_by_itself": ended}
+        if not self._may_end_daemon(request):
+            return {"stopped": "", "idle": True, "daemon": {"instance": self.instance, "now_ns": self.now_ns()}}
         # Nothing moves, so the daemon itself stops, once the reply is sent.
         asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
         return {"ended": True}
+
+    def _may_end_daemon(self, request: Request) -> bool:
+        """Return whether a stop where nothing moves may end the daemon: it is known to be of now, and for this one.
+
+        Another one may have waited on its way, and somebody may work with the daemon since.
+        """
+        for_this_one = request.get("instance", self.instance) == self.instance
+        return for_this_one and type(request.get("until_ns")) is int and self._why_late(request) is None
 
 
 def check_arguments(name: str, request: Request) -> None:

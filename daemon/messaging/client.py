@@ -10,7 +10,7 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, READ_ONLY, has_valid_port, needs_keys
-from shearloop.daemon.messaging.deadlines import why_late
+from shearloop.daemon.messaging.deadlines import TYPED_WITHIN_S
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
 from shearloop.daemon.messaging.stop_client import foreign_reply
@@ -20,10 +20,6 @@ from shearloop.timeouts import timeout
 TopicContent: TypeAlias = tuple[str, dict[str, Any]]
 # A running daemon sends `health` every second.
 QUIET_S = 3.0
-
-
-class LateRequestError(UserError):
-    """The operator asked for it too long ago: it was not sent."""
 
 
 class UnansweredError(UserError):
@@ -168,7 +164,8 @@ async def ask(
             in_doubt = may_act and sent
             late = ". One that runs may have carried it out: see `shearloop command status`" if in_doubt else ""
             if content.get("command") == "stop":
-                late = ". Nothing says that the arm stands: use the emergency stop"
+                late = ". Nothing says that the arm stands: use the emergency stop. If the stop still arrives, it "
+                late += f"stops what moves then; {_end_sentence(content)}"
             kind = UnansweredError if in_doubt else UserError
             raise kind(
                 f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
@@ -178,22 +175,11 @@ async def ask(
             raise foreign_reply(address, error) from error
 
 
-def meant_for(status: Mapping[str, Any], age_s: float, within_s: float) -> dict[str, str | int]:
-    """Return what binds a request to the daemon that gave this reply to `status`, and to the time that is left.
-
-    A daemon that begins later refuses it. This one refuses it later than `within_s` after the operator's act, which was
-    at most `age_s` ago when the reply came. Raises LateRequestError if no time is left. Nothing binds it to a daemon
-    that does not say which one it is, or what its clock shows.
-    """
-    if (reason := why_late(age_s, within_s)) is not None:
-        raise LateRequestError(reason)
-    daemon = status.get("daemon", {})
-    bound: dict[str, str | int] = {}
-    if isinstance(instance := daemon.get("instance"), str):
-        bound["instance"] = instance
-    if isinstance(now_ns := daemon.get("now_ns"), int):
-        bound["until_ns"] = now_ns + round((within_s - age_s) * 1e9)
-    return bound
+def _end_sentence(stop: Mapping[str, Any]) -> str:
+    """Return whether a stop that nobody answered can still end a daemon in which nothing runs."""
+    if "until_ns" in stop:
+        return f"a daemon in which nothing runs ends only if it arrives within {TYPED_WITHIN_S:g} s of the command"
+    return "it ends no daemon"
 
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:

@@ -29,8 +29,8 @@ from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.callers import caller
-from shearloop.daemon.messaging.client import LateRequestError, UnansweredError, ask, connect, meant_for
-from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S, NEVER_LATE, why_late
+from shearloop.daemon.messaging.client import UnansweredError, ask, connect
+from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S, NEVER_LATE, LateRequestError, meant_for, why_late
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to_stop_socket

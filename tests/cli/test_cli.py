@@ -799,6 +799,33 @@ def test_the_daemon_imports_no_heavy_modules():
     assert found.stdout.strip() == "[]"
 
 
+@pytest.mark.parametrize("in_time", [True, False])
+def test_a_stop_ends_an_idle_daemon_by_a_second_request_that_names_its_age(in_time, monkeypatch, capsys):
+    asked: list[dict[str, Any]] = []
+
+    def answers(_address: str, content: dict[str, Any], _timeout_s: float) -> dict[str, Any]:
+        asked.append(content)
+        if "until_ns" in content:
+            return {"ok": True, "ended": True}
+        if not in_time:
+            # The program was stopped by Ctrl-Z.
+            monkeypatch.setattr("shearloop.cli.command.boot_ns", lambda: boot_ns() + 6 * 10**9)
+        return {"ok": True, "stopped": "", "idle": True, "daemon": {"instance": "a1", "now_ns": 0}}
+
+    monkeypatch.setattr("shearloop.daemon.messaging.stop_client.send_to_stop_socket", answers)
+    assert main(["command", "stop", "--connect", "ipc:///idle"]) == 0
+    assert "until_ns" not in asked[0], "a stop does not wait for the daemon's clock"
+    assert "spare_daemon" not in asked[0]
+    if in_time:
+        assert asked[1]["instance"] == "a1"
+        assert 0 < asked[1]["until_ns"] <= 5 * 10**9
+    assert len(asked) == 1 + in_time
+    said = capsys.readouterr().out
+    assert said.startswith("stop: nothing was moving; ")
+    assert ("the daemon has ended" in said) is in_time
+    assert ("Send it again to end the daemon" in said) is not in_time
+
+
 def test_a_stop_imports_little():
     """On a busy computer, imports are most of the time that `shearloop command stop` takes."""
     says = """if True:

@@ -31,6 +31,7 @@ from tests.fixtures.daemons import (
     collector,
     deadline,
     emulated_kit,
+    of_now,
     recording,
     robot_at,
     running_daemon,
@@ -105,7 +106,7 @@ async def test_tare_status_and_stop_commands(config, tmp_path):
             status = await ask(daemon, "status")
             assert status["tasks"]["right"]["connected"]
             assert status["tasks"]["commands"]["errors"] == {"tare refused": 1}
-        assert (await ask(daemon, "stop"))["ok"]
+        assert (await ask(daemon, "stop", **of_now()))["ok"]
         await daemon.ending.wait()
 
 
@@ -179,8 +180,8 @@ async def test_the_daemon_survives_a_closed_log(config, tmp_path):
         assert await asyncio.to_thread(os.read, reader, 1), "it runs, and says so"
         os.close(reader)
         # The log has a line for a refused tare.
-        for command, carried_out in (("status", True), ("tare", False), ("stop", True)):
-            reply = await asyncio.to_thread(send_command, address, {"command": command}, DEADLINE_S)
+        for command, given, carried_out in (("status", {}, True), ("tare", {}, False), ("stop", of_now(), True)):
+            reply = await asyncio.to_thread(send_command, address, {"command": command, **given}, DEADLINE_S)
             assert reply["ok"] is carried_out
         assert await daemon.wait() == 0
 

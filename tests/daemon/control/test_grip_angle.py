@@ -308,7 +308,7 @@ async def second_stop(rig: Rig) -> dict[str, Any]:
     """Return the reply to a stop while nothing runs."""
     runner = SimpleNamespace(stop=lambda **_: None, ended_unseen=lambda: None)
     subject, ending = SimpleNamespace(control_loop=rig.control_loop, runner=runner), asyncio.Event()
-    return await Commands(subject, None, None, None, ending, None).handlers()["stop"]({})
+    return await Commands(subject, None, None, None, ending, None, now_ns=lambda: 0).handlers()["stop"]({"until_ns": 1})
 
 
 @pytest.mark.parametrize("step", [{"do": "release"}, {**GRIP, "force_n": 100.0}])

@@ -31,6 +31,7 @@ from shearloop.drivers.robotiq.models import MODELS
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
+from tests.fixtures.daemons import of_now
 
 WAIT = {"do": "wait", "wait_s": 60}
 
@@ -601,7 +602,7 @@ async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
         commands = Commands(rig, SimpleNamespace(), None, SimpleNamespace(), ends, None)
         stop_command = commands.handlers()["stop"]
         for _ in range(2):
-            reply = await stop_command({})
+            reply = await stop_command(of_now())
         assert reply["held"] == "its fingers hold something 30.0 mm wide, with an unknown force"
         assert cell.control_loop.safety.waiting is not None, (
             "the next start waits for `unlock`, as after the page's stop"
@@ -611,7 +612,7 @@ async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
         assert "ended" not in await stop_command({"command": "stop", "spare_deamon": True}), (
             "a misspelt word ends nothing"
         )
-        assert await stop_command({}) == {"ended": True, "process": os.getpid()}
+        assert await stop_command(of_now()) == {"ended": True, "process": os.getpid()}
 
 
 async def test_a_stop_just_after_an_experiment_has_ended_by_itself_does_not_end_the_daemon():
@@ -619,9 +620,9 @@ async def test_a_stop_just_after_an_experiment_has_ended_by_itself_does_not_end_
     async with driven({"do": "wait", "wait_s": 0.1}) as cell:
         await cell.until_done()
         stop_command = commands_of(cell)["stop"]
-        assert await stop_command({}) == {"stopped": "", "ended_by_itself": "test", "process": os.getpid()}
+        assert await stop_command(of_now()) == {"stopped": "", "ended_by_itself": "test", "process": os.getpid()}
         await cell.cycles(round(UNSEEN_S * 1e9 / CYCLE_NS) + 1)
-        assert await stop_command({}) == {"ended": True, "process": os.getpid()}
+        assert await stop_command(of_now()) == {"ended": True, "process": os.getpid()}
 
 
 @pytest.mark.parametrize("acknowledged", [False, True])
@@ -633,4 +634,4 @@ async def test_a_second_stop_of_an_operator_ends_the_daemon_at_once(acknowledged
         await cell.cycles(5)
         if acknowledged:
             cell.control_loop.acknowledge()
-        assert await stop_command({}) == {"ended": True, "process": os.getpid()}
+        assert await stop_command(of_now()) == {"ended": True, "process": os.getpid()}

@@ -16,7 +16,7 @@ from shearloop.cli.command import DAEMON_COMMANDS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.messaging.callers import UNKNOWN, caller, caller_of
-from shearloop.daemon.messaging.client import LateRequestError, ask, meant_for, receive_messages, send_command
+from shearloop.daemon.messaging.client import ask, receive_messages, send_command
 from shearloop.daemon.messaging.command_server import (
     EXPERIMENTS,
     STATUS,
@@ -25,6 +25,7 @@ from shearloop.daemon.messaging.command_server import (
     CommandServer,
     RequestExecutor,
 )
+from shearloop.daemon.messaging.deadlines import LateRequestError, meant_for
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
@@ -123,6 +124,22 @@ async def test_what_is_asked_for_too_long_ago_is_refused_unless_it_lets_nothing_
     with pytest.raises(CommandRefusedError) as refused:
         await commands.handlers()[name](request)
     assert ("it came 0.1 s too late" in str(refused.value)) is (name != "pause")
+
+
+async def test_only_a_stop_that_is_known_to_be_fresh_ends_a_daemon_in_which_nothing_moves():
+    """One that timed out at its client may arrive when somebody else works with the daemon."""
+    now_ns, ends = 7_000_000_000, asyncio.Event()
+    commands = Commands(None, None, None, None, ends, None, now_ns=lambda: now_ns)
+    stop = commands.handlers()[STOP]
+    first = await stop({"command": STOP, "by": "ann"})
+    assert (first["stopped"], first["idle"]) == ("", True), "its age is not known"
+    fresh = meant_for(first, 0.5, 2.0)
+    for other in ({"instance": "of the earlier one"}, {"until_ns": now_ns - 1}, {"until_ns": True}, {"until_ns": "9"}):
+        assert (await stop({**fresh, **other}))["idle"]
+    assert "ended" not in await stop({**fresh, "spare_daemon": True})
+    assert (await stop(fresh))["ended"]
+    async with asyncio.timeout(10):
+        await ends.wait()
 
 
 async def test_nothing_is_sent_that_was_asked_for_too_long_ago():

@@ -20,7 +20,7 @@ from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.supervisor import resident_memory_mb
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import CommandReply
-from tests.fixtures.daemons import running_daemon
+from tests.fixtures.daemons import of_now, running_daemon
 from tests.fixtures.robots import write_filled_in
 
 FRAMES = REQUESTS = 50_000
@@ -121,7 +121,7 @@ async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, tmp_p
         assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
         assert resident_memory_mb() - before_mb < MAX_GROWTH_MB
         assert len(asyncio.all_tasks()) <= tasks + command_server.MAX_CONCURRENT
-        status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
+        status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop", **of_now()})]]))
         assert status == {True: 1}, "stop is heard in the middle of it all"
         await daemon.ending.wait()
     os.close(port)

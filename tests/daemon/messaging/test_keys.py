@@ -24,7 +24,7 @@ from shearloop.daemon.messaging.keys import (
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.errors import UserError
-from tests.fixtures.daemons import DEADLINE_S, running_daemon
+from tests.fixtures.daemons import DEADLINE_S, of_now, running_daemon
 
 NETWORK = "tcp://0.0.0.0:*"
 # How long somebody is waited for who is not to be heard.
@@ -126,7 +126,7 @@ async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, con
         anyone = partial(asyncio.to_thread, send_to_stop_socket, commands)
         for name in ("start", "resume", "unlock", "tare", "pause"):
             assert "this command needs a key" in (await anyone({"command": name}, DEADLINE_S))["reason"]
-        assert (await anyone({"command": "stop"}, DEADLINE_S))["ok"]
+        assert (await anyone({"command": "stop", **of_now()}, DEADLINE_S))["ok"]
         await daemon.ending.wait()
 
 

@@ -38,6 +38,23 @@ LAYOUT = """() => {
 }"""
 
 
+# Counts the answers to requests to a path, each once the page has dealt with it: a task runs after the promises.
+COUNT_ANSWERS = """(path) => {
+  window.answers = 0;
+  const real = window.fetch;
+  window.fetch = async (url, options) => {
+    const response = await real(url, options);
+    const json = response.json.bind(response);
+    response.json = async () => {
+      const content = await json();
+      if (String(url).startsWith(path)) setTimeout(() => { window.answers += 1; });
+      return content;
+    };
+    return response;
+  };
+}"""
+
+
 class Killable:
     """A process that a test kills and starts again."""
 
@@ -153,6 +170,13 @@ class Browsed:
             self.page.reload()
         self.until("#link-state", "● live")
         return self.page
+
+    @contextmanager
+    def answered(self, path: str) -> Iterator[None]:
+        """At the end of the block, wait until the page has dealt with the answer to a request of it to this path."""
+        self.page.evaluate(COUNT_ANSWERS, path)
+        yield
+        self.page.wait_for_function("() => window.answers > 0")
 
     def layout(self) -> dict[str, Any]:
         """Return where things are once the page is scrolled to its end."""

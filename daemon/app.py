@@ -184,13 +184,14 @@ class Daemon:
     def _report(self, clock: Clock, answered: Answered) -> None:
         """Publish a command and its answer."""
         name, request, refusal = answered
-        subject = request.get("experiment") or request.get("source")
+        subject, request_id = request.get("experiment") or request.get("source"), request.get("request_id")
         answer = DaemonCommand(
             source="daemon",
             t_mono_ns=clock.now_ns(),
             command=name,
             subject=printable(subject)[:MAX_ERROR_LENGTH] if isinstance(subject, str) else "",
             by=caller_of(request),
+            request_id=printable(request_id)[:MAX_ERROR_LENGTH] if isinstance(request_id, str) else "",
             accepted=refusal is None,
             reason=refusal or "",
         )

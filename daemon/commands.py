@@ -39,8 +39,9 @@ ARGUMENTS: Mapping[str, Mapping[str, type]] = {
     "unlock": {"confirmed": bool, "digest": str, "stop": int},
     "release": {"confirmed": bool, "ask": bool, "digest": str},
 }
-# Arguments that each of them may have: the process that it is meant for, and the time until which it may begin.
-_OF_ALL: Mapping[str, type] = {"instance": str, "until_ns": int}
+# Arguments that each of them may have: the process that it is meant for, the time until which it may begin, and the
+# sender's own name of the request.
+_OF_ALL: Mapping[str, type] = {"instance": str, "until_ns": int, "request_id": str}
 _KINDS: Mapping[type, str] = {bool: "true or false", int: "a whole number", str: "text"}
 STOP_DELAY_S = 0.05
 _ANOTHER_DAEMON = "it is meant for an earlier daemon, and this one has begun since; look at the rig, and send it again"

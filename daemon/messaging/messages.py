@@ -276,6 +276,7 @@ class DaemonCommand(Message):
     command: str = column("", "name of the command")
     subject: str = column("", "file of the experiment, or the sensor; empty without one")
     by: str = column("", "the sender, as the client says; it is not checked")
+    request_id: str = column("", "the sender's own name of this request; empty without one")
     accepted: bool = column("", "whether it was carried out")
     reason: str = column("", "why it was refused, in sentences; empty when it was accepted")
 

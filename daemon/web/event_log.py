@@ -15,7 +15,10 @@ ACTIVE = frozenset({"running", "paused", "held"})
 
 @dataclass(slots=True)
 class EventLog:
-    """The latest events of a daemon, each a map of number, timestamp (Unix s), kind and text."""
+    """The latest events of a daemon, each a map of number, timestamp (Unix s), kind and text.
+
+    A command whose sender has named its request also has `request_id` and `reason`.
+    """
 
     events: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
     # The latest message of each topic with events.
@@ -31,9 +34,11 @@ class EventLog:
         if topic != DaemonEnd.topic:
             self._before.pop(DaemonEnd.topic, None)
         self._before[topic] = content
+        # By these two a page finds the end of its own request.
+        own = {key: content[key] for key in ("request_id", "reason") if content.get("request_id")}
         for kind, text in _EVENTS_OF[topic](before, content):
             self.events.append(
-                {"number": number, "timestamp": content["timestamp"], "kind": kind, "text": f"{text}{earlier}"}
+                {"number": number, "timestamp": content["timestamp"], "kind": kind, "text": f"{text}{earlier}", **own}
             )
 
     def after(self, number: int) -> list[dict[str, Any]]:

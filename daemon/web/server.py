@@ -59,8 +59,9 @@ ASKED = ("start", "release")
 WORDS = {"start": ("experiment", "digest"), "unlock": ("digest", "stop"), "release": ("digest",)}
 # Those that are carried out at once, unless the daemon's refusal has a question; the digest answers it.
 ASKED_IF_NEEDED = ("unlock",)
-# The word of every command: the latest moment that the page had when it was clicked on.
-MOMENT = "moment"
+# The words of every command: the latest moment that the page had when it was clicked on, and the page's own name of the
+# request.
+MOMENT, REQUEST_ID = "moment", "request_id"
 # The parts of a question, which a refusal has as well where another one is to be answered.
 QUESTION = ("question", "plan", "digest")
 # The parts of a daemon's reply that a page shows.
@@ -382,7 +383,7 @@ class _Page:
         age_s = self._age(name, request.query.get(MOMENT, ""))
         if isinstance(age_s, web.Response):
             return age_s
-        words = (MOMENT, *WORDS.get(name, ()))
+        words = (MOMENT, REQUEST_ID, *WORDS.get(name, ()))
         if unknown := [word for word in request.query if word not in words]:
             return self._refuse(400, f"`{name}` has no word {unknown[0][:40]!r} here; there are {', '.join(words)}")
         own_words = {word: text for word, text in request.query.items() if text and word != MOMENT}

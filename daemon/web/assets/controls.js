@@ -78,11 +78,11 @@ export class Controls {
     this.received = received;
     // An unlock acknowledges the stop that is shown, and no other.
     this.stopShown = loop?.stop;
-    this.watch(loop);
+    this.watch();
   }
 
-  // A command without an answer, once nothing answers: the page says so until an answer, or the rig's state, says more.
-  watch(loop) {
+  // A command without an answer, once nothing answers: the page says so until the daemon tells how it ended.
+  watch() {
     const { sent, link } = this;
     if (!sent) return;
     if (link.state() !== "live") {
@@ -90,10 +90,12 @@ export class Controls {
       return;
     }
     if (!sent.inDoubt) return;
-    const known = outcomeByState(link, sent, loop);
-    if (!known) return;
+    // Another person's start, or his stop, says nothing of this request.
+    const told = link.events.findLast((event) => event.request_id === sent.id);
+    if (!told) return;
     this.sent = null;
-    this.tell(known.sentence, known.kind);
+    if (told.kind === "command") this.tell(`${sent.name}: done`);
+    else this.tell(`${sent.name} was refused: ${told.reason}`, "bad");
   }
 
   doubt(reason) {
@@ -182,11 +184,11 @@ export class Controls {
   async command(name, event, digest = "", picked = byId("experiment").value) {
     const click = this.begin();
     this.picked = picked;
-    const words = new URLSearchParams({ moment: this.link.momentOf(event) });
+    const words = new URLSearchParams({ moment: this.link.momentOf(event), request_id: newId() });
     if (digest) words.set("digest", digest);
     if (name === "start" && picked) words.set("experiment", picked);
     if (name === "unlock" && Number.isInteger(this.stopShown)) words.set("stop", this.stopShown);
-    this.sent = { name, at: event.timeStamp / 1000, run: this.link.get("loop.state")?.content.run, inDoubt: false };
+    this.sent = { name, id: words.get("request_id"), inDoubt: false };
     this.tell(`${name} …`, "", true);
     const reply = await this.ask(`commands/${name}?${words}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
     if (click !== this.clicks) return;
@@ -225,16 +227,8 @@ export class Controls {
   }
 }
 
-// What the rig's state shows of a command without an answer; undefined while it shows nothing.
-function outcomeByState(link, { name, at, run }, loop) {
-  const answered = link.get("daemon.command");
-  if (answered?.at >= at && answered.content.command === name) {
-    const { accepted, reason } = answered.content;
-    return accepted ? { sentence: `${name}: done` } : { sentence: `${name} was refused: ${reason}`, kind: "bad" };
-  }
-  if (name === "start" && loop && ACTIVE.has(loop.phase) && loop.run !== run) return { sentence: "start: done" };
-  return undefined;
-}
+// A name for a request that no other request has.
+function newId() { return [...crypto.getRandomValues(new Uint32Array(2))].map((part) => part.toString(36)).join("-"); }
 
 // Why each command cannot work now. What the page cannot know, the daemon refuses.
 function refusals(link) {

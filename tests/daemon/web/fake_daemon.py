@@ -27,6 +27,7 @@ from shearloop.daemon.messaging.refusals import Refusals
 # Estimates and heatmaps come twice a second, all else ten times.
 PUMP_S, SLOW_TURNS = 0.1, 5
 SLOW = ("eit.estimate", "eit.heatmap")
+RARE = ("end", "command")
 CAUSE = "the torque estimate is not valid: right says nothing. Wait for the next valid estimate."
 REASONS = (
     f"{CAUSE} a device's state is out of date: the gripper last reported its state 0.6 s ago. It goes on by itself. "
@@ -75,7 +76,7 @@ def made(given: Mapping[str, Any]) -> Message:
 def said(folder: Path) -> list[Message]:
     """Return what is to be said now: all MESSAGES with their changes, without those that are changed to nothing.
 
-    `end` is said only where it is changed.
+    RARE ones are said only where they are changed.
     """
     changed = json.loads((folder / "changed").read_text())["messages"]
     now_ns = Clock().now_ns()
@@ -84,7 +85,7 @@ def said(folder: Path) -> list[Message]:
     return [
         made({"t_mono_ns": now_ns, **values, **changed.get(name, {})})
         for name, values in given.items()
-        if changed.get(name, {}) is not None and (name != "end" or name in changed)
+        if changed.get(name, {}) is not None and (name not in RARE or name in changed)
     ]
 
 

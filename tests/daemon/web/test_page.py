@@ -9,7 +9,7 @@ from playwright.sync_api import Route
 from shearloop.daemon.messaging.messages import TOPICS, units
 from shearloop.daemon.web.message_store import conductivity_profile
 from shearloop.estimation.session import FINGERS_MOVED
-from tests.daemon.web.fake_daemon import CAUSE, MESSAGES, REASONS
+from tests.daemon.web.fake_daemon import CAUSE, MESSAGES, RARE, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
 
@@ -215,7 +215,7 @@ def test_before_the_first_run_the_large_figure_is_of_a_source_that_gives_a_torqu
 
 
 def test_a_replay_is_drawn_at_its_own_times(browsed):
-    browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES if name != "end"})
+    browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES if name not in RARE})
     browsed.open()
     for chart in ("#torque-chart", "#shear-chart"):
         browsed.page.wait_for_function(COLOURED, arg=chart)

@@ -1,9 +1,10 @@
 """The page in a browser: its buttons do what they say, are in reach, and say so when nobody answers."""
 
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
-from playwright.sync_api import Page
+from playwright.sync_api import Page, Route
 
 from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S
 from tests.daemon.web.fake_daemon import CAUSE, MESSAGES, PLAN, REASONS
@@ -210,14 +211,24 @@ def test_a_click_on_a_page_that_stands_still_is_not_carried_out_late(browsed):
     assert browsed.daemon.asked == []
 
 
-def test_the_state_tells_how_a_start_without_an_answer_ended(browsed):
-    page = begin_a_start(browsed)
-    browsed.page.route("**/commands/start?*", lambda route: route.abort())
+@pytest.mark.parametrize(("reason", "said"), [("", "start: done"), ("it is late", "start was refused: it is late")])
+def test_the_daemon_tells_how_a_start_without_an_answer_ended(browsed, reason, said):
+    page, asked = begin_a_start(browsed), []
+
+    def lose(route: Route) -> None:
+        asked.append(parse_qs(urlsplit(route.request.url).query)["request_id"][0])
+        route.abort()
+
+    browsed.page.route("**/commands/start?*", lose)
     page.click("#confirm")
     browsed.until("#answer", "START NOT CONFIRMED: the viewer on the rig's computer does not answer")
     browsed.page.unroute("**/commands/start?*")
-    browsed.daemon.say(loop={"phase": "running", "run": MESSAGES["loop"]["run"] + 1})
-    browsed.until("#answer", "start: done")
+    # Somebody else starts it, which says nothing of this start.
+    browsed.daemon.say(loop={"phase": "running", "run": MESSAGES["loop"]["run"] + 1}, command={})
+    browsed.until("#events", "start hold.yaml, by ben@desk, shearloop command")
+    assert "START NOT CONFIRMED" in browsed.text("#answer")
+    browsed.daemon.say(command={"request_id": asked[0], "accepted": not reason, "reason": reason})
+    browsed.until("#answer", said)
     browsed.complaints.clear()
 
 

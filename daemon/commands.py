@@ -116,7 +116,7 @@ class Commands:
             if name != STOP and request.get("instance", self.instance) != self.instance:
                 raise CommandRefusedError(_ANOTHER_DAEMON)
             if name not in NEVER_LATE:
-                _refuse_if(self._why_late(request))
+                _refuse_if(self._why_expired(request))
             reply = await handler(request)
             refusal = None
         except CommandRefusedError as error:
@@ -130,13 +130,21 @@ class Commands:
                 self.report(Answered(name, request, refusal))
         return reply
 
-    def _why_late(self, request: Request) -> str | None:
-        """Return why it is too late to begin what a request asks for, or None; one without `until_ns` is never late."""
+    def _why_expired(self, request: Request, since_ns: int = 0, delay: str = "", cure: str = "") -> str | None:
+        """Return why it is too late to begin what a request asks for, or None; one without `until_ns` never expires.
+
+        `delay` is what was waited for since the request came in time at `since_ns`, and `cure` is against that.
+        """
         now_ns = self.now_ns()
         late_s = (now_ns - request.get("until_ns", now_ns)) / 1e9
         if late_s <= 0.0:
             return None
-        return f"it came {late_s:.1f} s too late to be what the operator wants now; look at the rig, and send it again"
+        reason = f"it came {late_s:.1f} s too late to be what the operator wants now"
+        if delay:
+            reason = (
+                f"{delay} took {(now_ns - since_ns) / 1e9:.1f} s, and the request had expired {late_s:.1f} s before"
+            )
+        return f"{reason}; {cure}look at the rig, and send it again"
 
     async def _experiments(self, _request: Request) -> Reply:
         """Return the experiments that `start` may name, and the configured one, which it runs without a name.
@@ -173,8 +181,8 @@ class Commands:
             if request.get("ask"):
                 question = await rig.start_question(Path(path))
                 return dict(question.facts)
-            why_late = partial(self._why_late, request)
-            _refuse_if(await rig.start(Path(path), request.get("digest"), why_late))
+            why_expired = partial(self._why_expired, request, self.now_ns())
+            _refuse_if(await rig.start(Path(path), request.get("digest"), why_expired))
         except QuestionChangedError as error:
             raise CommandRefusedError(str(error), **error.question.facts) from error
         except InvalidExperimentError as error:
@@ -303,7 +311,7 @@ class Commands:
         Another one may have waited on its way, and somebody may work with the daemon since.
         """
         for_this_one = request.get("instance", self.instance) == self.instance
-        return for_this_one and type(request.get("until_ns")) is int and self._why_late(request) is None
+        return for_this_one and type(request.get("until_ns")) is int and self._why_expired(request) is None
 
 
 def check_arguments(name: str, request: Request) -> None:

@@ -1,7 +1,7 @@
 """The rig: builds robot, gripper and control loop from the configuration."""
 
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment, check_experiment
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.logs import LinkReporter
+from shearloop.daemon.messaging.deadlines import WhyExpired, never_expired
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
 from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
@@ -51,6 +52,8 @@ LOOP_KEYS = (
     *("phase", "run", "experiment", "step", "steps", "step_name", "activity", "progress"),
     *("stop", "cause", "faults", "reasons"),
 )
+# The cure of a start that expires while its file is read.
+_SLOW_FILE = "copy the file to a local drive, or end what keeps this computer busy; then "
 
 
 def make_gripper_client(config: GripperConfig, patience: float = 1.0) -> RobotiqClient:
@@ -247,24 +250,22 @@ class Rig:
     def _start_under_way(self) -> str | None:
         return f"{self.starting} is being started; wait until it has begun, or stop it" if self.starting else None
 
-    async def start(
-        self, path: Path, digest: str | None = None, why_late: Callable[[], str | None] = lambda: None
-    ) -> str | None:
+    async def start(self, path: Path, digest: str | None = None, why_expired: WhyExpired = never_expired) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file.
 
         `digest` is of the question that a person has confirmed, if one was asked; raises QuestionChangedError where
-        another one would be asked now. `why_late` says, once the file is read, whether it is too late to begin.
+        another one would be asked now. `why_expired` is asked after each wait: a slow drive makes the request too old.
         """
         # While something moves, no file is read.
         if (reason := self.start_refusal()) is not None:
             return reason
         self.starting = path.name
         try:
-            return await self._start(path, digest, why_late)
+            return await self._start(path, digest, why_expired)
         finally:
             self.starting = ""
 
-    async def _start(self, path: Path, digest: str | None, why_late: Callable[[], str | None]) -> str | None:
+    async def _start(self, path: Path, digest: str | None, why_expired: WhyExpired) -> str | None:
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
         if digest is not None and digest != (question := self._question_of(experiment)).digest:
@@ -273,12 +274,12 @@ class Rig:
                 "something was stopped or run"
             )
             raise QuestionChangedError(f"{path}: {changed}; look at the plan again", question)
-        if (reason := why_late()) is not None:
+        if (reason := why_expired("reading its file", _SLOW_FILE)) is not None:
             return reason
         try:
             if self.memory is not None and (reason := await self.memory.begins(experiment.file.name)) is not None:
                 return reason
-            reason = await self.runner.start(experiment.file, stops_before, why_late)
+            reason = await self.runner.start(experiment.file, stops_before, why_expired)
         finally:
             if self.memory is not None:
                 self.memory.starting = ""

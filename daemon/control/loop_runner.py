@@ -1,6 +1,6 @@
 """The task that runs the control loop: it takes robot states, sends commands and publishes, 125 times a second."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 
 import structlog
@@ -22,6 +22,7 @@ from shearloop.daemon.control.state_publisher import StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.straight_moves import StraightMoves
 from shearloop.daemon.control.wrench import WrenchMean, publish_every
+from shearloop.daemon.messaging.deadlines import WhyExpired, never_expired
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import error_text
 from shearloop.daemon.torques import WRENCH, Tareable, TorqueSample
@@ -192,12 +193,12 @@ class ControlLoopRunner:
         return None
 
     async def start(
-        self, file: ExperimentFile, stops_before: int | None = None, why_late: Callable[[], str | None] = lambda: None
+        self, file: ExperimentFile, stops_before: int | None = None, why_expired: WhyExpired = never_expired
     ) -> str | None:
         """Begin an experiment; return None, or why it cannot begin.
 
-        `stops_before` is the `stop_count` at the request, if the file was read since; `why_late` says whether the
-        request has become too old.
+        `stops_before` is the `stop_count` at the request, if the file was read since. `why_expired` says whether the
+        request has become too old once the arm is enabled.
         """
         if self._closed:
             return ENDING
@@ -206,7 +207,7 @@ class ControlLoopRunner:
         # The control loop refuses while an experiment runs or a stop waits for the operator; a stopped arm must not be
         # enabled on the way.
         if self._stop_count == stops_before and self._control_loop.operator.start_refusal() is None:
-            refusal = await self._enable() or why_late()
+            refusal = await self._enable() or why_expired("enabling the arm", "")
         if self._stop_count != stops_before:
             if not self._closed:
                 self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))

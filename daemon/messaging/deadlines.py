@@ -5,8 +5,8 @@ act, and the request carries the reading back. The time since that reading is at
 """
 
 import time
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final, TypeAlias
 
 from shearloop.errors import UserError
 
@@ -15,10 +15,16 @@ CLICK_WITHIN_S: Final = 2.0
 TYPED_WITHIN_S: Final = 5.0
 # They let nothing move: they are never too late.
 NEVER_LATE: Final = ("status", "stop", "pause")
+# Says why a request has become too old while something was waited for, or None. It takes what that was, and its cure.
+WhyExpired: TypeAlias = Callable[[str, str], str | None]
 
 
 class LateRequestError(UserError):
     """The operator asked for it too long ago: it was not sent."""
+
+
+def never_expired(_delay: str, _cure: str) -> None:
+    """Return that a request has not become too old: it names no time."""
 
 
 def boot_ns() -> int:
@@ -26,7 +32,7 @@ def boot_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-def why_late(age_s: float, within_s: float) -> str | None:
+def why_too_old(age_s: float, within_s: float) -> str | None:
     """Return why a request is not carried out at this age of the operator's act, or None."""
     if age_s <= within_s:
         return None
@@ -43,7 +49,7 @@ def meant_for(status: Mapping[str, Any], age_s: float, within_s: float) -> dict[
     at most `age_s` ago when the reply came. Raises LateRequestError if no time is left. Nothing binds it to a daemon
     that does not say which one it is, or what its clock shows.
     """
-    if (reason := why_late(age_s, within_s)) is not None:
+    if (reason := why_too_old(age_s, within_s)) is not None:
         raise LateRequestError(reason)
     daemon = status.get("daemon", {})
     bound: dict[str, str | int] = {}

@@ -30,7 +30,7 @@ from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.callers import caller
 from shearloop.daemon.messaging.client import UnansweredError, ask, connect
-from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S, NEVER_LATE, LateRequestError, meant_for, why_late
+from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S, NEVER_LATE, LateRequestError, meant_for, why_too_old
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to_stop_socket
@@ -405,7 +405,7 @@ class _Page:
         if name in NEVER_LATE:
             return lambda: 0.0
         try:
-            reason = why_late(self._moments.age_s(moment), CLICK_WITHIN_S)
+            reason = why_too_old(self._moments.age_s(moment), CLICK_WITHIN_S)
         except UnknownMomentError:
             return self._refuse(400, "the page does not say when it was clicked on; look at the rig, and click again")
         if reason is not None:

@@ -21,6 +21,7 @@ from shearloop.daemon.control.known_tool import AT_REST
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.experiment_files import ExperimentFiles, read_experiment
 from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
+from shearloop.daemon.messaging.deadlines import WhyExpired
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.errors import UserError
@@ -237,7 +238,7 @@ class Runner:
     def motion(self) -> str | None:
         return self.refusal
 
-    async def start(self, file: Any, stops_before: int, _why_late: Callable[[], str | None]) -> None:
+    async def start(self, file: Any, stops_before: int, _why_expired: WhyExpired) -> None:
         self.started.append((file.name, stops_before))
 
 
@@ -322,7 +323,10 @@ async def test_a_start_whose_file_comes_too_late_begins_nothing(folder, slow_dri
     await asyncio.to_thread(slow_drive.asked.wait)
     now_ns = 3_500_000_000
     slow_drive.answers.set()
-    with pytest.raises(CommandRefusedError, match=r"it came 1\.5 s too late to be what the operator wants now"):
+    said = (
+        r"reading its file took 3\.5 s, and the request had expired 1\.5 s before; copy the file to a local drive, or"
+    )
+    with pytest.raises(CommandRefusedError, match=said):
         await starting
     assert runner.started == []
     assert (await commands.handlers()["start"]({**request, "until_ns": now_ns}))["run"] == 1

@@ -16,7 +16,7 @@ from shearloop.daemon.control.loop_runner import ControlLoopRunner
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
+from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, WristSpeed
 from shearloop.drivers.ur.poses import along_tool
 from shearloop.errors import ActionError
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven, experiment, no_tick
@@ -215,6 +215,25 @@ async def test_a_stop_during_the_start_of_an_experiment_counts(how):
         await cell.cycles(10)
         assert await starting == "it was stopped during its start"
         assert cell.control_loop.experiment is None
+
+
+async def test_a_request_that_expires_while_the_arm_is_enabled_begins_nothing():
+    async with driven() as cell:
+        asked: list[str] = []
+
+        def why_expired(delay: str, _cure: str) -> str:
+            assert any(isinstance(command, Enable) for command in cell.robot.commands), "only then it is known"
+            asked.append(delay)
+            return "it is too late"
+
+        starting = asyncio.create_task(cell.runner.start(experiment(TWIST), why_expired=why_expired))
+        while not starting.done():
+            await cell.cycles(1)
+        assert starting.result() == "it is too late"
+        assert asked == ["enabling the arm"]
+        assert cell.control_loop.experiment is None
+        await cell.cycles(10)
+        assert cell.state.motion == "idle"
 
 
 async def test_a_daemon_that_ends_starts_and_unlocks_nothing():

@@ -59,7 +59,8 @@ def run(args: argparse.Namespace) -> int:
         # A script may answer for emulated devices.
         allows = config.emulated or sys.stdin.isatty()
         operator = Operator(terminal.answer, terminal.say, order, allows)
-        report, page = commission(config, args.config, args.out, operator, counts, args.stages)
+        with operator.word.watched():
+            report, page = commission(config, args.config, args.out, operator, counts, args.stages)
         sentences = [f"{label}{args.out} and {page} are written."]
         settings = open_settings(config)
         if settings is not None:

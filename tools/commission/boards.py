@@ -98,7 +98,7 @@ def _clocks(
     """Return the lines on the clocks, with a tool in the grip that the operator presses."""
     context.operator.act("Put the tool on the load cell's lever, between the open fingers", put_between(context))
     with ExitStack() as opened:
-        gripper = opened.enter_context(context.rig.gripper()) if context.config.gripper is not None else None
+        gripper = opened.enter_context(context.gripper()) if context.config.gripper is not None else None
         if gripper is not None:
             context.operator.allow(
                 f"the fingers close onto the tool at {FINGERS_MM_PER_S:g} mm/s with at most {GRIP_N:g} N, and open "

@@ -1,6 +1,7 @@
 """The devices, settings and questions that every stage of a commissioning uses."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -12,6 +13,7 @@ from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
 from shearloop.tools.commission.arrivals import Clock
 from shearloop.tools.commission.bounds import bounded
+from shearloop.tools.commission.fingers import AskedGripper, Gripper
 from shearloop.tools.commission.limits import TimeLimits, limits_for
 from shearloop.tools.commission.mover import Mover
 from shearloop.tools.commission.observer import Observer, Seen
@@ -92,7 +94,18 @@ class Context:
         if self._mover is None:
             about = self._confirmed or self.observer.latest()
             self._mover = self.opened.enter_context(self.rig.mover(bounded(self.settings, about.wrist_rad)))
+            self._mover.before_motion = self._before_motion
         return self._mover
+
+    @contextmanager
+    def gripper(self) -> Iterator[Gripper]:
+        """Open the configured gripper."""
+        with self.rig.gripper() as gripper:
+            yield AskedGripper(gripper, self._before_motion)
+
+    def _before_motion(self) -> None:
+        # Each stage has its own operator.
+        self.operator.allow_again_after_standstill()
 
     def confirm(self) -> Seen:
         """Have the operator confirm the pose about which motions are allowed, once; return a sample of it.

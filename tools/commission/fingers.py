@@ -1,6 +1,8 @@
 """The gripper of a commissioning: one motion after the other, each to its end."""
 
 import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -80,6 +82,33 @@ class ConnectedGripper(Opened):
     async def _move(self, command: GripperCommand) -> GripperState:
         async with self._gripper.halted_if_interrupted():
             return await self._gripper.finish(await self._gripper.move(command))
+
+
+@dataclass(frozen=True, slots=True)
+class AskedGripper:
+    """A gripper that calls `before_motion` before each motion of its fingers."""
+
+    gripper: Gripper
+    before_motion: Callable[[], None]
+
+    @property
+    def model(self) -> GripperModel:
+        """The gripper's model."""
+        return self.gripper.model
+
+    def activate(self, *, operator_confirmed: bool = False) -> None:
+        """Return once the gripper is active."""
+        self.before_motion()
+        self.gripper.activate(operator_confirmed=operator_confirmed)
+
+    def poll(self) -> GripperState:
+        """Return the gripper's state as the daemon polls it."""
+        return self.gripper.poll()
+
+    def move(self, command: GripperCommand) -> GripperState:
+        """Move the fingers, and return the state at their target or on an object."""
+        self.before_motion()
+        return self.gripper.move(command)
 
 
 def open_fingers(gripper: Gripper, force_n: float = GENTLE_N) -> None:

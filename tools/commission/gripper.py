@@ -36,7 +36,7 @@ def measure(context: Context) -> Measured:
         f"stroke of {model.stroke_mm:g} mm, at a speed of their own of up to {model.speed_mm_per_s[1]:g} mm/s; nothing "
         "is between them"
     )
-    with context.rig.gripper() as gripper:
+    with context.gripper() as gripper:
         lines = [_activation(context, gripper), _exchanges(context, gripper)]
         width_line, supplies = judge_widths(_gauges(context, gripper), config)
         return Measured([*lines, width_line, *_objects(context, gripper)], supplies)

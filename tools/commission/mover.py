@@ -8,8 +8,10 @@ import subprocess
 import sys
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, Final
 
+from shearloop.daemon.messaging.deadlines import boot_ns
 from shearloop.drivers.ur.client import WORKER
 from shearloop.drivers.ur.messages import encode
 from shearloop.drivers.ur.settings import UrSettings
@@ -18,6 +20,8 @@ from shearloop.tools.commission.arrivals import REAL_CLOCK, Arrivals, Clock
 from shearloop.tools.commission.opened import Opened
 
 Event = dict[str, Any]
+# Requests that move the arm.
+MOTIONS: Final = ("turn", "swing", "line")
 # A controller unlocks a protective stop after 5 s; a worker starts and connects within some seconds more.
 READY_WITHIN_S: Final = 30.0
 _AGAIN_S: Final = 1.0
@@ -35,9 +39,17 @@ class MoveRefusedError(UserError):
 class Mover(ABC):
     """Drives the robot by requests, which `shearloop.tools.commission.mover_process` carries out."""
 
-    def __init__(self, settings: UrSettings, clock: Clock = REAL_CLOCK) -> None:
-        """`settings` have the limits of every motion; no process is started yet."""
+    def __init__(
+        self, settings: UrSettings, clock: Clock = REAL_CLOCK, now_boot_ns: Callable[[], int] = boot_ns
+    ) -> None:
+        """`settings` have the limits of every motion; no process is started yet.
+
+        `now_boot_ns` goes on while the computer is suspended: with it, a motion names the time of its request.
+        """
         self.settings = settings
+        # Called before each request that moves the arm.
+        self.before_motion: Callable[[], None] = lambda: None
+        self._now_boot_ns = now_boot_ns
         # The module of the worker.
         self.worker = WORKER
         self.events: Arrivals[Event] = Arrivals(lambda event: int(event["t_ns"]), clock)
@@ -70,8 +82,10 @@ class Mover(ABC):
 
     def request(self, do: str, **arguments: object) -> int:
         """Send a request without waiting for its end; return its time."""
+        if do in MOTIONS:
+            self.before_motion()
         asked_ns = self.events.clock.now_ns()
-        self.send({"do": do, **arguments})
+        self.send({"do": do, "asked_boot_ns": self._now_boot_ns(), **arguments})
         return asked_ns
 
     def ended(self, asked_ns: int, within_s: float = READY_WITHIN_S) -> str:
@@ -104,9 +118,9 @@ class Mover(ABC):
 class MoverProcess(Mover, Opened):
     """Drives the robot through a process of its own, which can die; a context, which ends the process at its end."""
 
-    def __init__(self, settings: UrSettings) -> None:
+    def __init__(self, settings: UrSettings, now_boot_ns: Callable[[], int] = boot_ns) -> None:
         """Take the settings; nothing is started yet."""
-        super().__init__(settings)
+        super().__init__(settings, now_boot_ns=now_boot_ns)
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
         self._worker_pid = 0

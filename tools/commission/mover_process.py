@@ -17,6 +17,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from shearloop.daemon.messaging.deadlines import boot_ns
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.ur.client import WORKER, UrRobot
 from shearloop.drivers.ur.messages import (
@@ -34,7 +35,8 @@ from shearloop.drivers.ur.poses import tool_axis
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.tools.commission.bounds import LARGEST_M
 from shearloop.tools.commission.failing_worker import CLOSE_RTDE, NO_DEADLINES
-from shearloop.tools.commission.mover import FAILING_WORKER
+from shearloop.tools.commission.given_word import LONGEST_STANDSTILL_S
+from shearloop.tools.commission.mover import FAILING_WORKER, MOTIONS
 
 # The causes of a stop that a request may name: signals to the worker, then to this process.
 CAUSES: Final[Mapping[str, tuple[signal.Signals | None, signal.Signals | None]]] = {
@@ -87,9 +89,12 @@ class Surroundings(Protocol):
 class Driver:
     """Carries out one request after the other."""
 
-    def __init__(self, settings: UrSettings, robot: DrivenRobot, around: Surroundings) -> None:
-        """`settings` have the accelerations of all motions."""
+    def __init__(
+        self, settings: UrSettings, robot: DrivenRobot, around: Surroundings, now_boot_ns: Callable[[], int] = boot_ns
+    ) -> None:
+        """`settings` have the accelerations of all motions; `now_boot_ns` is the clock of a request's time."""
         self._settings, self._robot, self._around = settings, robot, around
+        self._now_boot_ns = now_boot_ns
 
     @property
     def _acceleration_rad_per_s2(self) -> float:
@@ -108,6 +113,8 @@ class Driver:
         while self._robot.state is None:
             await self._robot.next_state()
         cause = request.get("cause", "")
+        if request["do"] in MOTIONS and (reason := self._why_too_old(request)):
+            return CommandReply(refusal=reason)
         match request["do"]:
             case "unlock":
                 return await self._robot.send(Unlock())
@@ -119,6 +126,16 @@ class Driver:
                 return await self._line(request["metres"], request["m_per_s"], cause)
             case _:
                 return await self._stop()
+
+    def _why_too_old(self, request: Mapping[str, Any]) -> str:
+        """Return why a motion is not begun: this process, or the computer, stood still since its request."""
+        age_s = (self._now_boot_ns() - request.get("asked_boot_ns", self._now_boot_ns())) / 1e9
+        if age_s <= LONGEST_STANDSTILL_S:
+            return ""
+        return (
+            f"It was asked for {age_s:.0f} s ago, and this computer stood still since then. Look at the rig, and run "
+            "the commissioning again."
+        )
 
     async def _stop(self) -> CommandReply:
         """Stop, and return once the arm rests."""

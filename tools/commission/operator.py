@@ -2,10 +2,11 @@
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from shearloop.errors import UserError
+from shearloop.tools.commission.given_word import GivenWord
 
 # The word that allows one motion or one action of the operator.
 WORD: Final = "move"
@@ -49,13 +50,14 @@ class Operator:
     """Asks and tells; `answer` returns the line that is typed after a question.
 
     `play` is of devices that are emulated for this commissioning, and None for others. `allows`: who answers may allow
-    a motion, as a person at a terminal and any script for emulated devices.
+    a motion, as a person at a terminal and any script for emulated devices. `word` is the one that was typed last.
     """
 
     answer: Callable[[str], str]
     say: Callable[[str], None]
     play: Play | None = None
     allows: bool = False
+    word: GivenWord = field(default_factory=GivenWord)
 
     def ask(self, question: str, played: Played | None = None) -> str:
         """Return the answer, without blanks around it."""
@@ -93,6 +95,16 @@ class Operator:
             )
         question = f"MOTION: {motion}. Keep clear, one hand at the emergency stop. Type `{WORD}` to allow it:"
         self._confirm(question, WORD, f"not allowed: {motion}")
+        self.word.give(motion)
+
+    def allow_again_after_standstill(self) -> None:
+        """Return at once, or once the last motion is allowed again where this program stood still since its word."""
+        if (stood_s := self.word.standstill_s()) > 0.0 and self.word.motion:
+            self.say(
+                f"This program stood still for {stood_s:.0f} s since `{WORD}` was typed, by Ctrl-Z or on a suspended "
+                "computer. Look at the rig."
+            )
+            Operator.allow(self, self.word.motion)
 
     def accept(self, warning: str) -> None:
         """Show a warning, a whole sentence, and return once the operator goes on; raises DeclinedError."""

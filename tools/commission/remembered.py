@@ -95,7 +95,7 @@ class LeftRobot:
         if not held:
             return self.operator
         asked = self.operator
-        return HoldingOperator(asked.answer, asked.say, asked.play, asked.allows, held)
+        return HoldingOperator(asked.answer, asked.say, asked.play, asked.allows, asked.word, held)
 
     def _keep(self, state: Remembered) -> None:
         try:

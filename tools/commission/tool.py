@@ -109,7 +109,7 @@ def _grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
         f"{GRIP_N:g} N, and stay closed; a gripper that lost its power, as in stage 4, opens and closes once before"
     )
     diameters_mm = []
-    with context.rig.gripper() as gripper:
+    with context.gripper() as gripper:
         gripper.activate()
         open_fingers(gripper, GRIP_N)
         for sensor in tactile:

@@ -153,7 +153,7 @@ class SimulatedMover(Mover):
     """The requests' coroutines and their robot; each can be killed or stopped."""
 
     def __init__(self, rig: "SimulatedRig", settings: UrSettings) -> None:
-        super().__init__(settings, rig.clock)
+        super().__init__(settings, rig.clock, rig.now_ns)
         self._rig = rig
         self._robot: SimulatedRobot | None = None
         self._driver: Driver | None = None
@@ -163,7 +163,7 @@ class SimulatedMover(Mover):
     def start(self) -> None:
         settings = for_watchdog_alone(self.settings) if self.worker == WATCHDOG_WORKER else self.settings
         self._robot = SimulatedRobot(self._rig, settings)
-        self._driver, self._daemon_runs = Driver(settings, self._robot, self), True
+        self._driver, self._daemon_runs = Driver(settings, self._robot, self, self._rig.now_ns), True
 
     def kill(self) -> None:
         if self._running is not None:

@@ -11,6 +11,7 @@ import subprocess
 import pytest
 
 from shearloop.drivers.defaults import RTDE_PORT
+from shearloop.drivers.ur.messages import CommandReply
 from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.errors import UserError
 from shearloop.tools.commission import mover
@@ -95,6 +96,37 @@ def test_a_request_that_fails_is_reported(capsys):
     assert (event, facts["do"]) == ("ended", "turn")
     assert "rad_per_s" in str(facts["refusal"])
     assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_motion_is_asked_about_before_its_request_and_no_other_request_is():
+    done: list[object] = []
+
+    class Noted(MoverProcess):
+        def send(self, request: dict[str, object]) -> None:
+            done.append((request["do"], request["asked_boot_ns"]))
+
+    noted = Noted(DELIVERED, lambda: len(done))
+    noted.before_motion = lambda: done.append("asked")
+    for do in ("unlock", "turn", "line", "swing", "stop"):
+        noted.request(do)
+    assert done == [("unlock", 0), "asked", ("turn", 2), "asked", ("line", 4), "asked", ("swing", 6), ("stop", 7)]
+
+
+@pytest.mark.parametrize(("do", "refused"), [("turn", True), ("swing", True), ("line", True), ("unlock", False)])
+def test_no_motion_begins_that_was_asked_for_before_a_standstill(do, refused):
+    """Its request was on the way while the computer was suspended."""
+    here, sent = Here(), []
+
+    async def send(command: object) -> CommandReply:
+        sent.append(command)
+        return CommandReply(refusal="enough")
+
+    here.send = send
+    driver = Driver(DELIVERED, here, here, lambda: 47_000_000_000)
+    asyncio.run(driver.handle({"do": do, "asked_boot_ns": 6_000_000_000}))
+    ((_, facts),) = here.reports
+    assert ("asked for 41 s ago" in facts["refusal"]) is refused
+    assert bool(sent) is not refused
 
 
 def test_a_worker_without_deadlines_writes_none_from_its_signal_on(monkeypatch):

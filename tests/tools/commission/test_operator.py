@@ -7,6 +7,8 @@ import pytest
 
 from shearloop.errors import UserError
 from shearloop.tools.commission.context import Context, Counts
+from shearloop.tools.commission.fingers import AskedGripper
+from shearloop.tools.commission.given_word import LONGEST_STANDSTILL_S, GivenWord
 from shearloop.tools.commission.operator import DONE, WORD, DeclinedError, Operator, Played
 
 QUESTIONS = {WORD: Operator.allow, DONE: Operator.act}
@@ -36,6 +38,35 @@ def test_no_other_word_allows(word, answers, asked):
     with pytest.raises(DeclinedError, match="is kept"):
         QUESTIONS[word](operator, "the wrist turns")
     assert len(answers) - len(left) == asked
+
+
+@pytest.mark.parametrize(("stood_s", "asks"), [(LONGEST_STANDSTILL_S + 1.0, True), (LONGEST_STANDSTILL_S - 1.0, False)])
+def test_a_word_from_before_a_standstill_is_asked_for_again(stood_s, asks):
+    """A laptop is closed after the word, and opened when somebody stands at the robot."""
+    now_ns, questions, said = 0, [], []
+
+    def answer(question: str) -> str:
+        questions.append(question)
+        return WORD
+
+    operator = Operator(answer, said.append, allows=True, word=GivenWord(lambda: now_ns))
+    with operator.word.watched():
+        operator.allow_again_after_standstill()
+        operator.allow("the wrist turns")
+        # Of the many motions after one word, each comes long after it.
+        for _ in range(20):
+            now_ns += round(0.5e9 * LONGEST_STANDSTILL_S)
+            operator.word.beat()
+        operator.allow_again_after_standstill()
+        assert len(questions) == 1
+        now_ns += round(1e9 * stood_s)
+        fingers = AskedGripper(SimpleNamespace(move=lambda _: "moved"), operator.allow_again_after_standstill)
+        assert [fingers.move(None) for _ in range(2)] == ["moved"] * 2
+    assert len(questions) == 1 + asks
+    assert len(said) == asks
+    if asks:
+        assert questions[1] == questions[0]
+        assert said[0].startswith("This program stood still for 6 s since `move` was typed")
 
 
 def test_emulated_hands_do_nothing_before_the_word():

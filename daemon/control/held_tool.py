@@ -112,8 +112,8 @@ class HeldTool:
         self._before_closing = _KnownGrip(self.grip, self.is_earlier, self.another)
         self._tightens = not isinstance(action, Opening) and self._has_grip()
         # While the fingers open, their last width on the tool shows whether they have let the tool go.
-        width_mm = self.grip.width_mm if self._tightens or isinstance(action, Opening) else None
-        self.grip = Grip(origin_rad, force_n, width_mm)
+        keeps_width = self._tightens or isinstance(action, Opening)
+        self.grip = Grip(origin_rad, force_n, self.grip.width_mm if keeps_width else None)
         self.is_earlier = False
         self.another = ""
 

@@ -5,12 +5,17 @@ from dataclasses import dataclass
 
 from shearloop.daemon.control.experiment import Experiment
 from shearloop.daemon.control.experiment_check import not_measured, too_noisy
-from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, TareStep
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
 from shearloop.daemon.control.known_tool import UNTURNED_RAD, KnownTool, known_at_start
 from shearloop.daemon.control.safety import SafetyMonitor
-from shearloop.daemon.control.step_motions import first_gripper_step, first_motion_before_grip, first_turn_before_tare
+from shearloop.daemon.control.step_motions import (
+    first_grip,
+    first_gripper_step,
+    first_motion_before_grip,
+    first_turn_before_tare,
+)
 from shearloop.daemon.torques import CONFIRM_TARE, SensorLoad, TorqueSource, load_of
 
 # The way out for a clamped tool, also without a known zero.
@@ -94,10 +99,11 @@ class OperatorView:
 
     def _load(self) -> SensorLoad | None:
         """Return a sensor's load beyond the usual drift, or None."""
-        # Empty fingers of the gripper do not load a fingertip, so its torque is drift.
-        empty = self.tool.has_gripper and self.inputs.gripper is not None
         # A skin without a radius is no source of torques, but has a load.
-        uncounted = {name for name, one in self.sources.items() if one.from_robot or (empty and one.warm_up_s)}
+        uncounted = {name for name, source in self.sources.items() if source.from_robot}
+        if self.tool.has_gripper and self.inputs.gripper is not None:
+            # Empty fingers of the gripper do not load a fingertip, so its torque is drift.
+            uncounted.update(name for name, source in self.sources.items() if source.warm_up_s)
         # Of a sensor that is lost, the last torque says nothing of the present.
         uncounted.update(self.inputs.lost)
         return load_of(latest for name, latest in self.inputs.torques.items() if name not in uncounted)
@@ -168,7 +174,8 @@ class OperatorView:
         first = first_gripper_step(file)
         if first is None or not self.tool.activates or not self.tool.may_hold():
             return ""
-        return f" Before step {first[0]} the gripper is activated: its fingers open and close once, and a tool drops."
+        number, _ = first
+        return f" Before step {number} the gripper is activated: its fingers open and close once, and a tool drops."
 
     def held_note(self, file: ExperimentFile) -> str:
         """Return a sentence on the held tool, for the question before a start; empty if no step turns it."""
@@ -176,10 +183,10 @@ class OperatorView:
             turned = self._clamped_turn()
             from_zero = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
             return f" At present the clamped tool's angle continues: {turned}; {from_zero}." if turned else ""
-        held, unknown, first = self.tool.held, self.tool.unknown_grip, first_gripper_step(file)
+        held, unknown = self.tool.held, self.tool.unknown_grip
         # A `grip` only closes tighter on the held tool, so the angle stays unknown.
-        turns = first_motion_before_grip(file) is not None
-        turns = turns or bool(unknown and first is not None and isinstance(first[1], GripStep))
+        tightens_unknown = bool(unknown) and first_grip(file) is not None
+        turns = tightens_unknown or first_motion_before_grip(file) is not None
         if held is None or not turns:
             return ""
         angle = f" The grip is not known ({unknown}): its angle counts from the start." if unknown else ""
@@ -230,23 +237,24 @@ class OperatorView:
 
     def _why_no_activation(self, file: ExperimentFile) -> str | None:
         """Return why a `grip` must not activate the gripper, or None: an activation would drop the held tool."""
-        first, held = first_gripper_step(file), self.tool.may_still_hold
-        if first is None or not isinstance(first[1], GripStep) or not self.tool.activates or held is None:
+        first, held = first_grip(file), self.tool.may_still_hold
+        if first is None or not self.tool.activates or held is None:
             return None
+        number, _ = first
         if self.inputs.gripper is not None and self.inputs.gripper.too_hot:
-            return f"{held}; the gripper is too hot for step {first[0]} (grip): let it cool down"
+            return f"{held}; the gripper is too hot for step {number} (grip): let it cool down"
         return (
-            f"{held}; step {first[0]} (grip) would activate the gripper first, which opens its fingers, and the tool "
+            f"{held}; step {number} (grip) would activate the gripper first, which opens its fingers, and the tool "
             "drops: take it out with `shearloop command release --yes`, or put a `release` before it"
         )
 
     def _why_no_grip(self, file: ExperimentFile) -> str | None:
         """Return why the first `grip` would open the fingers on the held tool, or None."""
-        first, gripper, held = first_gripper_step(file), self.inputs.gripper, self.tool.held
+        first, gripper, held = first_grip(file), self.inputs.gripper, self.tool.held
         if first is None or gripper is None or held is None:
             return None
         number, step = first
-        if not isinstance(step, GripStep) or step.width_mm <= gripper.width_mm:
+        if step.width_mm <= gripper.width_mm:
             return None
         return (
             f"{held}; step {number} (grip) to {step.width_mm:g} mm would open them and drop it: put a `release` before "

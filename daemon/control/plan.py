@@ -302,12 +302,17 @@ def _words(step: Step, turn: Turn, gripper: GripperModel | None) -> str:
 
 def _twist(step: steps.TwistStep, turn: Turn) -> str:
     angles_rad = step.angles_rad
-    count, low_rad, high_rad = len(angles_rad), min(angles_rad), max(angles_rad)
-    places = _angle(angles_rad[0]) if count == 1 else f"{count} angles from {_angle(low_rad)} to {_angle(high_rad)}"
+    count = len(angles_rad)
+    if count == 1:
+        places = _angle(angles_rad[0])
+    else:
+        places = f"{count} angles from {_angle(min(angles_rad))} to {_angle(max(angles_rad))}"
     since = "of wrist 3" if step.absolute else "from the grip"
     way = "in a direction that is not known" if turn.way_unknown else turn.direction
     turns_once = count == step.repeats == 1 and not step.return_to_start
-    first = f", {'' if turns_once else 'first '}{way}" if way is not None else ""
+    first = ""
+    if way is not None:
+        first = f", {way}" if turns_once else f", first {way}"
     then = f"holds each for {step.hold_s:g} s" + (" and returns" if step.return_to_start else "")
     times = f", {step.repeats} times" if step.repeats > 1 else ""
     return f"twists to {places} {since}{first}, {then}{times}, at {step.speed_rad_per_s:g} rad/s"

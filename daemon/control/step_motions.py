@@ -69,6 +69,14 @@ def first_gripper_step(file: ExperimentFile) -> tuple[int, GripperStep] | None:
     return next(((n, step) for n, step in enumerate(file.steps, 1) if isinstance(step, GripperStep)), None)
 
 
+def first_grip(file: ExperimentFile) -> tuple[int, GripStep] | None:
+    """Return the first step that moves the fingers, with its number from 1, if it is a `grip`; else None."""
+    match first_gripper_step(file):
+        case (number, GripStep() as step):
+            return number, step
+    return None
+
+
 def opens_to(step: ReleaseStep, gripper: GripperModel | None) -> str:
     """Return how far a step opens the fingers of a gripper, in words; as it is written where none is known.
 

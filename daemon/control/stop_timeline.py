@@ -84,8 +84,9 @@ class StopTimeline:
             self._stands_ns = (self._stands_ns or measured_ns) if robot.rests else None
         answered = self._sent_ns is not None or stop.refusal != ""
         awaits_reply = not answered and now_ns - self._decided_ns <= REPLY_NS
-        known = self._stands_ns is not None and not awaits_reply
-        return self.end() if known or now_ns - self._decided_ns > LONGEST_NS else None
+        is_known = self._stands_ns is not None and not awaits_reply
+        is_given_up = now_ns - self._decided_ns > LONGEST_NS
+        return self.end() if is_known or is_given_up else None
 
     def end(self) -> LoopStop | None:
         """Return the known times of a stop after the wait for its standstill."""

@@ -161,6 +161,13 @@ class Reversal(NamedTuple):
         )
 
 
+class _EarlierTurn(NamedTuple):
+    """The number of an earlier step, and a direction in which it turned or may have turned."""
+
+    number: int
+    direction: Direction
+
+
 class Reversals(NamedTuple):
     """The steps that turn the tool back in its grip, and the numbers, from 1, of those that may."""
 
@@ -179,19 +186,19 @@ def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
     # The possible directions of the last turn, each with its latest step.
     last: dict[Direction, int] = {}
     # The last turn that loaded the tool further.
-    loaded: tuple[int, Direction] | None = None
+    loaded: _EarlierTurn | None = None
     for number, (step, turn) in enumerate(zip(file.steps, turns(file, start), strict=True), 1):
         if isinstance(step, ReleaseStep):
             last, loaded = {}, None
         way = turn.direction
-        against: list[tuple[int, Direction]] = []
+        against: list[_EarlierTurn] = []
         for other, before in last.items():
             if turn.begins - STILL - {other}:
-                against.append((before, other))
+                against.append(_EarlierTurn(before, other))
         if way is not None and len(last) == 1 and against:
-            known.append(Reversal(number, way, *against[0]))
-        elif way is not None and loaded is not None and way == turn.loads and way != loaded[1]:
-            known.append(Reversal(number, way, *loaded))
+            known.append(Reversal(number, way, against[0].number, against[0].direction))
+        elif way is not None and loaded is not None and way == turn.loads and way != loaded.direction:
+            known.append(Reversal(number, way, loaded.number, loaded.direction))
         elif against:
             possible.append(number)
         if None not in turn.leaves:
@@ -199,5 +206,5 @@ def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
         last |= {left: number for left in turn.leaves if left is not None}
         left_way = only_way(turn.leaves)
         if left_way is not None and left_way == turn.loads:
-            loaded = number, left_way
+            loaded = _EarlierTurn(number, left_way)
     return Reversals(tuple(known), tuple(possible))

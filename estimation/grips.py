@@ -137,17 +137,18 @@ def _find_openings(channels: FloatArray, is_loaded: BoolArray) -> list[int]:
     if not len(held):
         return []
     sudden = _LARGE_STEP * float(np.quantile(held, 0.99))
-    return [
-        # The next grip is compared with its own idle frames, so it gets enough of them.
-        max(start, min((start + stop) // 2, stop - _MIN_RELEASED))
-        for start, stop in _runs(is_idle)
-        if span.start < start
-        and stop < span.stop
-        and stop - start >= _MIN_OPEN
-        and min(moved[start], moved[stop]) > sudden
-        and not is_loaded[start:stop].any()
-        and not (is_loaded[start - 1] and is_loaded[stop])
-    ]
+
+    def is_opening(start: int, stop: int) -> bool:
+        between_twists = span.start < start and stop < span.stop
+        if not between_twists or stop - start < _MIN_OPEN:
+            return False
+        if is_loaded[start:stop].any() or (is_loaded[start - 1] and is_loaded[stop]):
+            return False
+        return bool(min(moved[start], moved[stop]) > sudden)
+
+    openings = [(start, stop) for start, stop in _runs(is_idle) if is_opening(start, stop)]
+    # The next grip is compared with its own idle frames, so it gets enough of them.
+    return [max(start, min((start + stop) // 2, stop - _MIN_RELEASED)) for start, stop in openings]
 
 
 def _runs(chosen: BoolArray) -> Iterator[tuple[int, int]]:

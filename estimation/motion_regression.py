@@ -65,12 +65,10 @@ class TemporalFeatures(Motion):
         from shearloop.estimation.motion_fit import MEMORY_EDGES, main_directions
 
         windows = _NESTED_DIRECTION_FRAMES if nested else _DIRECTION_FRAMES
-        directions = [
-            np.vstack(
-                [main_directions([part[:, layer] for part in parts], validator.noise, frames) for frames in windows]
-            )
-            for layer, validator in enumerate(validators)
-        ]
+        directions = []
+        for layer, validator in enumerate(validators):
+            of_side = [part[:, layer] for part in parts]
+            directions.append(np.vstack([main_directions(of_side, validator.noise, frames) for frames in windows]))
         return cls(np.array(directions), np.array(MEMORY_EDGES), uses_position=True)
 
     @property

@@ -130,7 +130,12 @@ class LinkReporter:
     def on_link_event(self, event: LinkEvent) -> None:
         """Log a return as info, a loss as warning, a repeated loss as debug."""
         log = structlog.get_logger().bind(device=self.device)
-        (log.info if event.up else log.debug if event.repeated else log.warning)(event.sentence)
+        if event.up:
+            log.info(event.sentence)
+        elif event.repeated:
+            log.debug(event.sentence)
+        else:
+            log.warning(event.sentence)
         if self.loop is not None:
             self.loop.on_link(self.device, event.sentence, up=event.up)
 

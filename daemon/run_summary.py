@@ -323,8 +323,10 @@ def recovered_s(t_s: FloatArray, torque_nm: FloatArray, set_nm: float) -> float:
     """Return when a torque (n,) comes into its band for STAYS_S at least; infinite if it does not."""
     outside = np.flatnonzero(~_in_band(torque_nm, set_nm))
     came, left_s = np.append(0, outside + 1), np.append(t_s[outside], t_s[-1:])
-    stays = [t_s[at] for at, end_s in zip(came, left_s, strict=False) if at < len(t_s) and end_s - t_s[at] >= STAYS_S]
-    return float(stays[0]) if stays else np.inf
+    for at, end_s in zip(came, left_s, strict=False):
+        if at < len(t_s) and end_s - t_s[at] >= STAYS_S:
+            return float(t_s[at])
+    return np.inf
 
 
 def _counted(run: _Run) -> Iterator[str]:

@@ -121,12 +121,15 @@ def slope_below(points: Iterable[tuple[int, int]]) -> float:
     points = list(points)
     hull: list[tuple[int, int]] = []
     for n, t in points:
-        # Drop a corner on or above the chord past it.
-        while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (n - hull[-2][0]) >= (t - hull[-2][1]) * (
-            hull[-1][0] - hull[-2][0]
-        ):
+        while len(hull) > 1 and not _is_below_chord(hull[-1], hull[-2], (n, t)):
             hull.pop()
         hull.append((n, t))
     middle = sum(n for n, _ in points) / len(points)
-    (n0, t0), (n1, t1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
+    (n0, t0), (n1, t1) = next((start, end) for start, end in pairwise(hull) if end[0] >= middle)
     return (t1 - t0) / (n1 - n0)
+
+
+def _is_below_chord(point: tuple[int, int], start: tuple[int, int], end: tuple[int, int]) -> bool:
+    """Return whether a point lies below the line between two others, on both sides of it."""
+    (n, t), (n0, t0), (n1, t1) = point, start, end
+    return (t - t0) * (n1 - n0) < (t1 - t0) * (n - n0)

@@ -192,8 +192,9 @@ class LoadParser(LineParser[LoadSample]):
 
     def _is_reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
         # By the arrival: before a late line others may be missing. No interval counts as shorter than a period.
-        elapsed_s = max(after[1] - before[1], self._period_ns) * 1e-9
-        return abs(after[0] - before[0]) <= SLEW_NM_PER_S * elapsed_s
+        (before_nm, before_ns), (after_nm, after_ns) = before, after
+        elapsed_s = max(after_ns - before_ns, self._period_ns) * 1e-9
+        return abs(after_nm - before_nm) <= SLEW_NM_PER_S * elapsed_s
 
 
 class LoadCell(serial_sensor.SerialSensor[LoadSample]):

@@ -117,7 +117,7 @@ async def _contact(gripper: "RobotiqGripper") -> int | None:
     """Close and open; return the position of the contact, or None without one."""
     from shearloop.drivers.robotiq.messages import GripperCommand, ObjectStatus
 
-    stroke_mm, slowest_mm_s = gripper.model.stroke_mm, gripper.model.speed_mm_per_s[0]
+    stroke_mm, slowest_mm_s = gripper.model.stroke_mm, gripper.model.speed_mm_per_s.low
     # Beyond the fingers' stop: reaching the target is never a contact.
     closed = await gripper.finish(await gripper.move(GripperCommand(-stroke_mm, slowest_mm_s)))
     await gripper.finish(await gripper.move(GripperCommand(stroke_mm)))

@@ -189,7 +189,7 @@ def _outside_gripper(step: Step, model: GripperModel | None) -> str:
             beyond = model.why_beyond(step.width_mm, step.speed_mm_per_s, step.force_n)
             return f"asks for {beyond}" if beyond else ""
         case ReleaseStep() if model is not None and "width_mm" in step.model_fields_set:
-            beyond = model.why_beyond(step.width_mm, model.speed_mm_per_s[0], model.force_n[0])
+            beyond = model.why_beyond(step.width_mm, model.speed_mm_per_s.low, model.force_n.low)
             return f"asks for {beyond}" if beyond else ""
     return ""
 

@@ -59,8 +59,8 @@ Angles = Annotated[
 
 # What some gripper has; the configured model's own ranges are checked with its configuration.
 FingerWidth = Annotated[float, Field(ge=0, le=LARGEST_STROKE_MM)]
-FingerSpeed = Annotated[float, Field(ge=SPEEDS_MM_PER_S[0], le=SPEEDS_MM_PER_S[1])]
-FingerForce = Annotated[float, Field(ge=FORCES_N[0], le=FORCES_N[1])]
+FingerSpeed = Annotated[float, Field(ge=SPEEDS_MM_PER_S.low, le=SPEEDS_MM_PER_S.high)]
+FingerForce = Annotated[float, Field(ge=FORCES_N.low, le=FORCES_N.high)]
 
 
 class ExperimentLimits(ConfigModel):
@@ -112,7 +112,7 @@ class Opening(GripStep):
 
 def opening(width_mm: float, speed_mm_per_s: float) -> Opening:
     """Return the step that opens the gripper, with its least force."""
-    least_n = FORCES_N[0]
+    least_n = FORCES_N.low
     content = {"width_mm": width_mm, "speed_mm_per_s": speed_mm_per_s, "force_n": least_n, "expect_object": False}
     return Opening.model_validate({"do": "grip", **content})
 

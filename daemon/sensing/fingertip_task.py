@@ -193,7 +193,8 @@ class FingertipTask:
 
     def _changed_tool(self, now_ns: int) -> HeldTool | None:
         """Return what the gripper holds, None if it is what it was before the last frame."""
-        before, self._held = self._held, self.gripper.held_tool(now_ns) if self.gripper is not None else None
+        before = self._held
+        self._held = self.gripper.held_tool(now_ns) if self.gripper is not None else None
         return None if self._held == before else HeldTool(self._held)
 
     def _fingers_moved(self, frames: tuple[Frame, ...]) -> bool:

@@ -58,7 +58,8 @@ class LoadCellTask:
         self._publisher.publish(message)
         self._latest = sample
         if self._loop is not None:
-            torque_nm, now_ns = sample.torque_nm if sample.trusted else None, self._clock.now_ns()
+            now_ns = self._clock.now_ns()
+            torque_nm = sample.torque_nm if sample.trusted else None
             # A single one may be a line that was changed on its way.
             self._overloaded = self._overloaded + 1 if sample.overloaded else 0
             load = "the reading is beyond what it can measure" if self._overloaded > 1 else ""

@@ -7,7 +7,7 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -42,6 +42,13 @@ STANDING_COUNTS = 2
 _NO_COMMUNICATION = 9
 
 
+class _TimedReadout(NamedTuple):
+    """A readout, and when it began."""
+
+    readout: messages.Readout
+    began_ns: int
+
+
 @dataclass(eq=False)
 class RobotiqGripper:
     """One gripper: a connection, not yet open, and the meaning of its counts.
@@ -62,8 +69,8 @@ class RobotiqGripper:
     _seq: int = field(default=0, init=False)
     _requests: RequestWatch = field(default_factory=RequestWatch, init=False)
     _loss: DriverError | None = field(default=None, init=False)
-    # The latest readout since the last request, and its beginning.
-    _latest: tuple[messages.Readout, int] | None = field(default=None, init=False)
+    # The latest readout since the last request.
+    _latest: _TimedReadout | None = field(default=None, init=False)
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False)
     # The furthest position of the latest motion over this connection, and whether it has opened the fingers.
     _position: int | None = field(default=None, init=False)
@@ -263,10 +270,10 @@ class RobotiqGripper:
             round(float(np.interp(command.force_n, self.model.force_n, (0, COUNTS_MAX)))),
         )
 
-    async def _read(self, *, whole: bool = False) -> tuple[messages.Readout, int]:
-        self._latest = await self._exchange(partial(self.client.read, whole=whole))
+    async def _read(self, *, whole: bool = False) -> _TimedReadout:
+        self._latest = _TimedReadout(*await self._exchange(partial(self.client.read, whole=whole)))
         self._requests.take(*self._latest)
-        self._follow(self._latest[0].pos)
+        self._follow(self._latest.readout.pos)
         self._news.set()
         self._news.clear()
         return self._latest
@@ -284,17 +291,17 @@ class RobotiqGripper:
         """Take the fingers as opened where they stand: a release to this width has nothing to do."""
         self._opened = True
 
-    async def _recent(self) -> tuple[messages.Readout, int]:
+    async def _recent(self) -> _TimedReadout:
         """Return the latest readout where `states` keeps it fresh, else a new one: each delays the next state."""
-        if self._latest is not None and time.monotonic_ns() - self._latest[1] < 2 * self.poll_s * 1e9:
+        if self._latest is not None and time.monotonic_ns() - self._latest.began_ns < 2 * self.poll_s * 1e9:
             return self._latest
         return await self._read(whole=True)
 
-    async def _readout_after(self, since_ns: int) -> tuple[messages.Readout, int]:
+    async def _readout_after(self, since_ns: int) -> _TimedReadout:
         """Return a readout of `states` that began at `since_ns` or later; one of its own where none comes."""
         with contextlib.suppress(TimeoutError):
             async with timeout(_POLLS_WAITED * self.poll_s):
-                while self._latest is None or self._latest[1] < since_ns:
+                while self._latest is None or self._latest.began_ns < since_ns:
                     await self._news.wait()
                 return self._latest
         return await self._read()

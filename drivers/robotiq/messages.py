@@ -132,8 +132,8 @@ class GripperCommand:
     """A target width, a speed, and the largest force; by default as fast and as gently as the model can."""
 
     width_mm: float
-    speed_mm_per_s: float = SPEEDS_MM_PER_S[1]
-    force_n: float = FORCES_N[0]
+    speed_mm_per_s: float = SPEEDS_MM_PER_S.high
+    force_n: float = FORCES_N.low
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,12 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 ModelName = Literal["2F-140", "2F-85", "Hand-E"]
 DEFAULT_MODEL: Final = "2F-140"
 # Positions, speeds and forces are counts from 0 to this one.
 COUNTS_MAX: Final = 255
+
+
+class Range(NamedTuple):
+    """The smallest and the largest value of a quantity."""
+
+    low: float
+    high: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +28,8 @@ class GripperModel:
 
     name: ModelName
     stroke_mm: float
-    speed_mm_per_s: tuple[float, float]
-    force_n: tuple[float, float]
+    speed_mm_per_s: Range
+    force_n: Range
     bow_mm: float
     open_counts: float = 3.0
     closed_counts: float = 230.0
@@ -43,15 +50,17 @@ class GripperModel:
 MODELS: Mapping[ModelName, GripperModel] = {
     model.name: model
     for model in (
-        GripperModel("2F-140", 140.0, (30.0, 250.0), (10.0, 125.0), bow_mm=0.03 * 140.0),
-        GripperModel("2F-85", 85.0, (20.0, 150.0), (20.0, 235.0), bow_mm=0.03 * 85.0),
-        GripperModel("Hand-E", 50.0, (20.0, 150.0), (20.0, 185.0), bow_mm=0.0),
+        GripperModel("2F-140", 140.0, Range(30.0, 250.0), Range(10.0, 125.0), bow_mm=0.03 * 140.0),
+        GripperModel("2F-85", 85.0, Range(20.0, 150.0), Range(20.0, 235.0), bow_mm=0.03 * 85.0),
+        GripperModel("Hand-E", 50.0, Range(20.0, 150.0), Range(20.0, 185.0), bow_mm=0.0),
     )
 }
 # What some model has.
 LARGEST_STROKE_MM = max(model.stroke_mm for model in MODELS.values())
-SPEEDS_MM_PER_S = (
-    min(model.speed_mm_per_s[0] for model in MODELS.values()),
-    max(model.speed_mm_per_s[1] for model in MODELS.values()),
+SPEEDS_MM_PER_S = Range(
+    min(model.speed_mm_per_s.low for model in MODELS.values()),
+    max(model.speed_mm_per_s.high for model in MODELS.values()),
 )
-FORCES_N = min(model.force_n[0] for model in MODELS.values()), max(model.force_n[1] for model in MODELS.values())
+FORCES_N = Range(
+    min(model.force_n.low for model in MODELS.values()), max(model.force_n.high for model in MODELS.values())
+)

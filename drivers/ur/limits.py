@@ -226,8 +226,7 @@ def line_violation(sample: RtdeSample, limits: UrLimits) -> str:
         stops_at = q + math.copysign(qd * qd / (2 * braking), qd)
         if (qd > 0 and stops_at > high - joints.margin_rad) or (qd < 0 and stops_at < low + joints.margin_rad):
             return f"joint {number} at {q:.3f} rad came to the inner limit of its range"
-    fading = _fading(sample, limits)
-    return fading[0][1] if fading else ""
+    return next((reason for _, reason in _fading(sample, limits)), "")
 
 
 def _at_most(asked: float, bound: Bound, name: str, reasons: list[str], unit: str = "") -> float:

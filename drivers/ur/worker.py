@@ -193,7 +193,8 @@ def control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
             _set_alarm(messages.RECOVERY_HANG_S)
         ended = handler.tick(sample, time.monotonic_ns())
         if ended is not None:
-            pipe.send(ended[1], ended[0])
+            number, reply = ended
+            pipe.send(reply, number)
         if not handler.take_rejection():
             pipe.send_latest(handler.state(sample, cycle))
         if (handler.leaving and handler.at_rest) or time.monotonic() > leave_s:

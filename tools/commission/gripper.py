@@ -33,8 +33,8 @@ def measure(context: Context) -> Measured:
     model = MODELS[config.model]
     context.operator.allow(
         f"the gripper is activated, also where it is active already: its fingers open and close once over the whole "
-        f"stroke of {model.stroke_mm:g} mm, at a speed of their own of up to {model.speed_mm_per_s[1]:g} mm/s; nothing "
-        "is between them"
+        f"stroke of {model.stroke_mm:g} mm, at a speed of their own of up to {model.speed_mm_per_s.high:g} mm/s; "
+        "nothing is between them"
     )
     with context.gripper() as gripper:
         lines = [_activation(context, gripper), _exchanges(context, gripper)]

@@ -18,7 +18,7 @@ class UnknownMomentError(ValueError):
 
 
 class Moments:
-    """Gives out moments, and says how long ago it gave one out."""
+    """Gives out moments, and says when it gave one out."""
 
     def __init__(self, now_ns: Callable[[], int] = boot_ns) -> None:
         self._now_ns = now_ns
@@ -29,12 +29,16 @@ class Moments:
         """Return the present moment."""
         return f"{self._own}-{self._now_ns()}"
 
-    def age_s(self, moment: str) -> float:
-        """Return how long ago a moment was given out; raises UnknownMomentError."""
+    def given_ns(self, moment: str) -> int:
+        """Return when a moment was given out, by the viewer's clock; raises UnknownMomentError."""
         own, _, digits = moment.partition("-")
         if own != self._own or not is_whole_number(digits, _MAX_DIGITS):
             raise UnknownMomentError(moment)
-        age_s = (self._now_ns() - int(digits)) / 1e9
-        if age_s < 0.0:
+        given_ns = int(digits)
+        if given_ns > self._now_ns():
             raise UnknownMomentError(moment)
-        return age_s
+        return given_ns
+
+    def since_s(self, given_ns: int) -> float:
+        """Return how long ago the moment of this time was given out."""
+        return (self._now_ns() - given_ns) / 1e9

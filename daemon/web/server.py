@@ -30,7 +30,7 @@ from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.callers import caller
 from shearloop.daemon.messaging.client import UnansweredError, ask, connect
-from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S, NEVER_LATE, LateRequestError, meant_for, why_too_old
+from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S, NEVER_LATE, LateRequestError, meant_for
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to_stop_socket
@@ -118,6 +118,7 @@ class Bridge:
     def __init__(self, context: zmq.asyncio.Context, address: DaemonAddress, latest: MessageStore) -> None:
         """Subscribe to the daemon, whether or not it runs; raise UserError for a malformed address."""
         self.latest = latest
+        self.moments = Moments()
         self._context = context
         self.address = address
         self._stopping: asyncio.Future[dict[str, Any]] | None = None
@@ -164,8 +165,8 @@ class Bridge:
         """Return the daemon's list of experiments; raise UserError without a reply."""
         return await self._request({"command": "experiments"}, COMMAND_TIMEOUT_S)
 
-    async def command(self, name: str, age_s: Callable[[], float], **arguments: bool | int | str) -> dict[str, Any]:
-        """Return the daemon's reply to a command; `age_s` returns the age of the click on it.
+    async def command(self, name: str, clicked_ns: int | None, **arguments: bool | int | str) -> dict[str, Any]:
+        """Return the daemon's reply to a command; `clicked_ns` is the time of its moment, None if it is never late.
 
         Raises LateRequestError if it is too old to be sent, UnansweredError if it was sent and no reply came, and
         UserError if no daemon answers.
@@ -173,7 +174,9 @@ class Bridge:
         content = {"command": name, "by": caller(PROGRAM), **arguments}
         status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
         self._check_shown(status.get("daemon", {}).get("process"), "nothing was sent to it")
-        content |= meant_for(status, age_s(), CLICK_WITHIN_S)
+        # The daemon, or this process, may have stood still since the click.
+        age_s = self.moments.since_s(clicked_ns) if clicked_ns is not None else 0.0
+        content |= meant_for(status, age_s, CLICK_WITHIN_S)
         return await self._request(content, UNLOCK_TIMEOUT_S if name in SLOW else COMMAND_TIMEOUT_S)
 
     def _check_shown(self, process: int | None, done: str) -> None:
@@ -311,7 +314,6 @@ class _Page:
         self._bridge = bridge
         self._tokens = TokenCheck(token)
         self._refusals = Refusals()
-        self._moments = Moments()
         regular = [topic for topic, kind in messages.TOPICS.items() if kind.rate_hz is not None]
         self._settings = {
             "fingertip": fingertip,
@@ -380,9 +382,13 @@ class _Page:
         refusal = self._tokens.refusal(name, request.headers.get("Authorization"), time.monotonic_ns())
         if refusal is not None:
             return self._refuse(*refusal)
-        age_s = self._age(name, request.query.get(MOMENT, ""))
-        if isinstance(age_s, web.Response):
-            return age_s
+        clicked_ns = None
+        if name not in NEVER_LATE:
+            try:
+                clicked_ns = self._bridge.moments.given_ns(request.query.get(MOMENT, ""))
+            except UnknownMomentError:
+                reason = "the page does not say when it was clicked on; look at the rig, and click again"
+                return self._refuse(400, reason)
         words = (MOMENT, REQUEST_ID, *WORDS.get(name, ()))
         if unknown := [word for word in request.query if word not in words]:
             return self._refuse(400, f"`{name}` has no word {unknown[0][:40]!r} here; there are {', '.join(words)}")
@@ -398,19 +404,7 @@ class _Page:
             arguments["ask"] = True
         elif name == "release" or (name in ASKED_IF_NEEDED and "digest" in arguments):
             arguments["confirmed"] = True
-        return await self._reply(name, self._bridge.command(name, age_s, **arguments))
-
-    def _age(self, name: str, moment: str) -> Callable[[], float] | web.Response:
-        """Return a function that returns the age of a click, or the refusal of one that is too old."""
-        if name in NEVER_LATE:
-            return lambda: 0.0
-        try:
-            reason = why_too_old(self._moments.age_s(moment), CLICK_WITHIN_S)
-        except UnknownMomentError:
-            return self._refuse(400, "the page does not say when it was clicked on; look at the rig, and click again")
-        if reason is not None:
-            return self._refuse(409, reason)
-        return partial(self._moments.age_s, moment)
+        return await self._reply(name, self._bridge.command(name, clicked_ns, **arguments))
 
     async def _reply(self, name: str, requested: Awaitable[dict[str, Any]]) -> web.Response:
         try:
@@ -450,7 +444,7 @@ class _Page:
                 now_s = time.monotonic()
                 if first or latest.number > sent or now_s - sent_s >= HEARTBEAT_S:
                     history = latest.history(now_s) if first else []
-                    moment = self._moments.present()
+                    moment = self._bridge.moments.present()
                     text = latest.batch(sent, now_s, first=first, now=time.time(), moment=moment, history=history)
                     sent, first, sent_s = latest.number, False, now_s
                     try:

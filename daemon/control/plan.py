@@ -209,6 +209,9 @@ def plan_of(
     return Plan(file.name, file.torque_source, limits.torque_nm, limits.angle_rad, tuple(planned), unknown, assumed)
 
 
+_LAST_UNKNOWN = "it may be a reversal: which way the tool turned last before it is not known"
+
+
 class _Ways(NamedTuple):
     """The steps, by their numbers, that turn the tool back, that may, and whose direction is that after a `tighten`.
 
@@ -216,7 +219,7 @@ class _Ways(NamedTuple):
     """
 
     back: Mapping[int, str]
-    possible: frozenset[int]
+    possible: Mapping[int, str]
     if_tightened: frozenset[int]
 
     def notes(self, number: int, step: Step, turn: Turn) -> Iterator[str]:
@@ -226,7 +229,7 @@ class _Ways(NamedTuple):
         if turn.way_unknown:
             yield _why_way_unknown(step)
         elif number in self.possible:
-            yield "it may be a reversal: which way the tool turned last before it is not known"
+            yield self.possible[number]
         if number in self.if_tightened:
             yield "its direction may be the other one if the `tighten` before it ends at its angle, below its torque"
 
@@ -237,7 +240,7 @@ def _ways_of(file: ExperimentFile, start: KnownTool) -> _Ways:
     differing = enumerate(map(_is_less_certain, assumed, certain), 1)
     return _Ways(
         {one.number: one.sentence(file) for one in found.known},
-        frozenset(found.possible),
+        {number: one.possible_sentence(file) if one else _LAST_UNKNOWN for number, one in found.possible.items()},
         frozenset(number for number, differs in differing if differs),
     )
 

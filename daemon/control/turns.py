@@ -1,6 +1,6 @@
 """Which way each step of an experiment turns the tool, and which steps turn it back."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 from shearloop.daemon.control.experiment_schema import (
@@ -154,11 +154,18 @@ class Reversal(NamedTuple):
 
     def sentence(self, file: ExperimentFile) -> str:
         """Return what turns back what."""
-        step, before = file.steps[self.number - 1], file.steps[self.before - 1]
         return (
-            f"reversal: {step.do} turns {self.direction}, against step {self.before} "
-            f"({before.do}), which turned {self.direction_before}"
+            f"reversal: {file.steps[self.number - 1].do} turns {self.direction}, against {self._before(file)}, which "
+            f"turned {self.direction_before}"
         )
+
+    def possible_sentence(self, file: ExperimentFile) -> str:
+        """Return what may turn back what: one of the two steps may not turn at all."""
+        step, against = file.steps[self.number - 1], f"the {self.direction_before} turn of {self._before(file)}"
+        return f"may turn back: {step.do} may turn {self.direction}, against {against}"
+
+    def _before(self, file: ExperimentFile) -> str:
+        return f"step {self.before} ({file.steps[self.before - 1].do})"
 
 
 class _EarlierTurn(NamedTuple):
@@ -169,10 +176,13 @@ class _EarlierTurn(NamedTuple):
 
 
 class Reversals(NamedTuple):
-    """The steps that turn the tool back in its grip, and the numbers, from 1, of those that may."""
+    """The steps that turn the tool back in its grip, and the numbers, from 1, of those that may.
+
+    Where only one direction is possible, but a step may not turn at all, the possible reversal is there too.
+    """
 
     known: tuple[Reversal, ...]
-    possible: tuple[int, ...]
+    possible: Mapping[int, Reversal | None]
 
 
 def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
@@ -182,9 +192,10 @@ def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
     count as the last turn.
     """
     known: list[Reversal] = []
-    possible: list[int] = []
-    # The possible directions of the last turn, each with its latest step.
+    possible: dict[int, Reversal | None] = {}
+    # The possible directions of the last turn, each with its latest step that turns for certain, else its latest step.
     last: dict[Direction, int] = {}
+    certain: set[int] = set()
     # The last turn that loaded the tool further.
     loaded: _EarlierTurn | None = None
     for number, (step, turn) in enumerate(zip(file.steps, turns(file, start), strict=True), 1):
@@ -195,16 +206,25 @@ def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
         for other, before in last.items():
             if turn.begins - STILL - {other}:
                 against.append(_EarlierTurn(before, other))
+        earlier: _EarlierTurn | None = None
         if way is not None and len(last) == 1 and against:
-            known.append(Reversal(number, way, against[0].number, against[0].direction))
+            earlier = against[0]
         elif way is not None and loaded is not None and way == turn.loads and way != loaded.direction:
-            known.append(Reversal(number, way, loaded.number, loaded.direction))
-        elif against:
-            possible.append(number)
+            earlier = loaded
+        one = None
+        if way is not None and earlier is not None:
+            one = Reversal(number, way, earlier.number, earlier.direction)
+        if one is not None and None not in turn.begins and one.before in certain:
+            known.append(one)
+        elif one is not None or against:
+            possible[number] = one
         if None not in turn.leaves:
             last = {}
-        last |= {left: number for left in turn.leaves if left is not None}
+            certain.add(number)
+        for left in turn.leaves - STILL:
+            if left is not None and last.get(left) not in certain:
+                last[left] = number
         left_way = only_way(turn.leaves)
         if left_way is not None and left_way == turn.loads:
             loaded = _EarlierTurn(number, left_way)
-    return Reversals(tuple(known), tuple(possible))
+    return Reversals(tuple(known), possible)

@@ -49,7 +49,8 @@ NOTES = {
     # A straight line before it turns the wrist too, by what the plan does not know.
     "torque_sweep": {7: ["a tool may be held, and turns too: which way, and how far, depends on where wrist 3 stands"]},
     "skin_hold_shear": {
-        4: ["reversal: twist turns clockwise, against step 3 (hold_torque), which turned counterclockwise"]
+        # A tool that slipped under the torque may stand at the twist's angle already.
+        4: ["may turn back: twist may turn clockwise, against the counterclockwise turn of step 3 (hold_torque)"]
     },
 }
 

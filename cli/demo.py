@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import socket
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ from shearloop.cli.options import PORT, add_option, path_of
 from shearloop.cli.other_daemon import refuse_second_daemon
 from shearloop.cli.temporary_folders import run_folder
 from shearloop.cli.view import PAGE_PORT
+from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.daemon.process import interrupt_status
 from shearloop.errors import UserError, missing
 from shearloop.tools.outputs import writing
@@ -75,16 +77,40 @@ def run(args: argparse.Namespace) -> int:
             f"{folder / name} starts nothing by itself: it needs `emulated: true` and `autostart: true`; remove it, "
             "and `shearloop demo` writes it again"
         )
-    print("The demo starts …", flush=True)
-    # In a process of its own: the daemon would keep the memory of the fits.
-    with running([*SHEARLOOP, "demo", "--prepare", "--folder", str(args.folder), *played]) as process:
-        status = process.wait()
-    if status:
-        return status
-    # Half a minute has passed.
-    _config_of_free_ports(folder / name)
-    with page(config, port), elsewhere(config) as moved:
-        return _call(run_command, str(folder / name), "--show", *played, *moved)
+    with only_demo(config):
+        print("The demo starts …", flush=True)
+        # In a process of its own: the daemon would keep the memory of the fits.
+        with running([*SHEARLOOP, "demo", "--prepare", "--folder", str(args.folder), *played]) as process:
+            status = process.wait()
+        if status:
+            return status
+        # Half a minute has passed.
+        _config_of_free_ports(folder / name)
+        with page(config, port), elsewhere(config) as moved:
+            return _call(run_command, str(folder / name), "--show", *played, *moved)
+
+
+@contextmanager
+def only_demo(config: "DaemonConfig") -> Iterator[None]:
+    """Hold the configuration's addresses for this demo until its end; raises UserError if another demo has them.
+
+    A demo that has just started has no daemon yet that would answer.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held:
+        try:
+            held.bind(demo_name(config.commands))
+        except OSError as error:
+            raise UserError(
+                f"a demo has just started at {config.commands}, and it gets ready for half a minute: watch that one, "
+                "or end it with Ctrl-C in its terminal; with another --folder, give its `config/demo.yaml` other "
+                "`publish` and `commands`"
+            ) from error
+        yield
+
+
+def demo_name(commands: str) -> bytes:
+    """Return the abstract name that a demo with this command address holds."""
+    return stop_name(commands).replace(b"-stop-", b"-demo-", 1)
 
 
 def _write_missing(folder: Path) -> None:

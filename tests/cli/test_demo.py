@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.cli import demo
+from shearloop.cli import demo, init
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
@@ -29,6 +29,23 @@ def test_a_taken_port_is_named_before_anything_is_built(monkeypatch):
             demo.check_ports(config, Path("my/config/demo.yaml"))
     assert "in my/config/demo.yaml, which `shearloop demo --prepare --folder my` writes; --port" in str(refused.value)
     demo.check_ports(config, Path("my/config/demo.yaml"))
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_demo_beside_one_that_has_just_started_is_refused_before_it_builds_anything(tmp_path, monkeypatch, mistake):
+    """No daemon of the first one answers yet, and its ports are still free."""
+    path = tmp_path / "config" / "demo.yaml"
+    init.write_files(path.parent, init.packaged_files())
+    address = f"ipc://{tmp_path}/commands"
+    text = path.read_text().replace("tcp://127.0.0.1:7761", f"ipc://{tmp_path}/publish")
+    path.write_text(text.replace("tcp://127.0.0.1:7762", address))
+    monkeypatch.setattr(demo, "running", lambda *_: pytest.fail("it builds"))
+    with demo.only_demo(load_daemon_config(path)):
+        said = mistake("demo", "--folder", tmp_path, "--port", "0")
+    assert f"a demo has just started at {address}" in said
+    # Its end gives them back.
+    with demo.only_demo(load_daemon_config(path)):
+        pass
 
 
 @pytest.mark.parametrize("taken", [False, True])

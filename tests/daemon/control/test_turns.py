@@ -294,6 +294,7 @@ LINE = {"do": "approach", "along_tool_m": 0.01}
         ([_twist(-0.3), _hold(-0.05)], "", False, True),
         ([_hold(-0.1), _twist(-0.05)], "", False, True),
         ([_hold(-0.1), _twist(0.05)], CCW, True, False),
+        ([_hold(0.1), _twist(0.0)], CW, False, True),
         ([_tighten(CW), _twist(-0.05)], "", False, True),
         ([_tighten(CW), _twist(-0.05, -0.1)], "", False, True),
         ([_tighten(CW), _twist(-1.1)], CW, False, False),

@@ -37,7 +37,9 @@ def run(args: argparse.Namespace) -> int:
 def _serve_page(args: argparse.Namespace) -> int:
     require("aiohttp", "view", "the live view")
     from shearloop.daemon.logs import logging_to_stderr
-    from shearloop.daemon.web.server import DaemonAddress, default_token_path, load_token, serve
+    from shearloop.daemon.web.bridge import DaemonAddress
+    from shearloop.daemon.web.server import serve
+    from shearloop.daemon.web.tokens import default_token_path, load_token
 
     if (args.connect == PUBLISH_ADDRESS) != (args.commands == COMMAND_ADDRESS):
         raise UserError(

@@ -1,4 +1,4 @@
-"""The page's web server on loopback, and its bridge to the daemon's sockets: messages in, commands out.
+"""The page's web server on loopback: what the daemon says goes to pages, and their commands to the daemon.
 
 A browser on this computer also runs pages of other sites. Such a page may reach us through a host name of its own (DNS
 rebinding, visible in the Host header) or send cross-site requests (visible in the Origin header). Every program on this
@@ -7,13 +7,9 @@ computer may read and stop; commands that move something need the token.
 
 import asyncio
 import contextlib
-import hmac
-import os
-import secrets
-import stat
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,30 +23,24 @@ from aiohttp import WSCloseCode, web
 from shearloop.bank.fingertip import Fingertip
 from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.messaging import messages
-from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
-from shearloop.daemon.messaging.callers import caller
-from shearloop.daemon.messaging.client import UnansweredError, ask, connect
-from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S, NEVER_LATE, LateRequestError, meant_for
-from shearloop.daemon.messaging.keys import ClientKeys
-from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
-from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to_stop_socket
+from shearloop.daemon.messaging.client import UnansweredError
+from shearloop.daemon.messaging.deadlines import NEVER_LATE, LateRequestError
+from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.process import ending_signals
+from shearloop.daemon.web.bridge import Bridge, DaemonAddress
 from shearloop.daemon.web.message_store import MessageStore
-from shearloop.daemon.web.moments import Moments, UnknownMomentError
+from shearloop.daemon.web.moments import UnknownMomentError
+from shearloop.daemon.web.tokens import TokenCheck
 from shearloop.errors import UserError
 from shearloop.timeouts import timeout
 from shearloop.words import is_whole_number
 
 HOST = "127.0.0.1"
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
-TOKEN_BYTES = 32
-TOKEN_LENGTHS = range(32, 201)
 # Requests in progress get this long at the end.
 SHUTDOWN_S = 1.0
 # A daemon that ends together with the viewer is still shown as ended.
 LAST_MESSAGES_S = 0.1
-# Names the page as the sender of its commands, together with the viewer's user.
-PROGRAM = "the live page"
 # Commands that move something, or change what moves it.
 NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock", "release")
 # Those that the page asks about first, with the daemon's question. The confirmation gives back the question's digest.
@@ -67,8 +57,6 @@ QUESTION = ("question", "plan", "digest")
 # The parts of a daemon's reply that a page shows.
 _SHOWN_KEYS = ("ok", "reason", "stopped", "taring", "not_connected", "experiment", *QUESTION)
 _LIST_KEYS = ("ok", "reason", "experiments", "configured", "unread")
-# Wrong tokens that are compared at once, and then per second.
-WRONG_BURST, WRONG_PER_S = 20.0, 1.0
 # Maximum redraw rate of a page.
 BATCHES_PER_S = 30.0
 # A page gets a batch at least this often.
@@ -81,9 +69,6 @@ MAX_CONNECTIONS, ACCEPTED_AT_ONCE = 128, 16
 MAX_BODY_BYTES = 4096
 # Of the number of a stop.
 _MAX_DIGITS = 9
-# The largest message is a heatmap of 200 × 200 float32.
-MAX_MESSAGE_BYTES = 1 << 20
-HIGH_WATER_MARK = 1000
 # Health comes once a second. After a longer silence the page shows a dead daemon, within 2 s in all.
 DEAD_AFTER_S = 1.6
 # Allows for the delay through this process and the browser.
@@ -101,126 +86,6 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class DaemonAddress:
-    """A daemon's sockets, with the keys if it is on the network."""
-
-    publish: str
-    commands: str
-    keys: ClientKeys | None = None
-
-
-class Bridge:
-    """Receives the messages of one daemon and sends commands to it."""
-
-    def __init__(self, context: zmq.asyncio.Context, address: DaemonAddress, latest: MessageStore) -> None:
-        """Subscribe to the daemon, whether or not it runs; raise UserError for a malformed address."""
-        self.latest = latest
-        self.moments = Moments()
-        self._context = context
-        self.address = address
-        self._stopping: asyncio.Future[dict[str, Any]] | None = None
-        self._socket = context.socket(zmq.SUB)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
-        try:
-            connect(self._socket, address.publish, address.keys)
-            with context.socket(zmq.DEALER) as commands:
-                connect(commands, address.commands, address.keys)
-        except UserError:
-            self._socket.close()
-            raise
-        for topic in messages.TOPICS:
-            # The daemon computes heatmaps only for subscribers: subscribe while a page is open.
-            if topic not in (messages.EitFrame.topic, messages.EitHeatmap.topic):
-                self._socket.subscribe(topic)
-
-    async def run(self) -> None:
-        """Receive messages until cancelled."""
-        while True:
-            parts = await self._socket.recv_multipart()
-            try:
-                topic, payload = parts
-                content = messages.decode(payload)
-            except ValueError:
-                self.latest.refused["malformed message"] += 1
-                continue
-            self.latest.add(topic.decode(errors="replace"), content, time.monotonic())
-
-    @contextlib.contextmanager
-    def watching(self) -> Iterator[None]:
-        """Subscribe to heatmaps while a page is open."""
-        # ZeroMQ counts the subscriptions of several pages.
-        self._socket.subscribe(messages.EitHeatmap.topic)
-        try:
-            yield
-        finally:
-            self._socket.unsubscribe(messages.EitHeatmap.topic)
-
-    async def experiments(self) -> dict[str, Any]:
-        """Return the daemon's list of experiments; raise UserError without a reply."""
-        return await self._request({"command": "experiments"}, COMMAND_TIMEOUT_S)
-
-    async def command(self, name: str, clicked_ns: int | None, **arguments: bool | int | str) -> dict[str, Any]:
-        """Return the daemon's reply to a command; `clicked_ns` is the time of its moment, None if it is never late.
-
-        Raises LateRequestError if it is too old to be sent, UnansweredError if it was sent and no reply came, and
-        UserError if no daemon answers.
-        """
-        content = {"command": name, "by": caller(PROGRAM), **arguments}
-        status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
-        self._check_shown(status.get("daemon", {}).get("process"), "nothing was sent to it")
-        # The daemon, or this process, may have stood still since the click.
-        age_s = self.moments.since_s(clicked_ns) if clicked_ns is not None else 0.0
-        content |= meant_for(status, age_s, CLICK_WITHIN_S)
-        return await self._request(content, UNLOCK_TIMEOUT_S if name in SLOW else COMMAND_TIMEOUT_S)
-
-    def _check_shown(self, process: int | None, done: str) -> None:
-        """Raise UserError if the page shows another daemon than this process; `done` says what that one did.
-
-        After a restart of the daemon they differ for a second.
-        """
-        shown = self.latest.process
-        if shown is not None and process not in (None, shown):
-            raise UserError(
-                f"the page shows the daemon at {self.address.publish}, process {shown}, and the one at "
-                f"{self.address.commands} is process {process}: {done}. After a restart of the daemon try again; else "
-                "start the page with the addresses of one daemon"
-            )
-
-    async def stop(self) -> dict[str, Any]:
-        """Return the daemon's reply to a stop of all motion; simultaneous calls share one request.
-
-        Raises UserError without a reply.
-        """
-        if self._stopping is None or self._stopping.done():
-            self._stopping = asyncio.ensure_future(self._request_stop())
-        # Shielded: a page that disappears has still requested the stop.
-        return await asyncio.shield(self._stopping)
-
-    async def _request_stop(self) -> dict[str, Any]:
-        content, address = {"command": "stop", "by": caller(PROGRAM), "spare_daemon": True}, self.address.commands
-        reply = None
-        if not needs_keys(address):
-            # A local daemon accepts it even without valid keys.
-            with contextlib.suppress(TimeoutError, StopSocketTakenError):
-                reply = await asyncio.to_thread(send_to_stop_socket, address, content, COMMAND_TIMEOUT_S)
-        reply = reply or await self._request(content, COMMAND_TIMEOUT_S)
-        self._check_shown(reply.get("process"), "that one was stopped")
-        return reply
-
-    async def _request(self, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
-        return await ask(self._context, self.address.commands, content, timeout_s, self.address.keys)
-
-    async def close(self) -> None:
-        """Close the socket; wait for a stop that is on its way."""
-        self._socket.close()
-        if self._stopping is not None:
-            await asyncio.gather(self._stopping, return_exceptions=True)
 
 
 async def serve(
@@ -286,23 +151,6 @@ def make_app(bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str
     app.router.add_post("/commands/{name}", page.command)
     app.on_shutdown.append(page.disconnect)
     return app
-
-
-class TokenCheck:
-    """Checks tokens; after WRONG_BURST wrong ones it refuses all, right or wrong, but for WRONG_PER_S."""
-
-    def __init__(self, token: str) -> None:
-        self._token = token
-        self._wrong = TokenBucket(WRONG_BURST, WRONG_PER_S)
-
-    def refusal(self, name: str, authorization: str | None, t_ns: int) -> tuple[int, str] | None:
-        """Return status and reason if a command with this Authorization header is refused at monotonic time t_ns."""
-        if not self._wrong.has_token(t_ns):
-            return 429, "too many wrong tokens came; wait a second and try again, or use `shearloop command`"
-        if token_valid(authorization, self._token):
-            return None
-        self._wrong.allow(t_ns)
-        return 403, f"{name} needs the token: open the address that `shearloop view` printed"
 
 
 # Connections with a request in progress.
@@ -477,55 +325,3 @@ def host_allowed(host: str | None) -> bool:
 def origin_allowed(origin: str | None, host: str | None) -> bool:
     """Return whether a request comes from the page itself, or from a program that sends no Origin header."""
     return origin is None or (host is not None and origin.lower() == f"http://{host.lower()}")
-
-
-def token_valid(authorization: str | None, token: str) -> bool:
-    """Return whether an Authorization header carries the token; compares in constant time."""
-    scheme, _, given = (authorization or "").partition(" ")
-    return scheme == "Bearer" and hmac.compare_digest(given.encode(errors="replace"), token.encode())
-
-
-def default_token_path() -> Path:
-    """Return the token's default path (XDG Base Directory Specification)."""
-    state = os.environ.get("XDG_STATE_HOME", "")
-    folder = Path(state) if os.path.isabs(state) else Path.home() / ".local" / "state"
-    return folder / "shearloop" / "view-token"
-
-
-def load_token(path: Path, *, new: bool = False) -> str:
-    """Return the token in a file; create a missing one, and replace it with `new`.
-
-    Raises UserError for a file that others may read, that holds no token, or that cannot be written.
-    """
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if new:
-            path.unlink(missing_ok=True)
-        try:
-            return _read_token(path)
-        except FileNotFoundError:
-            token = secrets.token_urlsafe(TOKEN_BYTES)
-            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
-            with os.fdopen(handle, "w") as file:
-                file.write(f"{token}\n")
-            return token
-    except OSError as error:
-        raise UserError(
-            f"the token cannot be kept in {path} ({error.strerror}); name another file with --token-file"
-        ) from error
-
-
-def _read_token(path: Path) -> str:
-    # Without O_NONBLOCK, opening a pipe would block.
-    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    with os.fdopen(handle) as file:
-        status = os.fstat(handle)
-        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
-            raise UserError(
-                f"{path} must be a file of your own that no other user may read; "
-                "make a new token with --new-token, or name another file with --token-file"
-            )
-        text = file.read(TOKEN_LENGTHS.stop).strip()
-    if not (len(text) in TOKEN_LENGTHS and text.isascii() and text.isprintable() and " " not in text):
-        raise UserError(f"{path} holds no token; make a new one with --new-token, or name another file")
-    return text

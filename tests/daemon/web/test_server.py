@@ -29,26 +29,22 @@ from shearloop.daemon.messaging.command_server import CommandRefusedError, Comma
 from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.daemon.web import bridge as bridge_module
 from shearloop.daemon.web import server as server_module
+from shearloop.daemon.web.bridge import Bridge, DaemonAddress
 from shearloop.daemon.web.message_store import MessageStore
 from shearloop.daemon.web.moments import Moments
 from shearloop.daemon.web.server import (
     ASKED,
     HEADERS,
     NEEDS_TOKEN,
-    WRONG_BURST,
-    Bridge,
-    DaemonAddress,
-    TokenCheck,
-    default_token_path,
     host_allowed,
     listen,
-    load_token,
     make_app,
     origin_allowed,
     serve,
-    token_valid,
 )
+from shearloop.daemon.web.tokens import WRONG_BURST, TokenCheck, default_token_path, load_token, token_valid
 from shearloop.errors import UserError
 from shearloop.tools.bank_config import FingertipGeometryConfig
 from tests.fixtures.daemons import DEADLINE_S, free_port, running_daemon, shearloop
@@ -176,7 +172,7 @@ async def test_a_confirmation_is_the_digest_of_a_question(tmp_path):
 async def test_a_click_is_carried_out_soon_or_never_whatever_stood_still(tmp_path, monkeypatch):
     begun_ns, slow_ns = 1_000_000_000, [0]
     now_ns = begun_ns
-    monkeypatch.setattr(server_module, "Moments", lambda: Moments(lambda: now_ns))
+    monkeypatch.setattr(bridge_module, "Moments", lambda: Moments(lambda: now_ns))
 
     async def slow_status(_request: Mapping[str, Any]) -> dict[str, Any]:
         nonlocal now_ns
@@ -217,7 +213,7 @@ async def test_a_click_is_carried_out_soon_or_never_whatever_stood_still(tmp_pat
 
 async def test_the_daemon_is_told_how_much_time_a_click_has_left(tmp_path, monkeypatch):
     now_ns = 0
-    monkeypatch.setattr(server_module, "Moments", lambda: Moments(lambda: now_ns))
+    monkeypatch.setattr(bridge_module, "Moments", lambda: Moments(lambda: now_ns))
     requests: list[Mapping[str, Any]] = []
 
     async def status(_request: Mapping[str, Any]) -> dict[str, Any]:
@@ -235,7 +231,7 @@ async def test_the_daemon_is_told_how_much_time_a_click_has_left(tmp_path, monke
 
 
 async def test_a_command_without_an_answer_is_told_to_be_in_doubt(tmp_path, monkeypatch):
-    monkeypatch.setattr(server_module, "UNLOCK_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(bridge_module, "UNLOCK_TIMEOUT_S", 0.2)
 
     async def never(_request: Mapping[str, Any]) -> dict[str, Any]:
         await asyncio.Event().wait()
@@ -247,7 +243,7 @@ async def test_a_command_without_an_answer_is_told_to_be_in_doubt(tmp_path, monk
 
 
 async def test_a_list_that_there_is_not_is_no_refusal(tmp_path, log, monkeypatch):
-    monkeypatch.setattr(server_module, "COMMAND_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 0.05)
 
     async def experiments(_request: Mapping[str, Any]) -> dict[str, Any]:
         return {"experiments": [], "configured": "", "unread": "'hold' is running"}
@@ -403,7 +399,7 @@ async def test_messages_reach_open_pages_and_heatmaps_need_one(tmp_path):
 
 
 async def test_many_stops_share_one_request_and_overtake_hanging_commands(tmp_path, monkeypatch):
-    monkeypatch.setattr(server_module, "COMMAND_TIMEOUT_S", 30.0)
+    monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 30.0)
     released, all_in, stops, wanted = asyncio.Event(), asyncio.Event(), 0, 0
 
     async def hang(_: Mapping[str, Any]) -> dict[str, Any]:
@@ -435,7 +431,7 @@ async def test_many_stops_share_one_request_and_overtake_hanging_commands(tmp_pa
 
 
 async def test_a_stop_without_a_daemon_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setattr(server_module, "COMMAND_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 0.05)
     async with served(tmp_path) as page:
         page.bridge.address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
         status, reply = await post(page, "/stop")

@@ -11,7 +11,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CONSTRAINTS ?=
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS))
 
-.PHONY: lock coverage notebook install install-dev system-packages demo demo-python docs docs-site test test-computing test-the-rest test-fast lint format clean
+.PHONY: lock coverage notebook install install-dev system-packages demo demo-python docs docs-site test test-long test-computing test-the-rest test-fast lint format clean
 
 # Before anything is installed.
 demo-python:
@@ -53,19 +53,25 @@ demo: demo-python $(VENV)/.installed
 #   Tests that only compute run beside the rest, at a low priority: they take the time that it leaves of the cores, and
 #   disturb it less than a fourth worker would. On a busy computer they get little time, so that their timeout is long.
 # Status 5: no test was selected.
+# `make test` takes four minutes. `make test-long` runs what takes as long again: endurance, a newcomer's first hour, and
+# figures (LONG in tests/conftest.py). `.ci/run` calls both.
 PYTEST := $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+LENGTH := not long
 test: install-dev
-	$(PYTEST) -n 5 -m real_time $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -n 5 -m 'real_time and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 	+$(MAKE) --no-print-directory --jobs=2 --keep-going test-computing test-the-rest
+
+test-long: install-dev
+	+$(MAKE) --no-print-directory test LENGTH=long
 
 test-computing: install-dev
 	mkdir -p build
-	nice -n 10 $(BIN)/pytest -m computes --timeout=600 $(PYTEST_ARGS) >build/test-computing.log 2>&1 || [ $$? -eq 5 ] || \
-		{ cat build/test-computing.log; exit 1; }
+	nice -n 10 $(BIN)/pytest -m 'computes and $(LENGTH)' --timeout=600 $(PYTEST_ARGS) >build/test-computing.log 2>&1 || \
+		[ $$? -eq 5 ] || { cat build/test-computing.log; exit 1; }
 	tail -n 1 build/test-computing.log
 
 test-the-rest: install-dev
-	$(PYTEST) -m 'not real_time and not computes' $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -m 'not real_time and not computes and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \

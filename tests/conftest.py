@@ -9,7 +9,7 @@ import os
 import sys
 import threading
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -55,8 +55,26 @@ LONGEST = (
     "test_stops_and_unlocking.py", "test_twist_and_hold.py", "test_adapt_in_loop.py", "test_rehearsal.py",
     "test_doctor.py", "test_stop_times.py", "test_ends.py", "test_recorded_rig.py",
 )  # fmt: skip
+_TESTS = _ROOT / "tests"
 # What only computes: nothing there waits, or depends on how long it takes. As much as the rest leaves time for.
-COMPUTING = (_ROOT / "tests" / "estimation",)
+COMPUTING = (_TESTS / "estimation",)
+# `make test-long` runs these files and folders, `make test` all others.
+LONG = tuple(
+    _TESTS / path
+    for path in (
+        # Endurance: many experiments, every order of events, every pace, other clocks.
+        "benchmarks/test_soak.py", "daemon/control/test_no_command_beyond_limits.py",
+        "daemon/control/test_runner_any_order.py", "drivers/ur/test_script_any_order.py",
+        "tools/recordings/test_replay_rig.py", "tools/recordings/test_rig_with_set_clock.py",
+        # A newcomer's first hour, with the commands of the README.
+        "cli/newcomer", "tools/commission/test_walk.py",
+        # Figures: of the papers, of estimators on real recordings, of independent solutions.
+        "benchmarks/test_adaptation.py", "benchmarks/test_step_response.py", "benchmarks/test_stop_times.py",
+        "cli/test_leave_out.py", "cli/test_skin.py", "estimation/skin/test_plane_strain.py",
+        "estimation/test_dead_channels.py", "studies", "tools/recordings/test_adapt.py",
+        "tools/recordings/test_shared_recordings.py", "tools/test_leave_out.py",
+    )
+)  # fmt: skip
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -104,16 +122,17 @@ def tiny_bank(tmp_path_factory) -> Path:
     return path
 
 
+def pytest_configure() -> None:
+    """Refuse lists that a renamed file has left behind."""
+    if missing := [str(path) for path in (*COMPUTING, *LONG) if not path.exists()]:
+        raise pytest.UsageError(f"Not there, but in a list of tests/conftest.py: {', '.join(missing)}.")
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """For a part of the tests do not import the files and the folders that have none of it, in each worker."""
-    part = config.getoption("markexpr")
-    if part == "real_time":
-        return None if _has_real_time(collection_path) else True
-    if part == "computes":
-        leads_there = any(folder.is_relative_to(collection_path) for folder in COMPUTING)
-        return None if leads_there or _computes(collection_path) else True
-    if part == "not real_time and not computes":
-        return True if _computes(collection_path) else None
+    for term in config.getoption("markexpr").split(" and "):
+        if term in PARTS and not PARTS[term](collection_path):
+            return True
     return None
 
 
@@ -123,14 +142,30 @@ def _has_real_time(path: Path) -> bool:
     return path.match("test_*.py") and "real_time" in path.read_text(encoding="utf-8")
 
 
-def _computes(path: Path) -> bool:
-    return any(path.is_relative_to(folder) for folder in COMPUTING)
+def _is_in(path: Path, part: tuple[Path, ...]) -> bool:
+    return any(path.is_relative_to(one) for one in part)
+
+
+def _leads_to(path: Path, part: tuple[Path, ...]) -> bool:
+    return _is_in(path, part) or any(one.is_relative_to(path) for one in part)
+
+
+# Of the terms by which the Makefile selects a part: whether a file or folder may have tests of it.
+PARTS: dict[str, Callable[[Path], bool]] = {
+    "real_time": _has_real_time,
+    "computes": lambda path: _leads_to(path, COMPUTING),
+    "not computes": lambda path: not _is_in(path, COMPUTING),
+    "long": lambda path: _leads_to(path, LONG),
+    "not long": lambda path: not _is_in(path, LONG),
+}
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Mark the tests that only compute."""
-    if _computes(item.path) and item.get_closest_marker("real_time") is None:
+    """Mark the tests that only compute, and the long ones."""
+    if _is_in(item.path, COMPUTING) and item.get_closest_marker("real_time") is None:
         item.add_marker("computes")
+    if _is_in(item.path, LONG):
+        item.add_marker("long")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

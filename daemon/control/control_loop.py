@@ -292,7 +292,8 @@ class ControlLoop:
         """Return the faults while no experiment runs, with what the operator should know of a held tool."""
         faults, arm = list(found), self.inputs.arm
         if self.safety.waiting is not None and (held := self.tool.may_still_hold) is not None:
-            faults.append(Fault(FaultCode.TOOL_GRIPPED, held))
+            is_held = self.tool.held is not None
+            faults.append(Fault(FaultCode.TOOL_GRIPPED if is_held else FaultCode.TOOL_MAY_BE_GRIPPED, held))
         if unknown := self.tool.unknown_grip:
             faults.append(Fault(FaultCode.GRIP_UNKNOWN, unknown))
         if arm is not None and arm.enabled_by_start:

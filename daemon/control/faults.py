@@ -249,8 +249,13 @@ class FaultCode(Enum):
     )
     TOOL_GRIPPED = Rule(
         Response.NOTE,
-        "a tool is still gripped, or may be: {detail}.",
+        "a tool is still gripped: {detail}.",
         "Secure it. Then `shearloop command release --yes` opens the gripper, and the object drops.",
+    )
+    TOOL_MAY_BE_GRIPPED = Rule(
+        Response.NOTE,
+        "a tool may still be gripped: {detail}.",
+        "Look, and secure a tool that is there. `shearloop command release --yes` opens the gripper, and it drops.",
     )
     GRIP_UNKNOWN = Rule(
         Response.NOTE,

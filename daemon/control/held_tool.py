@@ -106,9 +106,11 @@ class HeldTool:
 
     def begin_grip(self, action: GripStep, origin_rad: float) -> None:
         """Store the state of the tool before the fingers move, and begin a new grip."""
+        # If this process dies while the fingers close, the next process finds this force. Fingers that hold nothing do
+        # not hold a tool once they open.
+        opens_empty = isinstance(action, Opening) and self.is_empty
+        force_n = None if opens_empty else max(self.grip.force_n or 0.0, action.force_n)
         self._moved = True
-        # If this process dies while the fingers close, the next process finds this force.
-        force_n = max(self.grip.force_n or 0.0, action.force_n)
         self._before_closing = _KnownGrip(self.grip, self.is_earlier, self.another)
         self._tightens = not isinstance(action, Opening) and self._has_grip()
         # While the fingers open, their last width on the tool shows whether they have let the tool go.

@@ -238,9 +238,10 @@ def _ways_of(file: ExperimentFile, start: KnownTool) -> _Ways:
     found = reversals(file, start)
     assumed, certain = turns(file, start), turns(file, start, reaches=False)
     differing = enumerate(map(_is_less_certain, assumed, certain), 1)
+    uncertain = {one.number: one.possible_sentence(file) for one in found.known if one.number in found.uncertain}
     return _Ways(
-        {one.number: one.sentence(file) for one in found.known},
-        {number: one.possible_sentence(file) if one else _LAST_UNKNOWN for number, one in found.possible.items()},
+        {one.number: one.sentence(file) for one in found.known if one.number not in uncertain},
+        dict.fromkeys(found.possible, _LAST_UNKNOWN) | uncertain,
         frozenset(number for number, differs in differing if differs),
     )
 

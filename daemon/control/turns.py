@@ -1,6 +1,6 @@
 """Which way each step of an experiment turns the tool, and which steps turn it back."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from shearloop.daemon.control.experiment_schema import (
@@ -178,11 +178,12 @@ class _EarlierTurn(NamedTuple):
 class Reversals(NamedTuple):
     """The steps that turn the tool back in its grip, and the numbers, from 1, of those that may.
 
-    Where only one direction is possible, but a step may not turn at all, the possible reversal is there too.
+    `uncertain` are the numbers of known ones where a step may not turn at all: it, or the one before.
     """
 
     known: tuple[Reversal, ...]
-    possible: Mapping[int, Reversal | None]
+    possible: tuple[int, ...]
+    uncertain: frozenset[int]
 
 
 def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
@@ -192,7 +193,8 @@ def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
     count as the last turn.
     """
     known: list[Reversal] = []
-    possible: dict[int, Reversal | None] = {}
+    possible: list[int] = []
+    uncertain: set[int] = set()
     # The possible directions of the last turn, each with its latest step that turns for certain, else its latest step.
     last: dict[Direction, int] = {}
     certain: set[int] = set()
@@ -211,13 +213,12 @@ def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
             earlier = against[0]
         elif way is not None and loaded is not None and way == turn.loads and way != loaded.direction:
             earlier = loaded
-        one = None
         if way is not None and earlier is not None:
-            one = Reversal(number, way, earlier.number, earlier.direction)
-        if one is not None and None not in turn.begins and one.before in certain:
-            known.append(one)
-        elif one is not None or against:
-            possible[number] = one
+            known.append(Reversal(number, way, earlier.number, earlier.direction))
+            if None in turn.begins or earlier.number not in certain:
+                uncertain.add(number)
+        elif against:
+            possible.append(number)
         if None not in turn.leaves:
             last = {}
             certain.add(number)
@@ -227,4 +228,4 @@ def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
         left_way = only_way(turn.leaves)
         if left_way is not None and left_way == turn.loads:
             loaded = _EarlierTurn(number, left_way)
-    return Reversals(tuple(known), possible)
+    return Reversals(tuple(known), tuple(possible), frozenset(uncertain))

@@ -292,6 +292,29 @@ def test_after_a_grip_fingers_that_were_halted_may_still_hold_the_tool(gripped):
     assert ("does not know whether it holds a tool" in said) if gripped else said is None
 
 
+@pytest.mark.parametrize(
+    ("before", "step", "said"),
+    [
+        ((), {"do": "release"}, None),
+        ((), {**GRIP, "expect_object": False}, FaultCode.TOOL_MAY_BE_GRIPPED),
+        ((GRIP,), {"do": "release"}, FaultCode.TOOL_MAY_BE_GRIPPED),
+    ],
+)
+def test_a_stop_on_the_way_of_the_fingers_says_what_may_be_in_them(before, step, said):
+    """Fingers that held nothing as they began to open cannot have gripped a tool."""
+    rig = started(Rig(new_loop()), *before, step, WAIT)
+    while not rig.pending or len(rig.begun) <= len(before):
+        rig.step()
+    rig.hand, rig.force_n = replace(rig.hand, moving=True), 0.0
+    rig.step()
+    stop(rig)
+    rig.hand = replace(rig.hand, moving=False, uncertain=True)
+    rig.run(0.1)
+    rig.step()
+    codes = {fault.code for fault in rig.control_loop.status.decision.reported}
+    assert codes & {FaultCode.TOOL_GRIPPED, FaultCode.TOOL_MAY_BE_GRIPPED} == ({said} if said else set())
+
+
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"unfelt": True}, {"moving": True}])
 def test_a_tare_with_an_uncertain_gripper_has_to_be_confirmed(sense):
     rig = held(**sense)

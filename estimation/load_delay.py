@@ -209,8 +209,12 @@ def _agree(one: LoadDelay, other: LoadDelay) -> bool:
 
 
 def _read_late(series: FrameSeries) -> float:
-    """Return the larger fraction of short steps, of the frames or of the readings: what waited is read in bursts."""
-    steps = [np.diff(times_s) for times_s in (series.t_s, series.torque_t_s)]
+    """Return the larger fraction of short steps, of the frames or of the readings: what waited is read in bursts.
+
+    They are those of the whole recording: in a quiet part of it the clocks may be off by what waited before.
+    """
+    t_s = series.t_s if series.whole_t_s is None else series.whole_t_s
+    steps = [np.diff(times_s) for times_s in (t_s, series.torque_t_s)]
     return max(float(np.mean(step < 0.5 * np.median(step))) for step in steps if len(step))
 
 

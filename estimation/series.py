@@ -24,7 +24,8 @@ class FrameSeries:
     number in the whole recording. load_doubt says why the torque's times may be wrong. left_out names frames and
     torques that were left out, with their number. emulated says that every device was emulated. fingers_moved (n, m)
     says during which frames the gripper's fingers opened or closed; it is None if that is not known. period_s is the
-    frame period of the daemon's configuration, infinite without one.
+    frame period of the daemon's configuration, infinite without one. whole_t_s (w,) has the times of all frames of the
+    recording where this series is a part of it.
     Raises CalibrationError for shapes that do not match and for times that decrease.
     """
 
@@ -42,6 +43,7 @@ class FrameSeries:
     emulated: bool = False
     fingers_moved: BoolArray | None = None
     period_s: float = np.inf
+    whole_t_s: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and times."""
@@ -92,6 +94,7 @@ class FrameSeries:
             diameter_mm=self.diameter_mm[part],
             first_frame=self.first_frame + start,
             fingers_moved=None if self.fingers_moved is None else self.fingers_moved[part],
+            whole_t_s=self.t_s if self.whole_t_s is None else self.whole_t_s,
         )
 
     @property

@@ -96,6 +96,22 @@ def test_no_delay_is_advised_where_the_recordings_computer_was_too_busy(recorded
         assert "--load-cell-delay-s" not in load_delay_warning(busy)
 
 
+def test_no_delay_is_advised_on_a_quiet_part_of_a_recording_whose_computer_was_too_busy(recorded):
+    late = replace(recorded, torque_t_s=recorded.torque_t_s - 2.0)
+    n = len(late.t_s)
+    begin = n // 3
+    quiet = late.between(begin, n).between(0, n - begin)
+    with pytest.raises(CalibrationError, match="calibrate with --load-cell-delay-s"):
+        measure_timing([quiet])
+    t_s = late.t_s.copy()
+    t_s[2:begin:8] = t_s[1:begin:8][: len(t_s[2:begin:8])] + 0.01
+    part = replace(late, t_s=t_s).between(begin, n).between(0, n - begin)
+    np.testing.assert_array_equal(part.t_s, quiet.t_s)
+    with pytest.raises(CalibrationError, match=r"came in bursts.*too busy.*record again") as refused:
+        measure_timing([part])
+    assert "--load-cell-delay-s" not in str(refused.value)
+
+
 def test_a_knocked_frame_does_not_hide_the_rest(recorded):
     knocked = recorded.channels.copy()
     knocked[[90, 140]] *= 1.5

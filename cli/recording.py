@@ -126,6 +126,10 @@ def _summary_text(found: "RecordingSummary") -> str:
     if found.first_unix_ns is not None:
         began = _local_time(found.first_unix_ns)
         lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.size_bytes / 1e6:.2f} MB")
+        named_ns = found.named_unix_ns
+        if named_ns is not None and found.first_unix_ns < named_ns:
+            waited = f"what was measured up to {(named_ns - found.first_unix_ns) / 1e9:.1f} s before waited for it"
+            lines.append(f"  begun    {_local_time(named_ns)}, by its name; {waited}")
     lines.append(f"  source   {found.metadata.get('source', 'unknown: not a recording of shearloop')}")
     if EMULATED in found.metadata:
         lines.append("  EMULATED every device was emulated on that computer")

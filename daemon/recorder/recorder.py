@@ -356,7 +356,7 @@ class Recorder:
 
     def _new_file(self, lost_before: int) -> _CurrentFile:
         now_ns, offset_ns = self._clock.now_ns(), self._clock.offset_ns
-        name = datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
+        name = datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime(schema.NAME_FORMAT)
         # Another file may have begun in the same second, or before the clock was set back.
         for number in count(1):
             began = name if number == 1 else f"{name}-{number}"

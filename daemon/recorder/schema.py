@@ -52,6 +52,8 @@ CONFIGURATION = "configuration.json"
 SCORES_SHAPE = "scores_shape"
 ARRIVAL = "arrival_unix_ns"
 SUSPENDED = "suspended_ns"
+# The name of a file, after the time (UTC) at which it was begun.
+NAME_FORMAT = "%Y-%m-%dT%H-%M-%SZ"
 # The keys of an imported message, which has no source.
 IMPORTED_KEYS: Mapping[str, tuple[str, ...]] = {FRAME_TOPIC: (ARRIVAL, "line"), LOAD_TOPIC: ("torque_nm",)}
 SIDES = ("right", "left")

@@ -1,6 +1,7 @@
 """The content of one recording in numbers, closed or not; damaged parts are counted and left out."""
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,10 +14,13 @@ from shearloop.tools.recordings.message_content import ContentError, read_conten
 from shearloop.tools.recordings.monotonic_times import MonotonicTimes
 from shearloop.tools.recordings.reader import reading
 
+# Fewer messages, or a shorter time, say nothing of a rate.
+MIN_RATED_MESSAGES, MIN_RATED_S = 3, 1.0
+
 
 @dataclass(slots=True)
 class TopicSummary:
-    """One topic; fewer than two messages have no mean rate."""
+    """One topic; a few messages, or those of a short time, have no mean rate."""
 
     messages: int = 0
     rate_hz: float | None = None
@@ -49,6 +53,8 @@ class RecordingSummary(FileCondition):
 
     dropped: int | None
     first_unix_ns: int | None
+    # When the file was begun, by its name; None for another name. Messages of before it waited for it.
+    named_unix_ns: int | None
     duration_s: float
     # Whether the same code made it, so that a replay must be equal bit for bit.
     same_code: bool
@@ -86,8 +92,9 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
             case Attachment():
                 attachments.append(record.name)
     for name, (first_ns, last_ns) in spans.items():
-        if last_ns > first_ns:
-            topics[name].rate_hz = (topics[name].messages - 1) / ((last_ns - first_ns) / 1e9)
+        topic, lasts_s = topics[name], (last_ns - first_ns) / 1e9
+        if topic.messages >= MIN_RATED_MESSAGES and lasts_s >= MIN_RATED_S:
+            topic.rate_hz = (topic.messages - 1) / lasts_s
     first_unix_ns = min((first_ns for first_ns, _ in spans.values()), default=None)
     ends = named.get(schema.END_METADATA, [])
     with reading(path):
@@ -104,6 +111,7 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         lost=records.lost,
         dropped=dropped,
         first_unix_ns=first_unix_ns,
+        named_unix_ns=named_unix_ns(path),
         duration_s=0.0 if first_unix_ns is None else (max(last for _, last in spans.values()) - first_unix_ns) / 1e9,
         same_code=metadata.get("code_sha256") == schema.code_digest(),
         experiments=[experiment.get("name", "") for experiment in experiments],
@@ -117,6 +125,17 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
             if (step := ClockStep.between(before, after)) is not None
         ],
     )
+
+
+def named_unix_ns(path: Path) -> int | None:
+    """Return the time in a recording's name, in Unix ns; None for a name that the daemon does not give."""
+    # A further file of the same second has a number after the Z.
+    name, zulu, _ = path.name.partition("Z")
+    try:
+        began = datetime.strptime(f"{name}{zulu}", schema.NAME_FORMAT).replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    return round(began.timestamp()) * 10**9
 
 
 def _clock_reading(message: Message) -> ClockReading | None:

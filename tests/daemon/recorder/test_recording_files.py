@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.reader import read_messages
 from shearloop.tools.recordings.replay import RecordedRun
+from shearloop.tools.recordings.summary import summarise
 from shearloop.tools.recordings.tables import RecordedTopics, arrays
 from shearloop.words import counted
 from tests.fixtures.recordings import START_DATENUM
@@ -54,6 +56,39 @@ def test_info_shows_the_content(recording, ran, result_of):
     printed = result_of("recording", "info", recording)
     assert printed["topics"]["load.torque"]["messages"] == 4
     assert (printed["closed"], printed["same_code"], printed["size_bytes"]) == (True, True, recording.stat().st_size)
+
+
+@pytest.mark.parametrize(
+    ("times_s", "rate_hz"),
+    [([0.0, 0.0054], None), ([0.0, 600.0], None), ([0.0, 0.01, 0.02, 0.03], None), ([0.0, 0.6, 1.2], 1 / 0.6)],
+)
+def test_a_few_messages_or_a_short_time_have_no_rate(times_s, rate_hz, tmp_path, ran):
+    with new_recording(tmp_path / "a.mcap", "a bench") as writer:
+        for time_s in times_s:
+            writer.add_torque(10**18 + round(1e9 * time_s), 0.1)
+    topic = summarise(tmp_path / "a.mcap").topics["load.torque"]
+    assert topic.rate_hz == (rate_hz and pytest.approx(rate_hz))
+    assert (" Hz" in ran("recording", "info", tmp_path / "a.mcap").out) is (rate_hz is not None)
+
+
+@pytest.mark.parametrize(
+    ("name", "begun"),
+    [
+        ("2026-11-21T10-46-18Z_hold-0.10-n-m.mcap", True),
+        ("2026-11-21T10-46-18Z-2.mcap", True),
+        ("2026-11-21T10-46-15Z.mcap", False),
+        ("twist.mcap", False),
+    ],
+)
+def test_info_explains_a_first_message_from_before_the_time_in_the_name(name, begun, tmp_path, ran):
+    """Messages have the times of their measurement, and wait until their file is begun."""
+    path = tmp_path / name
+    began_ns = round(datetime(2026, 11, 21, 10, 46, 15, 500_000, tzinfo=UTC).timestamp() * 1e3) * 10**6
+    with new_recording(path, "a bench") as writer:
+        writer.add_torque(began_ns, 0.1)
+    said = ran("recording", "info", path).out
+    assert ("by its name; what was measured up to 2.5 s before waited for it" in said) is begun
+    assert (":46:18 " in said) is begun
 
 
 def test_list_shows_the_recordings_of_a_folder_with_what_is_known_of_each(recording, tmp_path, ran, mistake):

@@ -332,9 +332,9 @@ def recovered_s(t_s: FloatArray, torque_nm: FloatArray, set_nm: float) -> float:
 def _counted(run: _Run) -> Iterator[str]:
     if run.hold_reasons:
         reasons = "; ".join(f"{times(count)} {reason}" for reason, count in run.hold_reasons.most_common())
-        yield f"  the wrist was held for {run.held_s:.1f} s in all: {reasons}"
+        yield f"  by faults, the wrist was held for {run.held_s:.1f} s in all: {reasons}"
     else:
-        yield "  the wrist was never held"
+        yield "  the wrist was never held by a fault"
     for source, reasons_of in run.invalid.items():
         # A source without any torque has another purpose.
         if source in run.torques:

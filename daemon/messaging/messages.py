@@ -319,7 +319,9 @@ def units(topic: str) -> Mapping[str, str]:
 
 def with_unit(topic: str, key: str, value: float, form: str) -> str:
     """Return a value of a message's key in a format, with the unit of the key: `+0.100 N·m`."""
-    return f"{value:{form}} {units(topic).get(key, '')}".rstrip()
+    # A small negative value rounds to -0.00.
+    shown = value if float(f"{value:{form}}") else 0.0
+    return f"{shown:{form}} {units(topic).get(key, '')}".rstrip()
 
 
 def cause_of(loop_state: Mapping[str, Any]) -> str:

@@ -9,6 +9,7 @@ import pytest
 
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.messaging import messages
+from shearloop.daemon.messaging.messages import with_unit
 from shearloop.daemon.run_summary import RunSummary, TorqueSeries
 
 S = 1_000_000_000
@@ -103,7 +104,8 @@ def test_the_summary_of_a_hold_has_true_torque_and_recovery_from_a_disturbance()
     assert "within ± 10% 3.0 s after the set point changed, by true torque" in text
     assert "disturbed after 12.0 s (kick -0.03): 0.030 N·m off, back within ± 10% after 5.5 s" in text
     assert "1 of 61 torques of right was not valid and not used, most often: no grip" in text
-    assert "the wrist was never held" in text
+    # The torque was held, and no fault has held the wrist.
+    assert "  the wrist was never held by a fault\n" in f"{text}\n"
 
 
 def test_the_most_frequent_reason_is_whole_and_counted_without_its_numbers():
@@ -152,7 +154,7 @@ def test_holds_are_counted_by_their_kind():
         loop_state(23, phase="held", response="hold", faults=stale.text),
         loop_state(24),
     )
-    assert f"held for 2.5 s in all: twice {stale.value.kind}\n" in text
+    assert f"by faults, the wrist was held for 2.5 s in all: twice {stale.value.kind}\n" in text
 
 
 def test_an_experiment_that_was_stopped_says_why():
@@ -404,3 +406,8 @@ def test_each_unit_of_the_summary_is_that_of_a_messages_key(monkeypatch):
     assert "turned by -0.500 <robot.state wrist_rad>" in text
     assert "decided after 0.004 <loop.stop decided_after_s>, sent after 0.006 <loop.stop sent_after_s>" in text
     assert not re.search(r"\d (N·m|rad)", text)
+
+
+@pytest.mark.parametrize(("delay_s", "said"), [(-0.004, "0.00"), (-0.006, "-0.01"), (0.0, "0.00"), (0.8, "0.80")])
+def test_a_value_that_rounds_to_zero_has_no_sign(delay_s, said):
+    assert with_unit("loop.state", "delay_s", delay_s, ".2f") == f"{said} s"

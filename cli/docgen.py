@@ -11,6 +11,8 @@ from shearloop.cli.config_schema import MODELS, Section, references, schema_of, 
 from shearloop.daemon.control.faults import TABLE, Response
 from shearloop.daemon.messaging.messages import TOPICS, Message
 from shearloop.daemon.recorder.schema import json_type
+from shearloop.drivers.eit_kit import FrameErrorKind
+from shearloop.drivers.shear_skin.skin import SkinFault
 from shearloop.units import unit_of
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -78,6 +80,13 @@ def safety_table() -> str:
     return table(("fault", "response", "message", "what to do"), rows)
 
 
+def error_kinds() -> str:
+    """Return the kinds of errors that `health` counts of fingertips and of the skin."""
+    kinds = [("fingertip", kind.name, kind.value) for kind in FrameErrorKind]
+    kinds += [("skin", fault.name, fault.value) for fault in SkinFault]
+    return table(("kind", "of", "meaning"), [(f"`{name.lower()}`", source, what) for source, name, what in kinds])
+
+
 def configuration() -> str:
     """Return the keys of all files that people write, section by section."""
     parts = []
@@ -132,6 +141,7 @@ def pages() -> dict[Path, str]:
         "commands": commands,
         "subscribers": subscribers,
         "safety table": safety_table,
+        "error kinds": error_kinds,
         "configuration": configuration,
     }
     found = {SCHEMAS / f"{kind}.json": schema_text(kind) for kind in MODELS}

@@ -1,7 +1,8 @@
 """The plan of an experiment: each step in words, with direction, angle, torque, force, duration and limits."""
 
+import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -160,29 +161,25 @@ def plan_of(
     speeds = speeds_of(robot)
     known = AT_REST if start is None else start
     ways = _ways_of(file, known)
-    planned: list[StepPlan] = []
-    # The latest grip or tare, with its number: the next step that turns a tool waits for the first torques after it.
-    awaited = ""
-    opened = False
+    found_turns = tuple(turns(file, known))
+    waits = _waits_for_torques(file, found_turns) if warm_up_s > 0 else {}
+    refused_tares = _tares_before_release(file) if gripper is not None else frozenset()
     untared = first_turn_before_tare(file) if file.torque_source in (LOAD_CELL, WRENCH) else None
-    expected = zip(file.steps, turns(file, known), demands(file.steps, speeds, known), strict=True)
+    planned: list[StepPlan] = []
+    expected = zip(file.steps, found_turns, demands(file.steps, speeds, known), strict=True)
     for number, (step, turn, needs) in enumerate(expected, 1):
         duration_s = needs.takes_s
         notes = [*ways.notes(number, step, turn), *_notes(file, step, turn, robot)]
-        if isinstance(step, steps.GripStep | steps.TareStep):
-            awaited = f"step {number} ({step.do})"
-        elif awaited and warm_up_s > 0 and turn.turns_tool:
-            notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques after {awaited}")
+        if number in waits:
+            notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques after {waits[number]}")
             duration_s += warm_up_s
-            awaited = ""
         if needs.begins_anywhere:
             notes.append("how long it takes depends on where the arm stands, and is a guess here")
         if step.timeout_s is not None and needs.takes_s > step.timeout_s:
             notes.append(f"its timeout_s of {step.timeout_s:g} s may stop it before its end")
         if number == untared:
             notes.append("no `tare` comes before it: the start is refused unless a zero is known")
-        opened = opened or isinstance(step, steps.ReleaseStep)
-        if gripper is not None and isinstance(step, steps.TareStep) and not opened:
+        if number in refused_tares:
             notes.append("it is refused unless the gripper knows that it holds nothing: put a `release` before it")
         planned.append(
             StepPlan(
@@ -207,6 +204,26 @@ def plan_of(
     assumed = _assumed(file) if start is None else ""
     limits = file.limits
     return Plan(file.name, file.torque_source, limits.torque_nm, limits.angle_rad, tuple(planned), unknown, assumed)
+
+
+def _waits_for_torques(file: ExperimentFile, found_turns: Sequence[Turn]) -> dict[int, str]:
+    """Return which steps turn a tool first after a grip or a tare, by their numbers, each with that grip or tare."""
+    waits: dict[int, str] = {}
+    latest = ""
+    for number, (step, turn) in enumerate(zip(file.steps, found_turns, strict=True), 1):
+        if isinstance(step, steps.GripStep | steps.TareStep):
+            latest = f"step {number} ({step.do})"
+        elif latest and turn.turns_tool:
+            waits[number] = latest
+            latest = ""
+    return waits
+
+
+def _tares_before_release(file: ExperimentFile) -> frozenset[int]:
+    """Return the numbers of the tares before any release: the gripper may hold a tool since before the start."""
+    numbered = enumerate(file.steps, 1)
+    before = itertools.takewhile(lambda one: not isinstance(one[1], steps.ReleaseStep), numbered)
+    return frozenset(number for number, step in before if isinstance(step, steps.TareStep))
 
 
 _LAST_UNKNOWN = "it may be a reversal: which way the tool turned last before it is not known"

@@ -88,12 +88,14 @@ class _DeviceReplacer:
         # Without another sensor on the tool, the robot turns it on the skin.
         others = config.fingertips or config.load_cell is not None or config.gripper is not None
         on_skin = config.skin is not None and not others
-        if config.skin is not None:
-            self._skin(config.skin, robot if on_skin else None)
-        if robot is None:
+        skin = self._skin(config.skin) if config.skin is not None else []
+        if robot is not None and not on_skin:
+            self._rig(robot, skin)
+        else:
             self._boards()
-        elif not on_skin:
-            self._rig(robot)
+            if skin:
+                turned = ["--robot", self._host, *_robot_arguments(robot)] if robot is not None else []
+                self._emulators.append({"device": "skin", "arguments": skin + turned})
         if config.experiment is not None:
             self._content |= {"autostart": True, "stop_when_done": True}
         if config.recording is not None:
@@ -118,10 +120,12 @@ class _DeviceReplacer:
         self._sentences += sentences_on_open_keys(source, settings)
         return replace(settings, host=self._host)
 
-    def _rig(self, robot: "UrSettings") -> None:
-        """Play robot, gripper, load cell and fingertips over one physics."""
+    def _rig(self, robot: "UrSettings", skin: list[str]) -> None:
+        """Play robot, gripper, load cell, fingertips and skin over one physics; `skin` are the skin's arguments."""
         config = self._config
-        arguments = ["--host", self._host, "--run-dir", str(self._folder), *_robot_arguments(robot)]
+        arguments = ["--host", self._host, "--run-dir", str(self._folder), *_robot_arguments(robot), *skin]
+        if skin:
+            self._sentences.append("the skin bears the whole torque of the emulated tool, as its other sensors do")
         for name, fingertip in config.fingertips.items():
             arguments += ["--fingertip", name, _bank(name, fingertip, self._path)]
             self._replace_port("fingertips", name, link=self._folder / f"eit-{name}")
@@ -180,8 +184,8 @@ class _DeviceReplacer:
         self._sentences.append(f"the gripper, a {gripper.model}, is played at {where}")
         return ["--gripper", interface, "--model", gripper.model]
 
-    def _skin(self, skin: "SkinConfig", robot: "UrSettings | None") -> None:
-        """Play the skin's instruments, and the robot that turns a tool on it, if one is given."""
+    def _skin(self, skin: "SkinConfig") -> list[str]:
+        """Replace the addresses of the skin's instruments, and return the emulator's arguments for it."""
         arguments = ["--bind", LOOPBACKS[0], "--normal-n", str(skin.normal_n)]
         if skin.tool_radius_mm is not None:
             arguments += ["--radius-mm", str(skin.tool_radius_mm)]
@@ -192,13 +196,7 @@ class _DeviceReplacer:
         else:
             arguments += self._instrument(section["daq"]["adc"], "daq", "", "device")
             arguments += ["--daq-rate-hz", str(skin.daq.rate_hz)]
-        if robot is not None:
-            arguments += ["--robot", self._host, *_robot_arguments(robot)]
-        elif self._config.robot is not None:
-            self._sentences.append(
-                "the skin is played untouched: the emulated robot turns the tool of the other sensors"
-            )
-        self._emulators.append({"device": "skin", "arguments": arguments})
+        return arguments
 
     def _instrument(self, section: dict[str, Any], name: str, by_socket: str, by_serial: str) -> list[str]:
         """Replace the address of an instrument, and return the emulator's arguments for the new one."""

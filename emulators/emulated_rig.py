@@ -1,11 +1,11 @@
-"""The whole rig in one process: arm, gripper, load cell and two EIT boards, tied by one physics.
+"""The whole rig in one process: arm, gripper, load cell, EIT boards and shear skin, tied by one physics.
 
-Arm → wrist angle → twin ← force of the fingers; twin → wrench, load cell and EIT frames. The
+Arm → wrist angle → twin ← force of the fingers; twin → wrench, load cell, EIT frames and skin. The
 controller's cycle makes time pass, so that all devices see the same moment.
 """
 
 import asyncio
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
 
@@ -16,18 +16,22 @@ from shearloop.emulators.gripper import Fingers, Gripper, GripperPlayer, ModbusS
 from shearloop.emulators.numbers import number_between
 from shearloop.emulators.ports import PtyServer, Server, SocketServer
 from shearloop.emulators.scene import FloatArray, Joint, Scene, TwinSettings
+from shearloop.emulators.skin import SkinInstruments
+from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.emulators.ur_controller import FAULTS, Controller
 from shearloop.emulators.ur_robot import ControllerSpec, Robot
 
 NOISE_NM = 0.0005
 # Holds more than any limit on the torque, 6 N·m, allows.
 CLAMP_N = 600.0
+# The shear on the skin beyond which its membrane is not modelled.
+MAX_SHEAR_N = 20.0
 JOINTS = {joint.value: joint for joint in Joint}
 # The pads face each other: a shear on the right has the opposite sign on the left.
 SIDES = {"right": 1.0, "left": -1.0}
 COMMANDS = (
     f"kick NM, slip [NM], weigh NM, flip load|FINGERTIP, joint {'|'.join(JOINTS)}, spring NM_PER_RAD, object MM|none, "
-    "silence DEVICE [SECONDS], unplug DEVICE [SECONDS], replug DEVICE, right|left|load FAULT, "
+    "silence DEVICE [SECONDS], unplug DEVICE [SECONDS], replug DEVICE, right|left|load|skin FAULT, "
     "gripper drop|fault CODE|…, a fault of the robot, or normal"
 )
 
@@ -39,7 +43,23 @@ class FrameSynthesiser(Protocol):
         """Return the board's line, (v,) in volts, for grip (0…1) and shear at each injection, (L,) each."""
 
 
-Device: TypeAlias = EitKitBoard | Hx711Board | GripperPlayer | Controller
+Device: TypeAlias = EitKitBoard | Hx711Board | SkinInstruments | GripperPlayer | Controller
+
+
+class SkinOnTool:
+    """The gauges of a synthetic skin that bears the whole torque of the scene's tool, as the other sensors do."""
+
+    def __init__(self, skin: SyntheticSkin, scene: Scene) -> None:
+        self._skin, self._scene = skin, scene
+        self._rested_s = scene.time_s
+
+    def resistances_ohm(self) -> tuple[float, float]:
+        """Return R₁ and R₂ now."""
+        self._skin.rest(self._scene.time_s - self._rested_s)
+        self._rested_s = self._scene.time_s
+        shear_n = self._scene.twin.state.torque_nm * 1e3 / self._skin.radius_mm
+        self._skin.push(min(max(shear_n, -MAX_SHEAR_N), MAX_SHEAR_N))
+        return self._skin.resistances_ohm()
 
 
 class EmulatedRig:
@@ -58,6 +78,7 @@ class EmulatedRig:
         model: GripperModel = MODELS[DEFAULT_MODEL],
         load_cell: bool = True,
         load_rate_hz: float = LOAD_CELL_RATE_HZ,
+        skin: Callable[[Scene], SkinInstruments] | None = None,
         twin: TwinSettings | None = None,
         diameter_mm: float = 20.0,
         speed: float = 1.0,
@@ -68,7 +89,8 @@ class EmulatedRig:
     ) -> None:
         """Gel, fingers and boards are `speed` times as fast as arm, answers and watchdog, which stay in real time.
 
-        `synthesisers` are by the fingertips' names. Without a gripper the tool is clamped to the wrist.
+        `synthesisers` are by the fingertips' names; `skin` makes the instruments of a skin on the scene's tool. Without
+        a gripper the tool is clamped to the wrist.
         """
         gripper = Gripper(object_mm=diameter_mm, fingers=Fingers(model))
         self.scene = Scene(gripper, twin, speed, clamp_n=CLAMP_N if gripper_on == "none" else 0.0)
@@ -93,9 +115,11 @@ class EmulatedRig:
                 link=run_dir / "load-cell",
                 seed=seed,
             )
-        self._played: list[EitKitBoard | Hx711Board | Server] = [*boards.values()]
+        self._played: list[EitKitBoard | Hx711Board | SkinInstruments | Server] = [*boards.values()]
         self.commanded: dict[str, Device] = {**boards}
         self.ports = {name: board.port.appearances for name, board in boards.items()}
+        if skin is not None:
+            self._add_skin(skin(self.scene))
         if gripper_on != "none":
             player = GripperPlayer(
                 gripper,
@@ -108,6 +132,11 @@ class EmulatedRig:
             self.ports["gripper"] = player.server.appearances
         self.commanded["robot"] = self.controller
 
+    def _add_skin(self, instruments: SkinInstruments) -> None:
+        self._played.append(instruments)
+        self.commanded["skin"] = instruments
+        self.ports |= {"skin-source": instruments.source_port, "skin-daq": instruments.daq_port}
+
     async def run(self) -> None:
         """Play all but the robot until cancelled; OSError, in a group, if an address or port is not available."""
         async with asyncio.TaskGroup() as group:
@@ -118,11 +147,11 @@ class EmulatedRig:
         """Execute a command; ValueError, with a sentence, for an unknown one."""
         match text.split():
             case ["kick", jump_nm]:
-                self.scene.kick(_torque(jump_nm))
+                self.scene.kick(torque(jump_nm))
             case ["slip", *left_nm] if len(left_nm) < 2:
-                self.scene.slip(*map(_torque, left_nm))
+                self.scene.slip(*map(torque, left_nm))
             case ["weigh", torque_nm]:
-                self.scene.load_nm = _torque(torque_nm)
+                self.scene.load_nm = torque(torque_nm)
             case ["flip", "load"]:
                 self.scene.load_sign = -1.0
             case ["flip", side] if isinstance(self.commanded.get(side), EitKitBoard):
@@ -166,5 +195,6 @@ class EmulatedRig:
             yield self.scene.conversion_nm(period_s)
 
 
-def _torque(text: str) -> float:
+def torque(text: str) -> float:
+    """Return the torque of a command in N·m; ValueError, with a sentence, for other text."""
     return number_between(text, -5.0, 5.0, "no torque in N·m of at most 5; write for instance 0.05")

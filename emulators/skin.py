@@ -277,10 +277,13 @@ class EmulatedAdcBoard(EmulatedBoard):
 
 
 def adc_lines(circuit: Circuit, seed: int = 0) -> Iterator[bytes]:
-    """Yield a line of the converter board, with its noise and steps, for the voltages at the moment."""
+    """Yield a line of the converter board, with its noise and steps, for the mean voltages since the line before."""
     random = Random(seed)
+    after = circuit.voltages()
     while True:
-        steps = [round((volts + random.gauss(0.0, NOISE_V)) / ADC_STEP_V) for volts in circuit.voltages()]
+        before, after = after, circuit.voltages()
+        means = [(first + last) / 2 for first, last in zip(before, after, strict=True)]
+        steps = [round((volts + random.gauss(0.0, NOISE_V)) / ADC_STEP_V) for volts in means]
         v1_v, v2_v = (min(max(step * ADC_STEP_V, -ADC_FULL_SCALE_V), ADC_FULL_SCALE_V) for step in steps)
         yield f"{v1_v:.6f},{v2_v:.6f}\r\n".encode()
 
@@ -303,41 +306,42 @@ class SkinInstruments:
         seed: int = 0,
     ) -> None:
         self.circuit = Circuit(gauges)
-        source, answer_s = EmulatedKeithley6430(self.circuit, seed), ANSWER_S / speed
-        self._source: SocketServer | PtyServer = (
+        self.source = source = EmulatedKeithley6430(self.circuit, seed)
+        answer_s = ANSWER_S / speed
+        self._server: SocketServer | PtyServer = (
             SocketServer(source, *source_at, answer_s)
             if isinstance(source_at, tuple)
             else PtyServer(source, source_at, answer_s)
         )
-        self.source_port = self._source.appearances
-        self._daq: SocketServer | EmulatedAdcBoard
+        self.source_port = self._server.appearances
+        self.daq: SocketServer | EmulatedAdcBoard
         if isinstance(daq_at, tuple):
-            self._daq = SocketServer(EmulatedScanner(self.circuit, seed + 1), *daq_at, answer_s)
-            self.daq_port = self._daq.appearances
+            self.daq = SocketServer(EmulatedScanner(self.circuit, seed + 1), *daq_at, answer_s)
+            self.daq_port = self.daq.appearances
         else:
             lines = adc_lines(self.circuit, seed + 1)
-            self._daq = EmulatedAdcBoard(lines, period_s=1 / daq_rate_hz / speed, link=daq_at, seed=seed + 1)
-            self.daq_port = self._daq.port.appearances
+            self.daq = EmulatedAdcBoard(lines, period_s=1 / daq_rate_hz / speed, link=daq_at, seed=seed + 1)
+            self.daq_port = self.daq.port.appearances
 
     async def run(self) -> None:
         """Play until cancelled; OSError, in a group, if an address is taken."""
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._source.run())
-            group.create_task(self._daq.run())
+            group.create_task(self._server.run())
+            group.create_task(self.daq.run())
 
     def command(self, text: str) -> None:
         """Execute a command; ValueError, with a sentence, for an unknown one."""
         match text.split():
             case ["source", *words] if words:
-                self._source.command(" ".join(words))
+                self._server.command(" ".join(words))
             case ["daq", *words] if words:
-                self._daq.command(" ".join(words))
+                self.daq.command(" ".join(words))
             case ["silence" | "unplug", *_]:
                 # Without its voltages the skin measures nothing.
-                self._daq.command(text)
+                self.daq.command(text)
             case ["normal"]:
                 self.circuit.mend()
-                self._source.command("normal")
-                self._daq.command("normal")
+                self._server.command("normal")
+                self.daq.command("normal")
             case _:
                 self.circuit.command(text)

@@ -75,6 +75,18 @@ class SyntheticSkin:
         self.push(shear_n)
         return shear_n
 
+    def press(self, jump_nm: float) -> float:
+        """Push the tool so that its torque jumps; return the angle in rad by which that turns it."""
+        before_mm = self._way_mm()
+        self.push(self.shear_n + jump_nm * 1e3 / self.radius_mm)
+        return (self._way_mm() - before_mm) / self.radius_mm
+
+    def _way_mm(self) -> float:
+        """Return how far the tool has moved since its first contact."""
+        return self.shear_n / CONTACT_N_PER_MM + self.membrane.section.outer_radius_mm * self.membrane.turned_rad(
+            self.state
+        )
+
     def rest(self, seconds: float) -> None:
         """Advance the gauges' drift, which stays within the paper's range."""
         keep = math.exp(-seconds / DRIFT_TIME_S)

@@ -20,8 +20,8 @@ from shearloop.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.emulators.emulated_rig import EmulatedRig
-    from shearloop.emulators.scene import Truth
-    from shearloop.emulators.skin import Address
+    from shearloop.emulators.scene import Scene, Truth
+    from shearloop.emulators.skin import Address, Gauges, SkinInstruments
     from shearloop.emulators.synthetic_frames import RigFrames
     from shearloop.emulators.synthetic_skin import SyntheticSkin
 
@@ -36,12 +36,13 @@ Commands, one a line on standard input:
   joint KIND                  put the tool on another joint: lever, tightening, seized
   spring NM_PER_RAD           put it on a lever; gel and lever together are as stiff as this
   object MM | object none     put something of that width between the fingers, or take it away
-  silence DEVICE [SECONDS]    silence a device: right, left, load, gripper, robot
+  silence DEVICE [SECONDS]    silence a device: right, left, load, skin, gripper, robot
   unplug DEVICE [SECONDS]     disconnect a device, without a number until `replug DEVICE`
   weigh NM                    add a torque to the load cell's, on top of the tool's
   flip load|FINGERTIP         turn the sign of the load cell, or of a fingertip's shear
   right|left FAULT            any fault of `emulate eit-kit`, for instance right cut-line
   load FAULT                  any fault of `emulate hx711`, for instance load spike
+  skin FAULT                  any fault of `emulate skin`, for instance skin short 1
   gripper drop|fault CODE|…   the tool falls; or any command of `emulate gripper-socket`
   protective-stop, …          any fault of `emulate ur`
   normal                      end all faults, the robot's included
@@ -50,6 +51,7 @@ With --speed N gel, fingers and boards are N times as fast; the arm stays in rea
 SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear, and the robot's events.
 Commands, one a line on standard input:
   shear N                        push the skin (not while a robot turns it)
+  kick NM                        push the tool on the skin so that its torque jumps by NM (with a robot)
   open 1|2, short 1|2, reversed 1|2, swapped, leads OHM, mend
                                  faults of the circuit
   source silence [SECONDS] | unplug [SECONDS] | normal
@@ -66,6 +68,11 @@ class PushedSkin:
         self.skin = skin
         self._rested_s = time.monotonic()
         self._first_rad: float | None = None
+        self._kicked_rad = 0.0
+
+    def kick(self, jump_nm: float) -> None:
+        """Push the tool so that its torque jumps."""
+        self._kicked_rad += self.skin.press(jump_nm)
 
     def resistances_ohm(self) -> tuple[float, float]:
         """Return R₁ and R₂ now."""
@@ -79,7 +86,7 @@ class PushedSkin:
         """Turn the tool with the wrist, counted from its first angle; return the torque on the flange."""
         if self._first_rad is None:
             self._first_rad = wrist_rad
-        self.skin.turn(wrist_rad - self._first_rad)
+        self.skin.turn(wrist_rad - self._first_rad + self._kicked_rad)
         return -self.skin.torque_nm
 
 
@@ -98,6 +105,7 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", choices=tuple(MODELS), metavar="MODEL", default=DEFAULT_MODEL, help=text)
     parser.add_argument("--no-load-cell", action="store_true", help="play no load cell")
     add_load_cell(parser)
+    _add_skin(parser.add_argument_group("a shear skin that bears the tool's torque, if one of its addresses is given"))
     add_option(parser, "--diameter-mm", TOOL_MM, "MM", "of the tool (default: 20)", default=20.0)
     add_option(parser, "--gel-stiffness", positive(), "NM_PER_RAD", "of both pads (default: %(default)s)", default=0.8)
     console.add_seed_and_speed(parser, "the pace of gel, fingers and boards")
@@ -126,6 +134,7 @@ def _play_rig(args: argparse.Namespace) -> Playing:
         model=MODELS[args.model],
         load_cell=not args.no_load_cell,
         load_rate_hz=args.load_rate_hz,
+        skin=_skin_on_tool(args),
         twin=TwinSettings(gel_stiffness_nm_per_rad=args.gel_stiffness),
         diameter_mm=args.diameter_mm,
         speed=args.speed,
@@ -148,7 +157,7 @@ def _fingertips(args: argparse.Namespace) -> "dict[str, RigFrames]":
         both = RigFrames(args.bank, args.seed, args.sigma)
         return {"right": both, "left": both}
     for name, _ in args.fingertip:
-        if name in ("load", "gripper", "robot"):
+        if name in ("load", "skin", "gripper", "robot"):
             raise UserError(f"--fingertip {name}: another device of the emulated rig has this name; choose another")
     return {name: RigFrames(Path(bank), args.seed + n, args.sigma) for n, (name, bank) in enumerate(args.fingertip)}
 
@@ -182,6 +191,15 @@ def _fields(truth: "Truth") -> dict[str, object]:
 def _configure_skin(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = SKIN_EPILOG
+    _add_skin(parser)
+    console.add_seed_and_speed(parser, "the instruments' own pace")
+    robot = parser.add_argument_group("a robot whose wrist turns a tool on the skin")
+    robot.add_argument("--robot", metavar="HOST", help="play a UR controller on this address of this machine")
+    add_robot(robot)
+
+
+def _add_skin(parser: argparse._ActionsContainer) -> None:
+    """Add the addresses of the skin's instruments, their rate, and the force and the place of the tool."""
     for name, link_help, port_help in (
         ("source", "a name for the source's RS-232 port", "the source on a socket instead"),
         ("daq", "a name for a converter board's port", "a scanner on a socket instead"),
@@ -190,10 +208,6 @@ def _configure_skin(parser: argparse.ArgumentParser) -> None:
         add_option(addresses, f"--{name}-link", Path, "PATH", link_help)
         add_option(addresses, f"--{name}-port", PORT, "N", port_help)
     parser.add_argument("--bind", default="127.0.0.1", metavar="ADDRESS", help="of the sockets (default: %(default)s)")
-    console.add_seed_and_speed(parser, "the instruments' own pace")
-    robot = parser.add_argument_group("a robot whose wrist turns a tool on the skin")
-    robot.add_argument("--robot", metavar="HOST", help="play a UR controller on this address of this machine")
-    add_robot(robot)
     add_option(parser, "--normal-n", number(0.0, 100.0), "N", "force on the skin (default: %(default)s)", default=1.0)
     text = "from the wrist's axis to the skin (default: %(default)s)"
     add_option(parser, "--radius-mm", positive(high=200.0), "MM", text, default=15.0)
@@ -202,17 +216,12 @@ def _configure_skin(parser: argparse.ArgumentParser) -> None:
 
 
 def _play_skin(args: argparse.Namespace) -> Playing:
-    from shearloop.emulators.skin import SkinInstruments
-    from shearloop.emulators.synthetic_skin import SyntheticSkin
+    from shearloop.emulators.emulated_rig import torque
     from shearloop.emulators.ur_controller import Controller
     from shearloop.emulators.ur_robot import Robot
 
-    skin = SyntheticSkin(radius_mm=args.radius_mm, normal_n=args.normal_n, seed=args.seed)
-    pushed = PushedSkin(skin)
-    source_at, daq_at = (_address(args, name) for name in ("source", "daq"))
-    instruments = SkinInstruments(
-        pushed, source_at, daq_at, speed=args.speed, daq_rate_hz=args.daq_rate_hz, seed=args.seed
-    )
+    pushed = PushedSkin(_synthetic_skin(args))
+    instruments = _instruments(args, pushed)
     controller = None
     if args.robot is not None:
         controller = Controller(Robot(robot_make(args), pushed), host=args.robot, rate_hz=args.rate_hz)
@@ -222,6 +231,9 @@ def _play_skin(args: argparse.Namespace) -> Playing:
             case ["robot", *words] if controller is not None:
                 controller.command(" ".join(words))
                 console.print_event("obeyed", detail=line)
+            case ["kick", jump_nm] if controller is not None:
+                pushed.kick(torque(jump_nm))
+                console.print_event("obeyed", detail=line)
             case ["shear", newtons]:
                 refusal = "no force of at most 20 N; write for instance 0.5"
                 pushed.skin.push(number_between(newtons, -20.0, 20.0, refusal))
@@ -230,6 +242,29 @@ def _play_skin(args: argparse.Namespace) -> Playing:
 
     running = instruments.run() if controller is None else play_robot(controller, instruments.run)
     return console.play(running, on_command, source=instruments.source_port, daq=instruments.daq_port)
+
+
+def _skin_on_tool(args: argparse.Namespace) -> "Callable[[Scene], SkinInstruments] | None":
+    """Return what makes the instruments of a skin on the rig's tool; None if no address is given."""
+    from shearloop.emulators.emulated_rig import SkinOnTool
+
+    if all(at is None for at in (args.source_link, args.source_port, args.daq_link, args.daq_port)):
+        return None
+    return lambda scene: _instruments(args, SkinOnTool(_synthetic_skin(args), scene))
+
+
+def _synthetic_skin(args: argparse.Namespace) -> "SyntheticSkin":
+    from shearloop.emulators.synthetic_skin import SyntheticSkin
+
+    return SyntheticSkin(radius_mm=args.radius_mm, normal_n=args.normal_n, seed=args.seed)
+
+
+def _instruments(args: argparse.Namespace, gauges: "Gauges") -> "SkinInstruments":
+    """Return the instruments of these gauges at the given addresses."""
+    from shearloop.emulators.skin import SkinInstruments
+
+    source_at, daq_at = (_address(args, name) for name in ("source", "daq"))
+    return SkinInstruments(gauges, source_at, daq_at, speed=args.speed, daq_rate_hz=args.daq_rate_hz, seed=args.seed)
 
 
 def _address(args: argparse.Namespace, name: str) -> "Address | None":

@@ -89,7 +89,8 @@ def addresses(config: DaemonConfig) -> set[str]:
         (("robot", "skin"), ["skin"]),
         (("robot", "load_cell"), ["rig"]),
         (("robot", "gripper", "fingertips"), ["rig"]),
-        (tuple(REAL), ["skin", "rig"]),
+        (("robot", "gripper", "skin"), ["rig"]),
+        (tuple(REAL), ["rig"]),
     ],
 )
 def test_every_device_of_the_configuration_is_played_and_no_real_address_is_left(real_rig, keys, devices):
@@ -110,8 +111,12 @@ def test_every_device_of_the_configuration_is_played_and_no_real_address_is_left
         assert (rig.gripper, rig.model) == (("socket", "2F-85") if "gripper" in keys else ("none", "2F-140"))
         assert rig.no_load_cell == ("load_cell" not in keys)
         assert rig.payload_kg == 1.3
+    if "skin" in keys:
+        # The robot's tool is pressed and turned on the skin, whichever emulator plays the robot.
+        skin = played[devices[-1]]
+        assert (skin.radius_mm, skin.daq_rate_hz) == (20, 20)
+        assert skin.source_port is not None
     if "skin" in played:
-        assert (played["skin"].radius_mm, played["skin"].daq_rate_hz) == (20, 20)
         assert (played["skin"].robot is not None) == (keys == ("robot", "skin"))
 
 

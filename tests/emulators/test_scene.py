@@ -1,8 +1,14 @@
+from itertools import islice
+
 import numpy as np
 import pytest
 
+from shearloop.cli.emulate.rig import PushedSkin
+from shearloop.emulators.emulated_rig import SkinOnTool
 from shearloop.emulators.gripper import Gripper, GripperRegisters
 from shearloop.emulators.scene import Scene, Truth, TwinSettings
+from shearloop.emulators.skin import Circuit, adc_lines
+from shearloop.emulators.synthetic_skin import SyntheticSkin
 
 DT_S = 0.002
 # A gel that does not creep, so that every torque can be said in advance.
@@ -119,3 +125,41 @@ def test_a_tool_that_falls_takes_the_torque_with_it():
     truth = hands.wait(1.0)
     assert (truth.gripped, truth.torque_nm, truth.diameter_mm) == (False, 0.0, None)
     assert truth.width_mm == pytest.approx(0.0)
+
+
+def test_a_skin_on_the_tool_bears_the_torque_of_a_turn_and_of_a_press():
+    """The daemon compares the torques of all sensors of one tool."""
+    hands, _ = twisted(0.02, 0.2)
+    skin = SyntheticSkin(radius_mm=15.0)
+    gauges = SkinOnTool(skin, hands.scene)
+    gauges.resistances_ohm()
+    assert skin.torque_nm == pytest.approx(STIFF * 0.02)
+    hands.scene.kick(0.03)
+    hands.wait(0.1)
+    gauges.resistances_ohm()
+    assert skin.torque_nm == pytest.approx(STIFF * 0.02 + 0.03)
+
+
+def test_a_press_on_a_skin_that_a_robot_turns_shows_in_its_torque_and_on_the_flange_and_stays():
+    skin = SyntheticSkin(radius_mm=15.0)
+    pushed = PushedSkin(skin)
+    pushed.step(DT_S, 1.0)
+    before_nm = -pushed.step(DT_S, 1.05)
+    assert before_nm > 0.005
+    pushed.kick(0.03)
+    assert [-pushed.step(DT_S, 1.05) for _ in range(3)] == pytest.approx([before_nm + 0.03] * 3)
+    assert skin.torque_nm == pytest.approx(before_nm + 0.03)
+    assert -pushed.step(DT_S, 1.06) > before_nm + 0.03, "the wrist turns it on from there"
+
+
+def test_a_converter_board_sends_the_mean_over_its_conversion():
+    """The driver says that a reading belongs to the middle of its period."""
+    skin = SyntheticSkin()
+    circuit = Circuit(skin, level_a=0.005, output_on=True)
+    lines = adc_lines(circuit)
+    at_rest = next(lines)
+    skin.push(1.0)
+    pressed = [at_rest, *islice(lines, 2)]
+    first, middle, last = (float(line.split(b",")[0]) for line in pressed)
+    assert last - first > 0.005
+    assert middle == pytest.approx((first + last) / 2, abs=2e-5)

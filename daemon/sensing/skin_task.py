@@ -1,7 +1,7 @@
 """The shear skin's task: builds instruments and estimator, publishes the shear force, takes the zero."""
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -16,7 +16,7 @@ from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest, ZeroState
 from shearloop.daemon.torques import SensorListener, TorqueSample, TorqueSource
-from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, SerialLink, TcpLink
+from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, LinkObserver, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinSample
@@ -67,13 +67,7 @@ class SkinTask:
         Raises BankError for an unusable calibration and UserError if the instruments cannot measure these gauges.
         """
         calibration = load_calibration(config.calibration)
-        check_circuit(config, calibration)
-        self._skin = ShearSkin(
-            _current_source(config, inputs.get(SKIN_CURRENT)),
-            _daq(config, inputs.get(SKIN_DAQ)),
-            gauge_ohm(calibration),
-            config.daq.averaged,
-        )
+        self._skin = skin_device(config, calibration, config.daq.averaged, inputs)
         self.source = SkinCurrentTask(self._skin)
         self._estimator = estimator_of(config, calibration)
         self._publisher = publisher
@@ -279,15 +273,36 @@ def estimator_of(config: SkinConfig, calibration: SkinCalibration) -> SkinEstima
     )
 
 
-def _current_source(config: SkinConfig, inputs: InputRecorder | None) -> Keithley6430:
+def skin_device(
+    config: SkinConfig,
+    calibration: SkinCalibration,
+    averaged: int,
+    inputs: Mapping[str, InputRecorder | None] = MappingProxyType({}),
+    observer_of: Callable[[str], LinkObserver | None] = LinkReporter,
+) -> ShearSkin:
+    """Return the skin's instruments, not yet open; `averaged` readings become a sample.
+
+    `observer_of` returns what is told of an instrument's link. Raises UserError if the instruments cannot measure these
+    gauges.
+    """
+    check_circuit(config, calibration)
+    source, daq = (LinkMonitor(observer_of(name)) for name in ("skin source", "skin daq"))
+    return ShearSkin(
+        _current_source(config, source, inputs.get(SKIN_CURRENT)),
+        _daq(config, daq, inputs.get(SKIN_DAQ)),
+        gauge_ohm(calibration),
+        averaged,
+    )
+
+
+def _current_source(config: SkinConfig, monitor: LinkMonitor, inputs: InputRecorder | None) -> Keithley6430:
     source = config.source
-    link = _link(source.socket, source.serial, source.baud, LinkMonitor(LinkReporter("skin source")))
+    link = _link(source.socket, source.serial, source.baud, monitor)
     return Keithley6430(link, current_a=source.current_ma * 1e-3, compliance_v=source.compliance_v, inputs=inputs)
 
 
-def _daq(config: SkinConfig, inputs: InputRecorder | None) -> Daq:
+def _daq(config: SkinConfig, monitor: LinkMonitor, inputs: InputRecorder | None) -> Daq:
     rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
-    monitor = LinkMonitor(LinkReporter("skin daq"))
     if scanner is not None:
         link = _link(scanner.socket, None, DEFAULT_BAUD, monitor)
         channels, range_v = scanner.channels, scanner.range_v

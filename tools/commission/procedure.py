@@ -11,8 +11,10 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.rig import gripper_calibration, open_settings
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, why_not_emulated
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
+from shearloop.daemon.sensing.skin_task import check_circuit
 from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.errors import UserError
+from shearloop.estimation.skin.calibration import load_calibration
 from shearloop.tools.commission import boards, gripper, identity, motion, rtde, stops, tool, wrench
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.limits import EMULATED
@@ -79,6 +81,8 @@ def _open_files(config: DaemonConfig) -> None:
         load_cell_calibration(config.load_cell)
     if config.gripper is not None:
         gripper_calibration(config.gripper)
+    if config.skin is not None:
+        check_circuit(config.skin, load_calibration(config.skin.calibration))
 
 
 def _without_changed(report: Report, config: DaemonConfig, operator: Operator) -> Report:

@@ -1,18 +1,21 @@
 """The rig's devices for a commissioning; each is opened when a stage needs it."""
 
+import asyncio
 from collections.abc import AsyncGenerator
-from contextlib import AbstractContextManager, aclosing
+from contextlib import AbstractContextManager, aclosing, suppress
 from typing import Protocol
 
-from shearloop.daemon.config import DaemonConfig, LoadCellConfig
+from shearloop.daemon.config import DaemonConfig, LoadCellConfig, SkinConfig
 from shearloop.daemon.patience import patience_of
 from shearloop.daemon.rig import gripper_calibration, make_gripper_client
 from shearloop.daemon.sensing.sessions import fingertip_table
+from shearloop.daemon.sensing.skin_task import skin_device
 from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.drivers.connection import SerialLink
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.shear_skin.skin import SkinSample
 from shearloop.drivers.ur.control_box import ControllerInfo, query_controller
 from shearloop.drivers.ur.dashboard import ask_dashboard
 from shearloop.drivers.ur.messages import RtdeOutputs
@@ -20,6 +23,7 @@ from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.drivers.ur.rtde import register_round_trip
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
+from shearloop.estimation.skin.calibration import load_calibration
 from shearloop.tools.commission.arrivals import REAL_CLOCK, Arrivals, Clock
 from shearloop.tools.commission.fingers import ConnectedGripper, Gripper
 from shearloop.tools.commission.listening import BoardListener
@@ -59,6 +63,9 @@ class Rig(Protocol):
 
     def fingertip(self, name: str) -> AbstractContextManager[Arrivals[Frame]]:
         """Return the frames of a configured fingertip."""
+
+    def skin(self) -> AbstractContextManager[Arrivals[SkinSample]]:
+        """Return the readings of the configured skin, which are not averaged."""
 
 
 class ConnectedRig:
@@ -128,3 +135,26 @@ class ConnectedRig:
         link, zero_slots = SerialLink(**config.device.model_dump()), fingertip_table(config).zero_slots
         board = EitKit(link, zero_slots, config.frame_period_s, patience=patience_of(self._config))
         return BoardListener(f"the fingertip {name}", board.readings)
+
+    def skin(self) -> BoardListener[SkinSample]:
+        """Return the readings of the configured skin, which are not averaged."""
+        config = self._config.skin
+        if config is None:
+            raise ValueError("the configuration has no skin")
+        return BoardListener("the skin", lambda: _readings(config))
+
+
+async def _readings(config: SkinConfig) -> AsyncGenerator[SkinSample]:
+    """Yield the skin's readings, and watch its current source; switch it off at the end."""
+    # The report has what is lost, and the terminal the commissioning's own lines.
+    skin = skin_device(config, load_calibration(config.calibration), averaged=1, observer_of=lambda _: None)
+    watching = asyncio.create_task(skin.watch_source())
+    try:
+        async with aclosing(skin.batches()) as batches:
+            async for samples in batches:
+                for sample in samples:
+                    yield sample
+    finally:
+        watching.cancel()
+        with suppress(asyncio.CancelledError):
+            await watching

@@ -34,7 +34,7 @@ class ScriptedOperator:
             "Take the mass": lambda _: self._do("hang 0"),
             "known torque and let": lambda _: self._do("weigh 0.1", "0.1"),
             "Take the known torque": lambda _: self._do("weigh 0"),
-            "on the load cell's lever": lambda _: self._hold(20, "done"),
+            "Put the tool": lambda _: self._hold(20, "done"),
             "Press the tool": lambda _: self._do("kick 0.1"),
             "known stiffness": lambda _: self._hold(20, str(SPRING_NM_PER_RAD)),
             "Which way": lambda _: "counterclockwise",

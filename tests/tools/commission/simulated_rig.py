@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.config import DaemonConfig, SkinConfig
 from shearloop.daemon.sensing.sessions import fingertip_table
+from shearloop.daemon.sensing.skin_task import gauge_ohm
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.errors import DriverError
@@ -18,6 +19,8 @@ from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand,
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.socket_client import ALWAYS, IN_TURN, IN_TURN_S
 from shearloop.drivers.robotiq.widths import WidthCalibration
+from shearloop.drivers.shear_skin.instruments import SOURCE_PERIOD_S, PairParser, Reply, read_elements
+from shearloop.drivers.shear_skin.skin import SampleValidator, SkinSample
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import (
@@ -32,11 +35,15 @@ from shearloop.drivers.ur.messages import (
 from shearloop.drivers.ur.script import UPPER, ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.emulators.boards import PAPER_SKETCH
-from shearloop.emulators.emulated_rig import NOISE_NM, EmulatedRig
+from shearloop.emulators.emulated_rig import NOISE_NM, EmulatedRig, SkinOnTool
 from shearloop.emulators.gripper import COUNTS_MAX, GripperRegisters
+from shearloop.emulators.scene import Scene
+from shearloop.emulators.skin import SkinInstruments
 from shearloop.emulators.synthetic_frames import RigFrames
+from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, ControllerSpec
 from shearloop.emulators.ur_rtde import variable
+from shearloop.estimation.skin.calibration import load_calibration
 from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.failing_worker import NO_DEADLINES
 from shearloop.tools.commission.mover import WATCHDOG_WORKER, Mover
@@ -264,12 +271,34 @@ class SimulatedGripper:
         return self.poll()
 
 
+class SkinReader:
+    """The skin's driver without its ports: queries and replies of the source, lines of the converter board."""
+
+    def __init__(self, rig: "SimulatedRig", instruments: SkinInstruments, config: SkinConfig) -> None:
+        calibration = load_calibration(config.calibration)
+        self._rig, self._source, self._parser = rig, instruments.source, PairParser(config.daq.rate_hz)
+        current_a, rate_hz = config.source.current_ma * 1e-3, config.daq.rate_hz
+        self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, 1 / rate_hz, gauge_ohm(calibration))
+        switch_on = ":SENS:FUNC 'VOLT','CURR'", ":FORM:ELEM VOLT,CURR,STAT", f":SOUR:CURR {current_a}", ":OUTP ON"
+        self._source.feed("\n".join([*switch_on, ""]).encode())
+        self._asked_ns = -BEGIN_NS
+
+    def feed(self, line: bytes, now_ns: int) -> list[SkinSample]:
+        if now_ns - self._asked_ns >= SOURCE_PERIOD_S * 1e9:
+            self._asked_ns = now_ns
+            self._reading = read_elements(Reply(self._source.feed(b":READ?\n").decode().strip(), now_ns, now_ns))
+        return [self._validator.sample(voltages, self._reading) for voltages in self._parser.feed(line, now_ns)]
+
+
+Parser = FrameParser | LoadParser | SkinReader
+
+
 class SimulatedBoard:
     """A board that is due at times, and a parser for those who listen."""
 
     def __init__(self, board: Any, period_s: float) -> None:
         self.board, self.period_s, self.due_s = board, period_s, 0.0
-        self.parser: FrameParser | LoadParser | None = None
+        self.parser: Parser | None = None
         self.listeners: Arrivals[Any] | None = None
 
 
@@ -291,14 +320,16 @@ class SimulatedClock:
 
 
 class SimulatedRig:
-    """The devices of a configuration with one fingertip, `right`."""
+    """The devices of a configuration, whose skin is read by a converter board."""
 
     def __init__(self, config: DaemonConfig, folder: Path) -> None:
         self.config = config
-        right, cell = config.fingertips["right"], config.load_cell
+        cell, skin = config.load_cell, config.skin
         self.emulated = EmulatedRig(
-            {"right": RigFrames(right.bank, 0)},
+            {name: RigFrames(fingertip.bank, 0) for name, fingertip in config.fingertips.items()},
             folder,
+            load_cell=cell is not None,
+            skin=None if skin is None else self._skin_on,
             speed=SPEED,
             make=ControllerSpec(unlock_wait_s=0.5, power_on_s=0.2),
             sketch=replace(PAPER_SKETCH, noise_counts=NOISE_NM),
@@ -311,10 +342,20 @@ class SimulatedRig:
         self._held: list[tuple[int, RtdeOutputs]] = []
         self._mover: SimulatedMover | None = None
         self._observer: Observer | None = None
+        played = self.emulated.commanded
         self._boards = {
-            "right": SimulatedBoard(self.emulated.commanded["right"], right.frame_period_s),
-            "load": SimulatedBoard(self.emulated.commanded["load"], 1.0 / cell.rate_hz),
+            name: SimulatedBoard(played[name], fingertip.frame_period_s)
+            for name, fingertip in config.fingertips.items()
         }
+        if cell is not None:
+            self._boards["load"] = SimulatedBoard(played["load"], 1.0 / cell.rate_hz)
+        if skin is not None:
+            self._boards["skin"] = SimulatedBoard(played["skin"].daq, 1.0 / skin.daq.rate_hz)
+
+    def _skin_on(self, scene: Scene) -> SkinInstruments:
+        skin = self.config.skin
+        model = SyntheticSkin(radius_mm=skin.tool_radius_mm, normal_n=skin.normal_n)
+        return SkinInstruments(SkinOnTool(model, scene), None, None, daq_rate_hz=skin.daq.rate_hz)
 
     # Time.
     def now_ns(self) -> int:
@@ -438,7 +479,14 @@ class SimulatedRig:
             yield arrivals
 
     @contextlib.contextmanager
-    def _listening(self, board: SimulatedBoard, parser: FrameParser | LoadParser) -> Iterator[Arrivals[Any]]:
+    def skin(self) -> Iterator[Arrivals[SkinSample]]:
+        with self._listening(
+            self._boards["skin"], SkinReader(self, self.emulated.commanded["skin"], self.config.skin)
+        ) as arrivals:
+            yield arrivals
+
+    @contextlib.contextmanager
+    def _listening(self, board: SimulatedBoard, parser: Parser) -> Iterator[Arrivals[Any]]:
         board.parser, board.listeners = parser, Arrivals(lambda one: one.t_mid_ns, self.clock, "it is silent")
         try:
             yield board.listeners

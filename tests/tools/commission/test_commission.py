@@ -243,6 +243,43 @@ def test_a_commissioning_is_rehearsed_on_emulated_devices_and_every_line_says_so
     assert "prefers-color-scheme:dark" in page
 
 
+ON_SOCKETS = {
+    "source": {"socket": {"host": "10.0.0.7", "port": 5025}},
+    "daq": {"scanner": {"socket": {"host": "10.0.0.8", "port": 5025}}},
+}
+ON_SERIAL_PORTS = {
+    "source": {"serial": {"serial_number": "0042"}},
+    "daq": {"adc": {"device": {"serial_number": "0043"}}},
+}
+GRIPPER = {"socket": {"host": "192.168.1.10"}}
+
+
+@pytest.mark.real_time
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize(
+    ("instruments", "gripper", "words"),
+    [(ON_SOCKETS, {}, ["done"] * 3), (ON_SERIAL_PORTS, GRIPPER, ["done", "done", "move", "done"])],
+    ids=["clamped to the wrist", "gripped"],
+)
+def test_a_press_shows_in_the_played_skin_through_its_driver(
+    tmp_path, monkeypatch, capsys, instruments, gripper, words
+):
+    """Without fingertips and load cell, through every kind of instrument; the terminal shows its own lines alone."""
+    path, out = write_rig(tmp_path), tmp_path / "emulated.yaml"
+    calibration = Path("config/calibrations/skin_demo.yaml").resolve()
+    content = {"skin": {**instruments, "calibration": str(calibration), "tool_radius_mm": 15}, "robot": "ur.yaml"}
+    path.write_text(yaml.safe_dump({**content, **({"gripper": gripper} if gripper else {})}))
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(["Ada", *words, ""])))
+    assert main(["commission", str(path), "--out", str(out), "--stages", "6", "--emulate"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if not line.startswith("EMULATED: ")] == []
+    (stage,) = yaml.safe_load(out.read_text())["stages"]
+    passed = [line["what"] for line in stage["lines"] if line["verdict"] == "passed"]
+    assert passed[-2:] == ["clock of the skin", "skin's gauges under the press"]
+    assert len(passed) == 7
+    assert "supplies" not in stage or not any(stage["supplies"].values())
+
+
 def test_what_cannot_be_rehearsed_is_refused_before_anything_is_played(tmp_path, mistake):
     path = tmp_path / "rig.yaml"
     path.write_text("load_cell: {device: {path: cell}}\n")
@@ -253,9 +290,19 @@ def test_what_cannot_be_rehearsed_is_refused_before_anything_is_played(tmp_path,
 
 
 @pytest.mark.usefixtures("ur_rtde")
-def test_a_file_that_a_late_stage_needs_is_missed_before_the_first(tmp_path, mistake):
+@pytest.mark.parametrize(
+    ("device", "cure"),
+    [
+        (
+            {"fingertips": {"right": {"device": {"serial_number": "1"}, "bank": "absent.bank"}}},
+            "build it with `shearloop bank build",
+        ),
+        ({"skin": {**ON_SERIAL_PORTS, "calibration": "absent.yaml"}}, "make it with `shearloop skin calibrate`"),
+    ],
+    ids=["bank", "skin"],
+)
+def test_a_file_that_a_late_stage_needs_is_missed_before_the_first(tmp_path, mistake, device, cure):
     path = write_rig(tmp_path, "127.0.0.9")
     content = yaml.safe_load(path.read_text())
-    fingertip = {"device": {"serial_number": "1"}, "bank": "absent.bank"}
-    path.write_text(yaml.safe_dump({**content, "fingertips": {"right": fingertip}}))
-    assert "build it with `shearloop bank build" in mistake("commission", path, "--out", tmp_path / "report.yaml")
+    path.write_text(yaml.safe_dump({**content, **device}))
+    assert cure in mistake("commission", path, "--out", tmp_path / "report.yaml")

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,10 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.robotiq.widths import WidthCalibration
+from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
 from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.emulators.synthetic_skin import SyntheticSkin
+from shearloop.estimation.skin.calibration import load_calibration
 from shearloop.tools.commission import boards, tool
 from shearloop.tools.commission.boards import judge_frames, judge_load
 from shearloop.tools.commission.bounds import LARGEST_RAD, LARGEST_RAD_PER_S, bounded
@@ -27,8 +31,16 @@ from shearloop.tools.commission.limits import EMULATED, REAL
 from shearloop.tools.commission.motion import SIGMAS, Turn, judge_noise
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.rtde import judge_clock, judge_samples
+from shearloop.tools.commission.skin import judge_pressed, judge_skin, why_not_timed
 from shearloop.tools.commission.stops import Stop, judge_stops, rising_speeds
-from shearloop.tools.commission.tap import frame_step_s, judge_clocks, load_step_s
+from shearloop.tools.commission.tap import (
+    frame_step_s,
+    judge_clocks,
+    load_step_s,
+    robot_step_s,
+    skin_step_s,
+    why_hidden,
+)
 from shearloop.tools.commission.tool import Held, judge_signs, judge_twists
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
 from shearloop.tools.commission.wrench import LARGEST_KG, Reading, judge_mass, judge_rest, least_mass_kg
@@ -39,6 +51,12 @@ SIX = (0.0,) * 6
 AT_REST = RtdeOutputs(0.0, SIX, SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1.0, 1, 0, 0.002, 1.0, (0.0, 0.0, 0.0), SIX)
 PERIOD_S = 0.008
 RANDOM = np.random.default_rng(3)
+
+
+@pytest.fixture(autouse=True)
+def _same_noise():
+    """Begin each test with the same noise, whichever tests ran before it."""
+    RANDOM.bit_generator.state = np.random.default_rng(3).bit_generator.state
 
 
 def failed(lines) -> list[str]:
@@ -337,6 +355,29 @@ def test_a_press_is_seen_in_the_noise_of_a_real_wrench(rise_s):
     assert np.quantile(np.abs(errors_s), 0.9) < REAL.clocks_s
 
 
+def wrenches(press_nm: float, period_s: float) -> list[Seen]:
+    """Return states with the noise of a UR5e's data sheet, and a press in their middle, at 2 s."""
+    found = []
+    for number in range(round(4.0 / period_s)):
+        t_s = number * period_s
+        pressed_nm = press_nm * min(max((t_s - 2.0) / 0.1 + 0.5, 0.0), 1.0)
+        wrench = (*SIX[:5], pressed_nm + RANDOM.uniform(-1.0, 1.0) * 0.2 / math.sqrt(3))
+        found.append(Seen(round(1e9 * t_s), round(1e9 * t_s), dataclasses.replace(AT_REST, wrench=wrench)))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("press_nm", "period_s", "hidden"),
+    [(0.2, 0.008, False), (0.04, 0.008, True), (0.08, 0.008, True), (0.08, 0.002, False)],
+)
+def test_a_press_that_the_noise_of_the_wrench_hides_is_no_measure_of_a_clock(press_nm, period_s, hidden):
+    """Where it is not hidden the moments are within the limit."""
+    presses = [wrenches(press_nm, period_s) for _ in range(10)]
+    assert [bool(why_hidden(states, 2.0)) for states in presses] == [hidden] * 10
+    errors_s = [abs(robot_step_s(states) - 2.0) for states in presses]
+    assert (max(errors_s) > REAL.clocks_s) == hidden
+
+
 def test_noise_is_no_press():
     curve = [(number * 8_000_000, RANDOM.normal(0.0, 0.02)) for number in range(700)]
     assert step_s(curve, 0.6) is None
@@ -407,6 +448,116 @@ def test_a_load_cell_alone_beside_a_cb3_has_no_lag_to_judge(monkeypatch, setting
     assert (lag.verdict, "not measured" in lag.value) == (("passed", False) if seen else ("noted", True))
 
 
+CALIBRATION = load_calibration(Path("config/calibrations/skin_demo.yaml"))
+SKIN_PERIOD_S = 0.1
+
+
+def skin_readings(
+    pressed_n: float = 0.0, at_s: float = 4.0, noises: tuple[float, float] = (1e-4, 1e-4), **changes: Any
+) -> list[SkinSample]:
+    """Return readings of an emulated skin for 8 s, each a mean over its period; a press rises within 0.2 s."""
+    skin, found = SyntheticSkin(), []
+    for number in range(80):
+        pairs = []
+        for part in (np.arange(10) + 0.5) / 10:
+            skin.push(pressed_n * min(max((SKIN_PERIOD_S * (number + part) - at_s) / 0.2 + 0.5, 0.0), 1.0))
+            pairs.append(skin.resistances_ohm())
+        r1_ohm, r2_ohm = np.mean(pairs, axis=0) * (1.0 + RANDOM.normal(0.0, noises))
+        mid_ns, end_ns = (round(1e9 * SKIN_PERIOD_S * (number + part)) for part in (0.5, 1.0))
+        found.append(dataclasses.replace(SkinSample(r1_ohm, r2_ohm, mid_ns, end_ns, number), **changes))
+    return found
+
+
+def exchanged(readings: list[SkinSample]) -> list[SkinSample]:
+    return [dataclasses.replace(one, r1_ohm=one.r2_ohm, r2_ohm=one.r1_ohm) for one in readings]
+
+
+@pytest.mark.parametrize(
+    ("readings", "rate_hz", "lines"),
+    [
+        (skin_readings(), 10.0, []),
+        (skin_readings(), 12.0, ["rate of the skin"]),
+        (skin_readings(noises=(0.01, 1e-4)), 10.0, ["noise of the skin's gauge 1"]),
+        (skin_readings(noises=(1e-4, 0.01)), 10.0, ["noise of the skin's gauge 2"]),
+        (skin_readings(r1_ohm=None, r2_ohm=None, faults=(SkinFault.STUCK_2,)), 10.0, ["faults of the skin"]),
+        (exchanged(skin_readings()), 10.0, ["order of the skin's gauges"]),
+    ],
+)
+def test_the_skin_fails_its_line(readings, rate_hz, lines):
+    assert failed(judge_skin(readings, rate_hz, CALIBRATION)) == lines
+
+
+def test_gauges_that_are_alike_show_no_order():
+    alike = CALIBRATION.model_copy(update={"rest_ohm": (25.0, 25.1)})
+    (line,) = (line for line in judge_skin(skin_readings(), 10.0, alike) if "order" in line.what)
+    assert (line.verdict, "not measured" in line.value) == ("noted", True)
+
+
+@pytest.mark.parametrize("at_s", [3.0, 4.03, 5.08])
+@pytest.mark.parametrize("pressed_n", [2.5, -0.2])
+def test_a_skin_shows_the_moment_of_a_press(pressed_n, at_s):
+    assert skin_step_s(skin_readings(pressed_n, at_s)) == pytest.approx(at_s, abs=0.02)
+
+
+def test_a_skin_that_nothing_presses_shows_no_moment():
+    assert skin_step_s(skin_readings()) is None
+    assert skin_step_s(skin_readings(r1_ohm=None, r2_ohm=None)) is None
+
+
+@pytest.mark.parametrize(("pressed_n", "constant"), [(2.8, 1), (2.8, 2), (-2.8, 1), (-2.8, 2)])
+def test_a_gauge_that_a_press_does_not_change_fails_its_line(pressed_n, constant):
+    intact = skin_readings(pressed_n)
+    dead = [dataclasses.replace(one, **{f"r{constant}_ohm": 25.0}) for one in intact]
+    assert failed([judge_pressed(intact, 4.0, CALIBRATION)]) == []
+    assert failed([judge_pressed(dead, 4.0, CALIBRATION)]) == ["skin's gauges under the press"]
+    assert skin_step_s(dead) == pytest.approx(4.0, abs=0.02), "the clock has a line of its own"
+
+
+def test_a_skin_with_a_fault_or_slow_readings_shows_no_moment():
+    assert why_not_timed(skin_readings(), 10.0) == ""
+    assert why_not_timed(skin_readings(faults=(SkinFault.OPEN_1,)), 10.0) == "the skin has a fault"
+    assert why_not_timed(skin_readings(), 4.0) == "readings 0.25 s apart do not show a moment to 50 ms"
+
+
+def reads(readings: list) -> Any:
+    return contextlib.nullcontext(SimpleNamespace(take=lambda count, _: readings[:count], wait_for=lambda *_: None))
+
+
+SKIN_CONFIG = SimpleNamespace(
+    daq=SimpleNamespace(rate_hz=10.0), calibration=Path("config/calibrations/skin_demo.yaml"), normal_n=1.0
+)
+RIGHT = {"right": SimpleNamespace(frame_period_s=0.5)}
+
+
+@pytest.mark.parametrize(
+    ("settings", "fingertips", "skin", "asked"),
+    [
+        (DELIVERED, RIGHT, None, ["clock of right"]),
+        (DELIVERED, {}, SKIN_CONFIG, ["clock of the skin"]),
+        (CB3, RIGHT, SKIN_CONFIG, ["clock of right", "clock of the skin"]),
+        (CB3, RIGHT, None, []),
+        (CB3, {}, SKIN_CONFIG, []),
+    ],
+)
+def test_a_press_is_asked_for_where_two_clocks_show_it(monkeypatch, settings, fingertips, skin, asked):
+    """Of a CB3 no clock of its own shows the press; the device that is alone there has a line that says so."""
+    context: Any = SimpleNamespace(
+        config=SimpleNamespace(fingertips=fingertips, load_cell=None, gripper=None, skin=skin),
+        settings=settings,
+        limits=REAL,
+        counts=SimpleNamespace(frames=18),
+        operator=SimpleNamespace(act=lambda *_: None),
+        rig=SimpleNamespace(fingertip=lambda _: reads(frames()), skin=lambda: reads(skin_readings())),
+    )
+    pressed: list[str] = []
+    monkeypatch.setattr(boards, "_clocks", lambda _, seen_by: pressed.extend(seen_by.lines) or [])
+    lines = boards.measure(context).lines
+    assert pressed == asked
+    clocks = [line for line in lines if line.what.startswith("clock of")]
+    assert [line.verdict for line in clocks] == ([] if asked else ["noted"])
+    assert all("is too noisy" in line.value for line in clocks)
+
+
 def test_five_gauges_make_a_table_of_widths():
     gauges = [(10.0 + 40.0 * number, 100.0 - 20.0 * number) for number in range(5)]
     line, supplied = judge_widths(gauges, SimpleNamespace(model="2F-140"))
@@ -451,18 +602,18 @@ def test_a_straight_move_that_the_watchdog_alone_ends_keeps_the_rigs_watchdog_an
     assert (alone.limits, alone.command_timeout_s) == (DELIVERED.limits, DELIVERED.command_timeout_s)
 
 
-def test_what_a_rig_without_boards_cannot_measure_is_noted_and_raises_no_torque(tmp_path):
+def test_what_a_rig_without_the_papers_boards_cannot_measure_is_noted_and_raises_no_torque(tmp_path):
     path = tmp_path / "rig.yaml"
     source, daq = {"serial": {"serial_number": "1"}}, {"adc": {"device": {"serial_number": "2"}}}
     skin = {"source": source, "daq": daq, "calibration": "skin.yaml"}
     gripper = {"socket": {"host": "192.168.1.10"}}
     path.write_text(yaml.safe_dump({"skin": skin, "robot": "ur.yaml", "gripper": gripper}))
     context = SimpleNamespace(config=load_daemon_config(path))
-    of_boards, of_tool = boards.measure(context), tool.measure(context)
-    assert [line.what for line in of_boards.lines] == ["fingertips", "load cell", "clock of the gripper", "skin"]
+    of_boards, of_tool = boards.unmeasured(context.config), tool.measure(context)
+    assert [line.what for line in of_boards] == ["fingertips", "load cell", "clock of the gripper"]
     assert [line.what for line in of_tool.lines] == ["tool and spring"]
-    assert {line.verdict for line in (*of_boards.lines, *of_tool.lines)} == {"noted"}
-    assert (of_boards.supplies, of_tool.supplies) == (NOTHING_SUPPLIED, NOTHING_SUPPLIED)
+    assert {line.verdict for line in (*of_boards, *of_tool.lines)} == {"noted"}
+    assert of_tool.supplies == NOTHING_SUPPLIED
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import yaml
 
 from benchmarks.stop_times import write_random_bank
 from shearloop.bank.bank_file import Bank
-from shearloop.daemon.commissioning import Line, commissioning_of
+from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Line, commissioning_of
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.rig import open_settings
 from shearloop.tools.commission.bounds import LARGEST_RAD
@@ -62,11 +62,20 @@ def write_rig(folder: Path, host: str, **content: object) -> Path:
     return path
 
 
+# At this radius the skin bears the press that is asked for, as the load cell and the fingertip do.
+SKIN = {
+    "source": {"serial": {"path": "skin-source"}},
+    "daq": {"adc": {"device": {"path": "skin-daq"}}, "rate_hz": 10.0 * SPEED},
+    "calibration": str(Path("config/calibrations/skin_demo.yaml").resolve()),
+    "tool_radius_mm": 75.0,
+}
+
+
 class Lab:
     """A simulated rig and its operator."""
 
     def __init__(self, folder: Path, **content: object) -> None:
-        self.path = write_rig(folder, "127.0.0.9", **content)
+        self.path = write_rig(folder, "127.0.0.9", **{"skin": SKIN, **content})
         self.rig = SimulatedRig(load_daemon_config(self.path), folder)
         self.operator = ScriptedOperator(self.rig.order, self.rig.stop_program)
 
@@ -169,6 +178,9 @@ FAULTS = [
     ("right zero-channel", "6", "dead channels of right"),
     ("right late 1", "6", "clock of right"),
     ("load late 8", "6", "lag of the load cell"),
+    ("skin short 1", "6", "faults of the skin"),
+    ("skin swapped", "6", "order of the skin's gauges"),
+    ("skin daq late 4", "6", "clock of the skin"),
     ("flip load", "7", "sign of the load cell"),
     ("flip right", "7", "sign of the estimate of right"),
 ]
@@ -181,6 +193,54 @@ def test_each_seeded_fault_turns_its_own_line_red(lab, fault, stage, line):
     report, _ = lab.run("" if stage <= "4" else stage)
     assert failed(report) == [line]
     assert report.stages[-1].stage.startswith(stage)
+
+
+@pytest.fixture
+def skin_lab(tmp_path) -> Iterator[Lab]:
+    lab = Lab(tmp_path, fingertips={}, load_cell=None)
+    yield lab
+    lab.close()
+
+
+def test_a_rig_with_a_skin_alone_runs_unattended(skin_lab):
+    report, _ = skin_lab.run()
+    assert failed(report) == []
+    assert [stage.stage for stage in report.stages] == list(STAGES)
+    lines = {line.what: line for line in report.stage("6").lines}
+    assert [what for what, line in lines.items() if line.verdict == "passed"] == [
+        "rate of the skin",
+        "faults of the skin",
+        "noise of the skin's gauge 1",
+        "noise of the skin's gauge 2",
+        "order of the skin's gauges",
+        "clock of the skin",
+        "skin's gauges under the press",
+    ]
+    assert report.stage("6").supplies == NOTHING_SUPPLIED
+    (asked,) = (question for question in skin_lab.operator.asked if "Press the tool" in question)
+    assert "by about 0.2 N·m, with at most 2.8 N on the skin" in asked
+
+
+def test_a_press_that_spares_a_skin_near_the_axis_may_be_hidden_in_the_wrench(tmp_path):
+    """A clock that is not known is not judged: the noise alone would turn its line red."""
+    lab = Lab(tmp_path, fingertips={}, load_cell=None, skin={**SKIN, "tool_radius_mm": 30.0})
+    asked = lab.operator.asked
+    try:
+        report, _ = lab.run("6")
+    finally:
+        lab.close()
+    assert failed(report) == []
+    (line,) = (line for line in report.stages[0].lines if line.what == "clock of the skin")
+    assert line.verdict == "noted"
+    assert "in the noise of the robot's wrench" in line.value
+    assert any("by about 0.084 N·m" in question for question in asked)
+
+
+def test_a_skin_alone_with_a_dead_gauge_is_not_pressed(skin_lab):
+    skin_lab.rig.order("skin open 2")
+    report, _ = skin_lab.run("6")
+    assert failed(report) == ["faults of the skin"]
+    assert not any("Press the tool" in question for question in skin_lab.operator.asked)
 
 
 def test_an_answer_of_12_ms_a_variable_is_fast_enough_for_the_daemon(lab):

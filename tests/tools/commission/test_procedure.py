@@ -236,6 +236,23 @@ def test_a_press_that_spares_a_skin_near_the_axis_may_be_hidden_in_the_wrench(tm
     assert any("by about 0.084 N·m" in question for question in asked)
 
 
+def test_a_skin_is_the_reference_of_a_load_cell_beside_a_cb3(tmp_path):
+    """The wrench of a CB3 is too noisy for a press."""
+    lab = Lab(tmp_path, fingertips={}, skin={**SKIN, "tool_radius_mm": 30.0})
+    settings = yaml.safe_load((tmp_path / "ur.yaml").read_text())
+    limits = {**settings["limits"], "force_n": {"inner": 60, "hard": 90}, "torque_nm": {"inner": 12, "hard": 20}}
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**settings, "generation": "cb3", "limits": limits}))
+    try:
+        report, _ = lab.run("6")
+    finally:
+        lab.close()
+    assert failed(report) == []
+    lines = {line.what: line for line in report.stages[0].lines}
+    assert "clock of the skin" not in lines
+    assert lines["lag of the load cell"].verdict == "passed"
+    assert "behind the skin" in lines["lag of the load cell"].value
+
+
 def test_a_skin_alone_with_a_dead_gauge_is_not_pressed(skin_lab):
     skin_lab.rig.order("skin open 2")
     report, _ = skin_lab.run("6")

@@ -49,6 +49,11 @@ AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
 Interval = tuple[float, float, float]
 
 
+# A frame is read half a period after its middle. One that is read this long after it waited for a reader that stood
+# still, and the next frame is there, or nearly.
+_WAITED_PERIODS = 1.25
+
+
 class Session:
     """State of one run: `estimate` takes every frame of the calibration's sides, in order."""
 
@@ -179,6 +184,13 @@ class Session:
         difference = self._first_difference()
         return None if self.search is None or difference is None else self.search.heatmap(difference)
 
+    def is_old(self, frame: TactileFrame) -> bool:
+        """Return whether a newer frame waits behind this one: nobody needs its position, which takes longest to find.
+
+        Its torque belongs to the history of the newer ones.
+        """
+        return frame.read_after_s > _WAITED_PERIODS * self._period_s
+
     def estimate(self, frame: TactileFrame) -> Estimate:
         """Return the estimate of a frame of the calibration's sides.
 
@@ -200,7 +212,8 @@ class Session:
             return Estimate(valid=False, reasons=processed.reasons)
         self.difference = processed.difference
         estimate = self._predict(processed, frame.t_s)
-        estimate = self._with_position(estimate)
+        if not self.is_old(frame):
+            estimate = self._with_position(estimate)
         return replace(estimate, lag_s=processed.lag_s) if processed.lag_s else estimate
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:

@@ -62,7 +62,12 @@ class CombinedTask(FingertipTask):
         return f"{frames}, without a frame of the other fingertip at that time: no combined estimate"
 
     async def process_pairs(self) -> None:
-        """Estimate from the pairs that wait, in order."""
+        """Estimate from the pairs that wait, in order.
+
+        The newest counts for the control loop, and needs those before it: its estimate goes by how the frames changed.
+        Seven that wait before it after a standstill of 4 s take 4 ms of processor time in all (rig of the demo). The
+        search of their positions in a bank, which takes longer, is left out.
+        """
         async with self._in_order:
             while self._pairs:
                 await self.process(*self._pairs.popleft())

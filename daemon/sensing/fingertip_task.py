@@ -272,15 +272,17 @@ def tactile_frame(frames: tuple[Frame, ...], *, fingers_moved: bool = False) -> 
     repeated = any(frame.repeated and frame.channels.any() for frame in frames)
     t_s = sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9
     usable = [~(frame.saturated | frame.dead) for frame in frames]
-    return TactileFrame(t_s, np.array([frame.channels for frame in frames]), np.array(usable), repeated, fingers_moved)
+    read_after_s = max(frame.t_arrival_ns for frame in frames) / 1e9 - t_s
+    channels = np.array([frame.channels for frame in frames])
+    return TactileFrame(t_s, channels, np.array(usable), repeated, fingers_moved, read_after_s)
 
 
 async def estimate_frames(session: Session, frames: tuple[Frame, ...], *, fingers_moved: bool = False) -> Estimate:
     """Return the estimate of the boards' frames of one time; `fingers_moved` while they were acquired.
 
-    A search of the bank runs in a thread: it can take half a second.
+    A search of the bank runs in a thread: it can take half a second. An old frame has none.
     """
     frame = tactile_frame(frames, fingers_moved=fingers_moved)
-    if session.search is None:
+    if session.search is None or session.is_old(frame):
         return session.estimate(frame)
     return await asyncio.to_thread(session.estimate, frame)

@@ -77,6 +77,9 @@ class FakeSession:
 
     prepare = Session.prepare
 
+    def is_old(self, _frame: TactileFrame) -> bool:
+        return False
+
     def tare(self) -> None:
         self._tared = True
 

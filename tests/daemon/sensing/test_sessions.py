@@ -120,6 +120,28 @@ def test_a_bank_adds_k_sigma_and_heatmaps(files, tiny_bank):
     assert estimate.score == pytest.approx(np.nanmax(heatmap), abs=1e-6)
 
 
+def test_a_frame_that_waited_behind_a_newer_one_has_a_torque_and_no_position(files, tiny_bank):
+    """After a standstill the search of each old frame's position would delay the newest torque."""
+    tips = {side: fingertip(bank=str(tiny_bank), matching="zero_lag") for side in ("right", "left")}
+    prompt, late = (open_combined(CombinedConfig(calibration=files["combined"]), tips) for _ in range(2))
+    played = twisting(seed=3)
+    last = int((IDLE_S + 12.0) / PERIOD_S)
+    read_ns = frame(last, NO_CHANNEL).t_arrival_ns
+    for number in range(last - 7):
+        for session in (prompt, late):
+            estimated(session, *(frame(number, channels) for channels in played.channels[number]))
+    for number in range(last - 7, last + 1):
+        pair = [frame(number, channels) for channels in played.channels[number]]
+        at_once = estimated(prompt, *pair)
+        waited = estimated(late, *(replace(one, t_arrival_ns=read_ns) for one in pair))
+        assert at_once.valid
+        assert replace(waited, k=None, sigma=None, score=None, runner_up=None) == replace(
+            at_once, k=None, sigma=None, score=None, runner_up=None
+        )
+        assert waited.k == (at_once.k if number == last else None)
+    assert waited.k is not None
+
+
 def test_the_calibration_decides_the_estimator(files):
     assert open_session(fingertip(calibration=files["right"]), "right").calibration.estimator.name == NAME
     tips = {"right": fingertip(), "left": fingertip()}

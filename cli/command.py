@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, with_connection
 from shearloop.daemon.messaging import addresses, stop_client
+from shearloop.daemon.messaging.bound_requests import LateRequestError, meant_for
 from shearloop.daemon.messaging.callers import caller
-from shearloop.daemon.messaging.deadlines import NEVER_LATE, TYPED_WITHIN_S, LateRequestError, boot_ns, meant_for
+from shearloop.daemon.messaging.deadlines import NEVER_LATE, TYPED_WITHIN_S, boot_ns
 from shearloop.daemon.running_rig import EMULATED, EMULATED_HEADING
 
 if TYPE_CHECKING:

@@ -5,10 +5,8 @@ act, and the request carries the reading back. The time since that reading is at
 """
 
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, Final, TypeAlias
-
-from shearloop.errors import UserError
+from collections.abc import Callable
+from typing import Final, TypeAlias
 
 # The page's clicks, and commands that are typed, whose program takes a while to begin on a busy computer.
 CLICK_WITHIN_S: Final = 2.0
@@ -17,10 +15,6 @@ TYPED_WITHIN_S: Final = 5.0
 NEVER_LATE: Final = ("status", "stop", "pause")
 # Says why a request has become too old while something was waited for, or None. It takes what that was, and its cure.
 WhyExpired: TypeAlias = Callable[[str, str], str | None]
-
-
-class LateRequestError(UserError):
-    """The operator asked for it too long ago: it was not sent."""
 
 
 def never_expired(_delay: str, _cure: str) -> None:
@@ -40,21 +34,3 @@ def why_too_old(age_s: float, within_s: float) -> str | None:
         f"it may have been asked for {age_s:.1f} s ago, and nothing begins later than {within_s:g} s after that; look "
         "at the rig, and send it again"
     )
-
-
-def meant_for(status: Mapping[str, Any], age_s: float, within_s: float) -> dict[str, str | int]:
-    """Return what binds a request to the daemon that gave this reply to `status`, and to the time that is left.
-
-    A daemon that begins later refuses it. This one refuses it later than `within_s` after the operator's act, which was
-    at most `age_s` ago when the reply came. Raises LateRequestError if no time is left. Nothing binds it to a daemon
-    that does not say which one it is, or what its clock shows.
-    """
-    if (reason := why_too_old(age_s, within_s)) is not None:
-        raise LateRequestError(reason)
-    daemon = status.get("daemon", {})
-    bound: dict[str, str | int] = {}
-    if isinstance(instance := daemon.get("instance"), str):
-        bound["instance"] = instance
-    if isinstance(now_ns := daemon.get("now_ns"), int):
-        bound["until_ns"] = now_ns + round((within_s - age_s) * 1e9)
-    return bound

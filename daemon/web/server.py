@@ -23,8 +23,9 @@ from aiohttp import WSCloseCode, web
 from shearloop.bank.fingertip import Fingertip
 from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.messaging import messages
+from shearloop.daemon.messaging.bound_requests import LateRequestError
 from shearloop.daemon.messaging.client import UnansweredError
-from shearloop.daemon.messaging.deadlines import NEVER_LATE, LateRequestError
+from shearloop.daemon.messaging.deadlines import NEVER_LATE
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.bridge import Bridge, DaemonAddress

@@ -15,6 +15,7 @@ import zmq.asyncio
 from shearloop.cli.command import DAEMON_COMMANDS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
+from shearloop.daemon.messaging.bound_requests import LateRequestError, meant_for
 from shearloop.daemon.messaging.callers import UNKNOWN, caller, caller_of
 from shearloop.daemon.messaging.client import ask, receive_messages, send_command
 from shearloop.daemon.messaging.command_server import (
@@ -25,7 +26,6 @@ from shearloop.daemon.messaging.command_server import (
     CommandServer,
     RequestExecutor,
 )
-from shearloop.daemon.messaging.deadlines import LateRequestError, meant_for
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals

@@ -1,0 +1,32 @@
+"""What a client adds to a request: the daemon that it is meant for, and the time until which it may begin.
+
+It imports little, so that `shearloop command stop` is quick on a busy computer.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from shearloop.daemon.messaging.deadlines import why_too_old
+from shearloop.errors import UserError
+
+
+class LateRequestError(UserError):
+    """The operator asked for it too long ago: it was not sent."""
+
+
+def meant_for(status: Mapping[str, Any], age_s: float, within_s: float) -> dict[str, str | int]:
+    """Return what binds a request to the daemon that gave this reply to `status`, and to the time that is left.
+
+    A daemon that begins later refuses it. This one refuses it later than `within_s` after the operator's act, which was
+    at most `age_s` ago when the reply came. Raises LateRequestError if no time is left. Nothing binds it to a daemon
+    that does not say which one it is, or what its clock shows.
+    """
+    if (reason := why_too_old(age_s, within_s)) is not None:
+        raise LateRequestError(reason)
+    daemon = status.get("daemon", {})
+    bound: dict[str, str | int] = {}
+    if isinstance(instance := daemon.get("instance"), str):
+        bound["instance"] = instance
+    if isinstance(now_ns := daemon.get("now_ns"), int):
+        bound["until_ns"] = now_ns + round((within_s - age_s) * 1e9)
+    return bound

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 # scipy.stats would cost the daemon 40 MB and half of its start-up time.
 from scipy.special import chdtri
 
+from shearloop.daemon.sensing.skin_drift import DriftLearner, zeros_differ_by
 from shearloop.drivers.defaults import DRIFT_PER_HOUR
 from shearloop.drivers.shear_skin.skin import SkinSample
 from shearloop.estimation.skin.calibration import DirectionFinder, ForceFollower, SkinCalibration
@@ -182,9 +183,9 @@ class SkinEstimator:
         self._calibration = calibration
         self._normal_n = normal_n
         self._zero_samples = zero_samples
-        self._drift_per_s = drift_per_hour / 3600.0
+        explained = zeros_differ_by(calibration.friction_response(normal_n), calibration.response_half_width)
+        self._drift = DriftLearner(drift_per_hour, explained)
         self._zero_s = 0.0
-        self._last: tuple[SkinZero, float] | None = None
         self.tare()
 
     def tare(self, from_ns: int = 0, until_ns: int | None = None) -> None:
@@ -223,8 +224,20 @@ class SkinEstimator:
 
     @property
     def drift_per_hour(self) -> float:
-        """The assumed drift of a response: as configured, or more if two zeros have shown it."""
-        return self._drift_per_s * 3600.0
+        """The assumed drift of a response: as configured, or more while the zeros of the last two hours show it."""
+        return self._drift.per_s * 3600.0
+
+    @property
+    def drift_warning(self) -> str:
+        """What a drift beyond the configured one does to the interval, and the cure; empty without one."""
+        if not self._drift.has_learned:
+            return ""
+        per_hour_n = self.drift_per_hour / self._calibration.slope_per_n
+        return (
+            "the skin drifts, or a zero was taken under load: zeros of the last two hours differ by more than friction "
+            f"and noise explain, and the interval widens by {per_hour_n:.2g} N an hour; tare with nothing on the skin. "
+            "If that does not end it, see the gauges' contacts and temperature, and `skin.normal_n`"
+        )
 
     def update(self, sample: SkinSample) -> SkinReading:
         """Return the reading of a sample; an invalid one comes with reasons."""
@@ -252,7 +265,7 @@ class SkinEstimator:
         rest_ohm = self.zero.r1_ohm, self.zero.r2_ohm
         exchanged = are_exchanged(rest_ohm, sample.r1_ohm, sample.r2_ohm, EXCHANGED_TOLERANCE)
         deviation, reasons = _deviation(self._calibration, response_1, response_2, exchanged=exchanged)
-        wider = self.zero.uncertainty + self._drift_per_s * (time_s - self._zero_s) + deviation
+        wider = self.zero.uncertainty + self._drift.per_s * (time_s - self._zero_s) + deviation
         interval = self._calibration.shear_from_response(response, self._normal_n, direction, wider)
         if math.isinf(interval.low_n) or math.isinf(interval.high_n):
             reasons = (*reasons, "the response is beyond the calibrated curve; take load off, or calibrate further")
@@ -267,21 +280,12 @@ class SkinEstimator:
         found = self._taker.add(r1_ohm, r2_ohm)
         if isinstance(found, SkinZero):
             self.zero, self._zero_s, self.refused = found, t_mid_ns / 1e9, None
-            self._learn_drift(found)
+            noise = 2.0 * found.noise / math.sqrt(self._zero_samples)
+            self._drift.add(self._zero_s, _log_ratio(found.r1_ohm, found.r2_ohm), noise)
             self._finder = DirectionFinder(found.noise)
             self._follower = ForceFollower(self._calibration, self._finder.threshold)
         elif found is not None:
             self.refused = found
-
-    def _learn_drift(self, zero: SkinZero) -> None:
-        """Compare with the last zero: loads come and go in between, a drift stays."""
-        if self._last is not None:
-            before, before_s = self._last
-            change_1, change_2 = before.changes(zero.r1_ohm, zero.r2_ohm)
-            drifted = abs(change_1 - change_2)
-            if drifted > 4.0 * (before.noise + zero.noise) / self._zero_samples**0.5:
-                self._drift_per_s = max(self._drift_per_s, drifted / max(self._zero_s - before_s, 1.0))
-        self._last = (zero, self._zero_s)
 
     def _forget_direction(self) -> None:
         if self.zero is not None:

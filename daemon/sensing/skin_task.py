@@ -79,6 +79,7 @@ class SkinTask:
         # The latest request for a zero. The first zero is taken without one.
         self._zero: ZeroRequest | None = None
         self._reason = ""
+        self._drift_warning = ""
         self._valid = 0
 
     async def run(self) -> None:
@@ -89,6 +90,7 @@ class SkinTask:
                     self._expire_zero(sample)
                     self._publish(sample, self._estimator.update(sample))
                     self._follow_estimator()
+                    self._warn_of_drift()
                 if self._inputs is not None and self._inputs.wants_state:
                     state = {**self._skin.state, "estimator": self._estimator}
                     record_state(self._inputs, state, self._estimator.fixed, self._clock.now_ns())
@@ -143,6 +145,12 @@ class SkinTask:
         elif estimator.is_collecting:
             zero.collect()
 
+    def _warn_of_drift(self) -> None:
+        """Say in the log when the latest zero changed what is known of the drift."""
+        before, self._drift_warning = self._drift_warning, self._estimator.drift_warning
+        if self._drift_warning != before:
+            structlog.get_logger().warning(self._drift_warning or "the skin's zeros show no drift any more")
+
     def _not_taken(self, within_s: float) -> str:
         return f"the skin's zero could not be taken within {within_s:.3g} s: {self._reason or 'nothing came'}"
 
@@ -156,7 +164,7 @@ class SkinTask:
         return {
             **voltages,
             "valid": self._valid,
-            "error": self._reason or str(voltages.get("last_refusal", "")),
+            "error": self._reason or self._drift_warning or str(voltages.get("last_refusal", "")),
             "zero_1_ohm": zero.r1_ohm if zero is not None else None,
             "zero_2_ohm": zero.r2_ohm if zero is not None else None,
             "drift_per_hour": self._estimator.drift_per_hour,

@@ -47,6 +47,8 @@ NOT_RISING = (
 # A response has moved when it differs by this many standard deviations of the compared means: by chance about once a
 # week at ten responses a second.
 STANDARD_DEVIATIONS = 5.0
+# Of the search for the response that friction leaves: to 1e-6 of the straight piece.
+BISECTIONS = 20
 # Responses averaged before they are compared.
 AVERAGED = 3
 # A slip proves the direction for this long. A longer time misses a hand that turns back, a shorter one forgets a slow
@@ -143,6 +145,15 @@ class SkinCalibration(BaseModel):
         """The 95 % prediction interval in N of shear, ±, at small forces."""
         capstan = math.exp(self.friction * math.radians(self.gauge_angle_deg))
         return self.response_half_width / self.slope_per_n * capstan
+
+    def friction_response(self, normal_n: float) -> float:
+        """Return the largest response, of either sign, that friction can leave without a shear force."""
+        low, high = 0.0, self.slope_per_n * self.linear_to_n
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            unloaded_n, _ = self._shear_range(middle, middle / self.slope_per_n, normal_n, Direction.UNLOADING)
+            low, high = (middle, high) if unloaded_n < 0 else (low, middle)
+        return high
 
     def band(self, response: float, normal_n: float, direction: Direction) -> ShearInterval:
         """Return the shear forces (N) that friction leaves open for an exact response.

@@ -227,6 +227,20 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
         await bench.valid()
 
 
+async def test_a_drift_that_two_zeros_show_is_said_in_status_and_log(tmp_path, monkeypatch, log):
+    monkeypatch.setattr("shearloop.daemon.sensing.skin_drift.SHORTEST_S", 0.0)
+    async with played(tmp_path) as bench:
+        await bench.valid()
+        bench.skin.push(0.22)
+        await bench.until(lambda content: content["valid"] and content["response"] > 0.015)
+        assert (await bench.command("tare", source="skin"))["ok"]
+        await bench.until(lambda content: content["valid"] and abs(content["response"]) < 0.005)
+        skin = (await bench.command("status"))["tasks"]["skin"]
+        assert skin["drift_per_hour"] > 0.001
+        assert skin["error"].startswith("the skin drifts, or a zero was taken under load")
+        assert skin["error"] in "\n".join(log.said)
+
+
 async def test_one_daemon_carries_a_fingertip_and_a_skin(config):
     async with running_daemon(config(skin=section(ADC))) as daemon:
         health = collector(daemon, "health")

@@ -11,6 +11,8 @@ const LATE_MS = 155000;
 const LIST_LATE_MS = 10000;
 const LIST_AGAIN_MS = 2000;
 const STOP_LATE_MS = 4000;
+// Their first press fetches the daemon's question, and moves nothing.
+const ASKED_FIRST = new Set(["start", "release"]);
 const NO_VIEWER = "the viewer on the rig's computer does not answer";
 // An answer disappears after this time; an unconfirmed stop stays.
 const SHOWN_MS = 8000;
@@ -99,8 +101,14 @@ export class Controls {
   }
 
   doubt(reason) {
+    const { name, onlyAsks } = this.sent;
+    if (onlyAsks) {
+      this.sent = null;
+      this.tell(`${name}: its question did not come, because ${reason}. This click moves nothing. Click again.`, "bad", true);
+      return;
+    }
     this.sent.inDoubt = true;
-    this.tell(`${this.sent.name.toUpperCase()} NOT CONFIRMED: ${reason}. Look at the rig: it may still move.`, "bad", true);
+    this.tell(`${name.toUpperCase()} NOT CONFIRMED: ${reason}. Look at the rig: it may still move.`, "bad", true);
   }
 
   // Fill the picker with the experiments that the daemon offers.
@@ -188,7 +196,8 @@ export class Controls {
     if (digest) words.set("digest", digest);
     if (name === "start" && picked) words.set("experiment", picked);
     if (name === "unlock" && Number.isInteger(this.stopShown)) words.set("stop", this.stopShown);
-    this.sent = { name, id: words.get("request_id"), inDoubt: false };
+    const onlyAsks = !digest && ASKED_FIRST.has(name);
+    this.sent = { name, id: words.get("request_id"), onlyAsks, inDoubt: false };
     this.tell(`${name} …`, "", true);
     const reply = await this.ask(`commands/${name}?${words}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
     if (click !== this.clicks) return;

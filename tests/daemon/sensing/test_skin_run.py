@@ -108,7 +108,7 @@ async def test_a_shear_force_is_streamed_from_either_daq(tmp_path, socket):
         for number in range(80):
             bench.skin.push(0.8 * number / 79)
             content = await bench.shear.get()
-        content = await bench.until(lambda content: content["response"] > 0.0603)
+        content = await bench.until(lambda content: content["valid"] and content["response"] > 0.0603)
         assert content["shear_low_n"] - 0.02 <= 0.8 <= content["shear_high_n"] + 0.02
         assert content["torque_nm"] == pytest.approx(content["shear_n"] * 0.015)
         assert content["response"] == pytest.approx(content["response_1"] - content["response_2"])

@@ -196,6 +196,17 @@ def test_a_start_to_a_daemon_that_stands_still_is_in_doubt_and_never_carried_out
     assert browsed.daemon.asked == ["stop"], "what was sent before the stop is read by then"
 
 
+def test_a_start_whose_question_does_not_come_is_in_no_doubt(browsed):
+    page = browsed.open(token=True)
+    browsed.daemon.say(loop={"phase": "idle"})
+    page.wait_for_selector("#experiment:visible")
+    with browsed.daemon.standing_still():
+        page.click("[data-command=start]:enabled")
+        browsed.until("#answer", "start: its question did not come, because the daemon does not answer")
+        assert "NOT CONFIRMED" not in browsed.text("#answer")
+    assert browsed.daemon.asked == []
+
+
 def test_a_click_on_a_page_that_stands_still_is_not_carried_out_late(browsed):
     page = begin_a_start(browsed)
     # Before the button hears of the click.

@@ -113,13 +113,15 @@ class Session(Protocol):
 class Server(ABC):
     """A device that answers requests, after `answer_s`, and its outages.
 
-    `appearances` gets the port's path or address whenever it can be opened.
+    `appearances` gets the port's path or address whenever it can be opened. The session gets a request after the
+    fraction `measures_at` of the answer's time.
     """
 
     appearances: asyncio.Queue[str]
 
-    def __init__(self, answer_s: float) -> None:
+    def __init__(self, answer_s: float, measures_at: float = 0.0) -> None:
         self.answer_s = self._usual_answer_s = answer_s
+        self._measures_at = measures_at
         # normal, silence or unplug.
         self._state = "normal"
         self._changed = asyncio.Event()
@@ -134,6 +136,16 @@ class Server(ABC):
                 await self._changed.wait()
         finally:
             await self.disconnect()
+
+    async def _reply(self, session: Session, data: bytes) -> bytes:
+        """Return a session's reply once its measurement is over; empty for none, and in a silence."""
+        if self._measures_at:
+            await asyncio.sleep(self._measures_at * self.answer_s)
+        reply = session.feed(data)
+        if not reply or self._state == "silence":
+            return b""
+        await asyncio.sleep((1.0 - self._measures_at) * self.answer_s)
+        return reply
 
     @abstractmethod
     async def restore(self) -> None:
@@ -183,11 +195,9 @@ class PtyServer(Server):
             group.create_task(super().run())
             while True:
                 data = await self._port.received.get()
-                reply = self._session.feed(data)
-                if not reply or self._state == "silence":
+                reply = await self._reply(self._session, data)
+                if not reply:
                     continue
-                # The time of the measurement.
-                await asyncio.sleep(self.answer_s)
                 with contextlib.suppress(ConnectionError):  # unplugged in between
                     await self._port.write(reply)
 
@@ -230,8 +240,10 @@ def accepting(serve: Serve, connections: Connections) -> Callable[[asyncio.Strea
 class SocketServer(Server):
     """A device that answers requests on a socket; each connection gets a copy of `session`."""
 
-    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 0, answer_s: float = 0.0) -> None:
-        super().__init__(answer_s)
+    def __init__(
+        self, session: Session, host: str = "127.0.0.1", port: int = 0, answer_s: float = 0.0, measures_at: float = 0.0
+    ) -> None:
+        super().__init__(answer_s, measures_at)
         self._session = session
         self._host = host
         self._server: asyncio.Server | None = None
@@ -262,9 +274,6 @@ class SocketServer(Server):
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         session = copy(self._session)
         while data := await reader.read(READ_BYTES):
-            replies = session.feed(data)
-            if replies and self._state != "silence":
-                # The time of the measurement.
-                await asyncio.sleep(self.answer_s)
+            if replies := await self._reply(session, data):
                 writer.write(replies)
                 await writer.drain()

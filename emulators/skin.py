@@ -275,6 +275,13 @@ class EmulatedAdcBoard(EmulatedBoard):
 
     faults = ("missing", "garbage", "torn", "silence", "stuck", "unplug")
 
+    def next_line(self, now_s: float) -> bytes:
+        """Return the line that is due now, with its faults, or nothing; its converter runs on in every fault."""
+        line = super().next_line(now_s)
+        if self._lasting is not None:
+            next(self._lines)
+        return line
+
 
 def adc_lines(circuit: Circuit, seed: int = 0) -> Iterator[bytes]:
     """Yield a line of the converter board, with its noise and steps, for the mean voltages since the line before."""
@@ -316,7 +323,8 @@ class SkinInstruments:
         self.source_port = self._server.appearances
         self.daq: SocketServer | EmulatedAdcBoard
         if isinstance(daq_at, tuple):
-            self.daq = SocketServer(EmulatedScanner(self.circuit, seed + 1), *daq_at, answer_s)
+            # Between the conversions of its two channels.
+            self.daq = SocketServer(EmulatedScanner(self.circuit, seed + 1), *daq_at, answer_s, measures_at=0.5)
             self.daq_port = self.daq.appearances
         else:
             lines = adc_lines(self.circuit, seed + 1)

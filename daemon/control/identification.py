@@ -82,8 +82,8 @@ class ToolModel:
 
     @property
     def significant_lag_s(self) -> float:
-        """The lag if it exceeds two standard deviations, else 0."""
-        return self.lag_s if abs(self.lag_s) > 2.0 * self.lag_std_s else 0.0
+        """The lag if it exceeds two standard deviations, else 0: no torque is measured before its cause."""
+        return self.lag_s if self.lag_s > 2.0 * self.lag_std_s else 0.0
 
 
 @dataclass(frozen=True, slots=True)

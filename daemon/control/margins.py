@@ -249,11 +249,7 @@ def gain_for_noise(noise_nm: float, allowed_nm: float) -> float:
 
 
 def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
-    """Return the loop that these settings close around an identified tool.
-
-    A negative lag is limited by the torque's age: no torque is known before its acquisition has ended.
-    """
-    earliest_s = 0.5 * settings.window_s - found.age_s
+    """Return the loop that these settings close around an identified tool."""
     return LoopModel(
         sample_period_s=found.sample_period_s,
         window_s=settings.window_s,
@@ -263,7 +259,7 @@ def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
         kp=settings.kp,
         ki=settings.ki,
         stiffness_ratio=found.stiffness_nm_per_rad / settings.stiffness_nm_per_rad,
-        lag_error_s=max(found.significant_lag_s - settings.lag_s, earliest_s),
+        lag_error_s=found.significant_lag_s - settings.lag_s,
     )
 
 

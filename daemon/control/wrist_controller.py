@@ -189,7 +189,7 @@ def controller_settings(
         stiffness_std_nm_per_rad=found.stiffness_std,
         sample_period_s=found.sample_period_s,
         window_s=source.window_s,
-        lag_s=max(found.significant_lag_s, 0.0),
+        lag_s=found.significant_lag_s,
         kp=kp,
         # An integral that grows while friction hides the torque swings the wrist through the whole friction band.
         ki=0.0 if source.has_friction_band else integral_gain(kp),

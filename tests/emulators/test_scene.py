@@ -7,7 +7,7 @@ from shearloop.cli.emulate.rig import PushedSkin
 from shearloop.emulators.emulated_rig import SkinOnTool
 from shearloop.emulators.gripper import Gripper, GripperRegisters
 from shearloop.emulators.scene import Scene, Truth, TwinSettings
-from shearloop.emulators.skin import Circuit, adc_lines
+from shearloop.emulators.skin import Circuit, EmulatedAdcBoard, adc_lines
 from shearloop.emulators.synthetic_skin import SyntheticSkin
 
 DT_S = 0.002
@@ -163,3 +163,16 @@ def test_a_converter_board_sends_the_mean_over_its_conversion():
     first, middle, last = (float(line.split(b",")[0]) for line in pressed)
     assert last - first > 0.005
     assert middle == pytest.approx((first + last) / 2, abs=2e-5)
+
+
+def test_a_converter_board_converts_on_in_a_silence():
+    """The first line after it is no mean with a voltage from before."""
+    skin = SyntheticSkin()
+    board = EmulatedAdcBoard(adc_lines(Circuit(skin, level_a=0.005, output_on=True)), period_s=0.1)
+    board.command("silence")
+    assert [board.next_line(0.1 * number) for number in range(2)] == [b"", b""]
+    skin.push(1.0)
+    board.next_line(0.2)
+    board.command("normal")
+    first, second = (float(board.next_line(0.3).split(b",")[0]) for _ in range(2))
+    assert first == pytest.approx(second, abs=2e-5)

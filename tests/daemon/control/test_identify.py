@@ -82,6 +82,7 @@ def test_a_lag_within_its_noise_counts_as_none():
     found = identify(record_of(lag_s=0.0), WINDOW_S)
     assert abs(found.lag_s) > 0.0
     assert found.significant_lag_s == 0.0
+    assert identify(record_of(lag_s=-0.3), WINDOW_S).significant_lag_s == 0.0
     assert identify(record_of(lag_s=0.5), WINDOW_S).significant_lag_s == pytest.approx(0.5, abs=0.15)
 
 

@@ -227,5 +227,10 @@ def test_the_model_takes_over_what_was_identified():
     assert model.stiffness_ratio == 2.0
     assert model.lag_error_s == pytest.approx(0.2)
     assert loop_model(SETTINGS, replace(FOUND, lag_s=0.01)).lag_error_s == 0.0
-    # Nothing is known before its window has ended, whatever the fit says.
-    assert loop_model(SETTINGS, replace(FOUND, lag_s=-0.4)).lag_error_s == pytest.approx(0.25 - 0.34)
+    # Nothing is measured before its cause, whatever the fit says.
+    assert loop_model(SETTINGS, replace(FOUND, lag_s=-0.4)).lag_error_s == 0.0
+
+
+def test_a_negative_lag_refuses_no_controller():
+    refused = margin_refusal(SETTINGS, replace(FOUND, lag_s=-0.09, lag_std_s=0.001), LoopConfig())
+    assert refused == margin_refusal(SETTINGS, FOUND, LoopConfig())

@@ -2,9 +2,11 @@
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +16,7 @@ from shearloop.drivers.defaults import DAQ_RATE_HZ
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Keithley6430, ScpiScanner, SourceReading, Voltages
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from shearloop.emulators.ports import SocketServer
-from shearloop.emulators.skin import Circuit, EmulatedKeithley6430, EmulatedScanner, SkinInstruments
+from shearloop.emulators.skin import Circuit, EmulatedKeithley6430, EmulatedScanner, Gauges, SkinInstruments
 from tests.running import DEADLINE_S, LinkEvents, pass_on, running
 
 R1, R2 = 24.6, 25.3
@@ -72,15 +74,37 @@ class Unstrained:
         return R1, R2
 
 
+class Rising:
+    """Gauges that rise with the monotonic clock: a resistance tells when it was measured."""
+
+    def __init__(self) -> None:
+        self._begin_ns = time.monotonic_ns()
+
+    def resistances_ohm(self) -> tuple[float, float]:
+        rises = 0.05 * (time.monotonic_ns() - self._begin_ns) / 1e9
+        return R1 * (1.0 + rises), R2 * (1.0 + rises)
+
+    def measured_ns(self, sample: SkinSample) -> float:
+        return self._begin_ns + (sample.r1_ohm / R1 - 1.0) / 0.05 * 1e9
+
+
 @contextlib.asynccontextmanager
-async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: float = 2.0) -> AsyncIterator[Bench]:
+async def a_bench(
+    folder: Path,
+    *,
+    serial_source: bool,
+    adc: bool,
+    deadline_s: float = 2.0,
+    gauges: Gauges | None = None,
+    speed: float = SPEED,
+) -> AsyncIterator[Bench]:
     source_at, daq_at = folder / "source" if serial_source else ANY_PORT, folder / "adc" if adc else ANY_PORT
-    played = SkinInstruments(Unstrained(), source_at, daq_at, speed=SPEED)
+    played, rate_hz = SkinInstruments(gauges or Unstrained(), source_at, daq_at, speed=speed), speed * DAQ_RATE_HZ
     bench = Bench(played)
     async with running(played.run()):
         source_link = bench.link(await played.source_port.get())
         daq_link = bench.link(await played.daq_port.get())
-        daq = AdcBoard(daq_link, RATE_HZ) if adc else ScpiScanner(daq_link, period_s=1 / RATE_HZ, timeout_s=deadline_s)
+        daq = AdcBoard(daq_link, rate_hz) if adc else ScpiScanner(daq_link, period_s=1 / rate_hz, timeout_s=deadline_s)
         bench.skin = ShearSkin(Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s), daq)
         async with running(
             bench.skin.watch_source(), pass_on(bench.skin.batches(), lambda samples: [*map(bench.on_sample, samples)])
@@ -108,6 +132,16 @@ async def test_resistances_come_through_over_every_way_in(tmp_path, serial_sourc
         assert facts["connected"]
         assert facts["samples"] == len(bench.samples)
     assert not bench.circuit.output_on, "whoever stops measuring switches the current off"
+
+
+@pytest.mark.parametrize("adc", [True, False])
+async def test_a_sample_has_the_time_of_its_measurement(tmp_path, adc):
+    """Half of a conversion, or of a scan, is 50 or 20 ms."""
+    gauges = Rising()
+    async with a_bench(tmp_path, serial_source=False, adc=adc, gauges=gauges, speed=1.0) as bench:
+        await bench.until(lambda: sum(not sample.faults for sample in bench.samples) >= 21)
+    early_s = [(sample.t_mid_ns - gauges.measured_ns(sample)) / 1e9 for sample in bench.samples if not sample.faults]
+    assert abs(median(early_s)) < 0.008
 
 
 @pytest.mark.parametrize("serial_source", [True, False])

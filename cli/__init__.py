@@ -64,6 +64,10 @@ class Parser(argparse.ArgumentParser):
             near = get_close_matches(extras[0].partition("=")[0], self._option_string_actions, 1)
             meant = f"; did you mean {near[0]}?" if near else ""
             self._refuse(f"unrecognized arguments: {' '.join(extras)}{meant}")
+        for action in self._actions:
+            # The types of options that name an output look at the inputs.
+            if (check := getattr(action.type, "check", None)) is not None:
+                check(action, self._actions, found)
         return found, []
 
     def error(self, message: str) -> NoReturn:

@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 
 from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, load_calibration, time_range
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result
-from shearloop.errors import UserError
 from shearloop.tools.outputs import check_overwrite
 from shearloop.words import counted
 
@@ -15,7 +15,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_option(parser, "calibration", Path, "CAL", "made by `shearloop calibrate` on recordings")
     add_option(parser, "recordings", Path, "REC", "recordings (.mcap) of a grip with a twist or more", nargs="+")
-    add_option(parser, "--out", Path, "NEW", "calibration to write", required=True)
+    add_option(parser, "--out", output_path, "NEW", "calibration to write", required=True)
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     text = "fraction of each recording whose twists count, e.g. 0:0.2; earlier frames show the idle fingertip"
     add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
@@ -39,10 +39,6 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.tools.calibrate import adapt_to_recordings
 
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
-    if args.out.exists() and args.out.samefile(args.calibration):
-        raise UserError(
-            f"--out {args.out} is CAL itself, which the next grip needs: it was not changed; choose another"
-        )
     physics = Physics(bank=Bank.open(args.bank) if args.bank else None)
     calibration = load_calibration(args.calibration)
     if not calibration.learned.complete:

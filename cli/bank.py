@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.cli.options import add_action, add_cluster, add_json, add_option, positive, run_action
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
-from shearloop.tools.outputs import check_overwrite, progress_bar, writing
+from shearloop.tools.outputs import YAML_KEYS, check_overwrite, progress_bar, writing
 from shearloop.tools.parallel import processors
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     build = add_action(actions, "build", "build a bank", _build)
     add_option(build, "--config", Path, "FILE", "the bank's configuration (YAML)", required=True)
-    add_option(build, "--out", Path, "PATH", "the bank file to write", required=True)
+    add_option(build, "--out", output_path, "PATH", "the bank file to write", required=True)
     text = "threads, or workers of a cluster of this machine (default: one per core)"
     add_option(build, "--jobs", positive(int), "N", text)
     add_cluster(build)
@@ -36,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(design, "recording", Path, "RECORDING", "a recording (.mcap) or a folder of slices")
     add_option(design, "--fingertip", Path, "FILE", "the fingertip's measures (default: the paper's)")
     design.add_argument("--side", metavar="SIDE", help="side of the recording to design for (default: its first)")
-    add_option(design, "--out", Path, "FILE", "write the YAML there (default: print it)")
+    add_option(design, "--out", output_path, "FILE", "write the YAML there (default: print it)")
     info = add_action(actions, "info", "check a bank's checksums and print its definition", _info)
     add_option(info, "path", Path, "PATH", "the bank file")
     add_json(info)
@@ -46,7 +47,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(solve, "--k", float, "K", "the model's first parameter", required=True)
     add_option(solve, "--sigma", float, "S", "the model's second parameter", required=True)
     add_option(
-        solve, "--out", Path, "V.npy", "file for the float64 voltages, in the order of the channels", required=True
+        solve,
+        "--out",
+        output_path,
+        "V.npy",
+        "file for the float64 voltages, in the order of the channels",
+        required=True,
     )
     add_json(solve)
 
@@ -90,7 +96,7 @@ def _design(args: argparse.Namespace) -> int:
     from shearloop.tools.bank_design import design_yaml, designed_for, doubts, scene_of_recording
 
     if args.out is not None:
-        check_overwrite(args.out, "a configuration")
+        check_overwrite(args.out, "a configuration", YAML_KEYS)
     if args.recording.is_dir():
         from shearloop.studies.slices.scene import scene_of_folder
 

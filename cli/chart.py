@@ -5,6 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 
 from shearloop.cli.options import add_cluster, add_option, number, positive
+from shearloop.cli.output_paths import output_path
 from shearloop.errors import UserError, require
 
 NAMES = {
@@ -21,7 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", choices=NAMES, metavar="NAME", help=listing)
     text = "recordings (.mcap) or folders of slices (default: synthetic frames)"
     add_option(parser, "recordings", Path, "REC", text, nargs="*", default=[])
-    add_option(parser, "--out", Path, "DIR", "folder for the chart and its numbers", required=True)
+    add_option(parser, "--out", output_path, "DIR", "folder for the chart and its numbers", required=True)
     add_option(parser, "--bank", Path, "FILE", "bank to match with (default: a small one, built)")
     add_option(parser, "--mesh", Path, "FILE", "mesh or fingertip to reconstruct and solve on (default: our own)")
     add_option(parser, "--split", number(0.1, 0.9), "SHARE", "earlier part, for the fit (default: 0.6)", default=0.6)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from shearloop.cli.options import add_option
+from shearloop.cli.output_paths import output_path
 from shearloop.daemon.running_rig import EMULATED
 from shearloop.errors import UserError
 
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `commission`."""
     add_option(parser, "config", Path, "CONFIG", "a configuration with a robot; no daemon may run with it")
-    add_option(parser, "--out", Path, "FILE", "the report, a YAML file; an earlier one is continued", required=True)
+    add_option(
+        parser, "--out", output_path, "FILE", "the report, a YAML file; an earlier one is continued", required=True
+    )
     add_option(parser, "--stages", str, "FIGURES", "run only these stages, also again: 34 for 3 and 4", default="")
     add_option(parser, "--stops", int, "N", "stops by each layer at each speed; fewer than 5 raise no speed")
     text = (

@@ -53,6 +53,7 @@ def _mark_files(parser: argparse.ArgumentParser) -> None:
     import shtab
 
     from shearloop.cli.options import path_of
+    from shearloop.cli.output_paths import output_path
 
     for subparser in parts_of(parser).values():
         _mark_files(subparser)
@@ -60,5 +61,5 @@ def _mark_files(parser: argparse.ArgumentParser) -> None:
         if isinstance(action.choices, dict):
             # shtab would take a dictionary of choices for sub-commands.
             action.choices = list(action.choices)
-        if action.type is path_of:
+        if action.type in (path_of, output_path):
             action.complete = shtab.DIR if action.metavar == "DIR" else shtab.FILE  # type: ignore[attr-defined]

@@ -1,6 +1,7 @@
 """`shearloop evaluate CAL REC…`: compare estimates with the load cell of recordings, in numbers and as a figure."""
 
 import argparse
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from shearloop.cli.options import (
     of_slices,
     time_range,
 )
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError, missing
 from shearloop.estimation.defaults import LOADED_NM
@@ -29,7 +31,12 @@ if TYPE_CHECKING:
     from shearloop.tools.figures import Figures
     from shearloop.tools.leave_out import Plan
 
-_FIGURES = (".png", ".svg", ".pdf")
+# The kinds of figures, and how each begins.
+_FIGURES: Mapping[str, bytes | re.Pattern[bytes]] = {
+    ".png": b"\x89PNG",
+    ".svg": re.compile(rb"<\?xml|<svg"),
+    ".pdf": b"%PDF",
+}
 _MEANINGS = {
     "n": "frames with a known torque",
     "rmse_nm": "root mean square error, N·m",
@@ -72,11 +79,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
     text = "minimum known torque of a frame that counts as loaded (default: %(default)s N·m)"
     add_option(parser, "--loaded-nm", number(0.0, 100.0), "NM", text, default=LOADED_NM)
-    add_option(parser, "--estimates", Path, "FILE.csv", "table to write with known torque and estimate of every frame")
+    add_option(
+        parser, "--estimates", output_path, "FILE.csv", "table to write with known torque and estimate of every frame"
+    )
     add_cluster(parser)
     add_json(parser)
     parser.add_argument("--plot", action="store_true", help="draw load cell and estimate over time into --out")
-    add_option(parser, "--out", Path, "FILE", "figure to draw (default with --plot: CAL.png)")
+    add_option(parser, "--out", output_path, "FILE", "figure to draw (default with --plot: CAL.png)")
     parser.epilog = (
         "Prints each figure with its meaning, for frames with a load, for the others and for all, and why frames have "
         "no estimate. Errors and intervals are judged on frames with an estimate and a known torque or diameter."
@@ -86,7 +95,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and draw on request."""
     from shearloop.cli.options import judges_slices, read_judged
-    from shearloop.tools.evaluate import evaluate_recordings, write_estimates
+    from shearloop.tools.evaluate import ESTIMATES_MAGIC, evaluate_recordings, write_estimates
     from shearloop.tools.figures import figures_by_load, figures_of
     from shearloop.tools.outputs import check_overwrite
     from shearloop.tools.parallel import open_executor
@@ -96,10 +105,9 @@ def run(args: argparse.Namespace) -> int:
     if not args.recordings:
         raise UserError("name recordings after the calibration, or judge a recipe with --leave-out")
     _refuse_recipe(args)
-    if args.out is not None and args.out.suffix not in _FIGURES:
-        raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
+    figure = _checked_figure(args)
     if args.estimates is not None:
-        check_overwrite(args.estimates, "a table")
+        check_overwrite(args.estimates, "a table of estimates", ESTIMATES_MAGIC)
     with open_executor(args.cluster) as pool:
         if judges_slices(args.calibration, args.recordings):
             from shearloop.studies.slices.evaluate import evaluate_slices
@@ -120,8 +128,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"Left out: {omission}.", file=sys.stderr)
     for name in found.emulated:
         print(f"EMULATED: every device of {name} was emulated.", file=sys.stderr)
-    if args.plot or args.out:
-        _draw(found, args.out or args.calibration.with_suffix(".png"))
+    if figure is not None:
+        _draw(found, figure)
     by_load, figures = figures_by_load(tracks, args.loaded_nm), figures_of(tracks)
     sentences = [f"Loaded frames have a known torque of {args.loaded_nm:g} N·m or more, unloaded frames less."]
     sentences += _lines({**by_load, "all": figures})
@@ -130,6 +138,23 @@ def run(args: argparse.Namespace) -> int:
         sentences.append(against)
     print_result({**by_load, **figures}, sentences, as_json=args.json)
     return _status(tracks)
+
+
+def _checked_figure(args: argparse.Namespace) -> Path | None:
+    """Return the figure to draw, or None; raises UserError for a path that is no figure's, or another file's."""
+    if args.out is None and not args.plot:
+        return None
+    from shearloop.tools.outputs import check_apart, check_overwrite
+
+    figure: Path = args.out or args.calibration.with_suffix(".png")
+    if figure.suffix not in _FIGURES:
+        raise UserError(f"--out {figure} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
+    # The parser does not know the default of `--out`.
+    others = [("CAL", args.calibration), *(("REC", path) for path in args.recordings)]
+    others += [] if args.estimates is None else [("--estimates", args.estimates)]
+    check_apart("--out", figure, [(f"{name} {path}", path) for name, path in others])
+    check_overwrite(figure, "a figure", _FIGURES[figure.suffix])
+    return figure
 
 
 def _status(tracks: "Sequence[EstimateTrack]") -> int:
@@ -164,7 +189,7 @@ def _refuse_recipe(args: argparse.Namespace) -> None:
 
 def _leave_out(args: argparse.Namespace) -> int:
     """Judge a recipe on the blocks left out of each fit, and print the figures."""
-    from shearloop.tools.evaluate import write_estimates
+    from shearloop.tools.evaluate import ESTIMATES_MAGIC, write_estimates
     from shearloop.tools.figures import figures_by_load, figures_of
     from shearloop.tools.leave_out import sentences_of
     from shearloop.tools.outputs import check_overwrite
@@ -181,7 +206,7 @@ def _leave_out(args: argparse.Namespace) -> int:
     if args.adapt_twists is not None and (args.leave_out == "levels" or of_slices(paths)):
         raise UserError("--adapt-twists is for recordings: slices have no gain to adapt; leave it out")
     if args.estimates is not None:
-        check_overwrite(args.estimates, "a table")
+        check_overwrite(args.estimates, "a table of estimates", ESTIMATES_MAGIC)
     plan, doubts, left_out = (_plan_slices if of_slices(paths) else _plan_recordings)(args, paths)
     with open_executor(args.cluster) as pool:
         found = plan.judge(pool)

@@ -228,9 +228,9 @@ def check_calibration_file(out: Path) -> None:
     """Raise UserError, before anything is measured, unless `out` can become a calibration file."""
     if not out.parent.is_dir():
         raise UserError(f"--out {out} cannot be written: the folder {out.parent} does not exist")
-    from shearloop.tools.outputs import check_overwrite
+    from shearloop.tools.outputs import YAML_KEYS, check_overwrite
 
-    check_overwrite(out, "a calibration file")
+    check_overwrite(out, "a calibration file", YAML_KEYS)
 
 
 def load_calibration(path: Path) -> "Calibration":

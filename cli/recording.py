@@ -20,6 +20,7 @@ from shearloop.cli.options import (
     load_fingertip,
     run_action,
 )
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError
 from shearloop.tools.outputs import check_overwrite, progress_bar, writing
@@ -47,14 +48,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     info.add_argument("--json", action="store_true", help="one JSON object per recording")
     repair = add_action(parts, "repair", "copy the intact part of a damaged or unclosed one into a new one", _repair)
     add_option(repair, "recording", Path, "REC", "e.g. NAME.mcap.partial; it is not changed")
-    add_option(repair, "--out", Path, "FILE", "recording to write (default: NAME.mcap, or NAME.repaired.mcap)")
+    add_option(repair, "--out", output_path, "FILE", "recording to write (default: NAME.mcap, or NAME.repaired.mcap)")
     add_json(repair)
     summary = "write a recording as tables, or for MATLAB, Rerun, LeRobot or `reproduce`"
     export = add_action(parts, "export", summary, _export)
     add_option(export, "recording", Path, "REC", "a closed recording (.mcap); `recording repair` closes another")
     choices = ("csv", "parquet", "mat", "rrd", "lerobot", "slices")
     export.add_argument("--format", choices=choices, default="csv", help="files to write (default: %(default)s)")
-    add_option(export, "--out", Path, "PATH", "folder to write; for mat and rrd a file (default: next to REC)")
+    add_option(export, "--out", output_path, "PATH", "folder to write; for mat and rrd a file (default: next to REC)")
     export.add_argument("--topic", action="append", metavar="TOPIC", help="export only this topic; repeatable")
     add_fingertip(export)
     add_json(export)
@@ -67,7 +68,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     variables = "; ".join(f"{stream}: {' or '.join(names)}" for stream, names in STREAM_VARIABLES.items())
     text = f".mat files of one recording, or its folder; the variable of each stream is {variables}"
     add_option(mat, "sources", Path, "SRC", text, nargs="+")
-    add_option(mat, "--out", Path, "REC", "recording to write, e.g. twist.mcap", required=True)
+    add_option(mat, "--out", output_path, "REC", "recording to write, e.g. twist.mcap", required=True)
     formats_text = "; ".join(f"{name}: {form.words}" for name, form in TIME_FORMATS.items())
     text = f"what the first column's times are (default: %(default)s). {formats_text}"
     mat.add_argument("--time-format", choices=tuple(TIME_FORMATS), default=DATENUM, help=text)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.cli.options import PAPERS_RECORDINGS, add_json, add_option, positive
+from shearloop.cli.output_paths import output_path
 from shearloop.errors import missing
 from shearloop.tools.outputs import progress_bar, writing
 from shearloop.tools.parallel import processors
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_option(parser, "recordings", Path, "RECORDINGS", "folder with torque_slices, diameter_slices")
-    add_option(parser, "--out", Path, "DIR", "folder for banks, figures and numbers", required=True)
+    add_option(parser, "--out", output_path, "DIR", "folder for banks, figures and numbers", required=True)
     add_json(parser)
     default = "RECORDINGS/../reference/fingertip_mesh.npz, or a grid of our own if that file is missing"
     add_option(parser, "--mesh", Path, "FILE", f"mesh (.npz, EIDORS .mat) or fingertip (.yaml); by default {default}")

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.cli.options import add_action, add_json, add_option, number, run_action
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError, require
-from shearloop.tools.outputs import check_overwrite, writing
+from shearloop.tools.outputs import YAML_KEYS, check_overwrite, writing
 
 if TYPE_CHECKING:
     from shearloop.studies.skin.characterisation import FigureOfMerit
@@ -28,11 +29,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     summary = "compare the paper's table with the models'"
     characterise = add_action(actions, "characterise", summary, _characterise)
-    add_option(characterise, "--out", Path, "DIR", "draw figures 4 to 8 and the deadband here, PNG and SVG")
+    add_option(characterise, "--out", output_path, "DIR", "draw figures 4 to 8 and the deadband here, PNG and SVG")
     add_json(characterise)
     calibrate = add_action(actions, "calibrate", "fit a calibration to a recorded table", _calibrate)
     add_option(calibrate, "table", Path, "TABLE", "CSV with r1_ohm, r2_ohm, shear_n, normal_n")
-    add_option(calibrate, "--out", Path, "YAML", "the calibration file to write", required=True)
+    add_option(calibrate, "--out", output_path, "YAML", "the calibration file to write", required=True)
     text = "coefficient of friction, if the table does not determine it"
     add_option(calibrate, "--friction", number(0.0, 1.0), "MU", text)
     add_json(calibrate)
@@ -67,7 +68,7 @@ def _calibrate(args: argparse.Namespace) -> int:
     from shearloop.bank.errors import CalibrationError
     from shearloop.estimation.skin.calibration import fit_calibration, read_table, save_calibration
 
-    check_overwrite(args.out, "a calibration file")
+    check_overwrite(args.out, "a calibration file", YAML_KEYS)
     recorded = read_table(args.table)
     try:
         calibration = fit_calibration(recorded, friction=args.friction)

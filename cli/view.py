@@ -2,9 +2,9 @@
 
 import argparse
 import asyncio
-from pathlib import Path
 
 from shearloop.cli.options import PORT, add_connection, add_fingertip, add_option, client_keys, load_fingertip
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
 from shearloop.errors import UserError, require
@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--foxglove", PORT, "PORT", text)
     add_fingertip(parser)
     text = "the token that permits motion (default: ~/.local/state/shearloop/view-token)"
-    add_option(parser, "--token-file", Path, "FILE", text)
+    add_option(parser, "--token-file", output_path, "FILE", text)
     parser.add_argument("--new-token", action="store_true", help="make a new token; the old one becomes invalid")
     parser.add_argument("--json", action="store_true", help="print the page's address as JSON")
     parser.epilog = "Prints the address to open in a browser of this computer, and serves it until Ctrl-C."

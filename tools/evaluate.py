@@ -25,6 +25,8 @@ from shearloop.words import counted
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# How the table begins that `write_estimates` writes.
+ESTIMATES_MAGIC = b"recording,frame,"
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
 

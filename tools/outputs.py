@@ -2,8 +2,10 @@
 
 import codecs
 import contextlib
+import os
+import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,10 @@ from shearloop.printable import own_stream, printable
 
 # Longer than the 124 characters of text at the start of a MATLAB file.
 _HEAD_BYTES = 512
+# How a YAML file with keys begins, after comments; the comments may be longer than the head. A table does not.
+YAML_KEYS = re.compile(
+    rb"(?:\xef\xbb\xbf)?(?:[ \t\r]*(?:#[^\n]*|---[^\n]*)?\n)*[ \t]*(?:[\w\"'-]+[ \t]*:|(?:#[^\n]*)?\Z)"
+)
 
 
 @contextlib.contextmanager
@@ -25,7 +31,28 @@ def writing(out: Path, what: str) -> Iterator[None]:
         raise UserError(f"{file}: {what} cannot be written: {reason}; choose another path") from error
 
 
-def check_overwrite(out: Path, kind: str, begins: bytes | None = None) -> None:
+def check_apart(option: str, out: Path, others: Iterable[tuple[str, Path]]) -> None:
+    """Raise UserError if `out`, which `option` names, is one of the other files or folders of a command, each named.
+
+    Writing it would destroy what the command reads, or writes elsewhere.
+    """
+    for name, other in others:
+        if is_same_file(out, other):
+            raise UserError(
+                f"{option} {out} and {name} are the same file or folder: nothing was changed; choose another {option}"
+            )
+
+
+def is_same_file(one: Path, other: Path) -> bool:
+    """Return whether both paths lead to one file or folder, over links too, or would once it is written."""
+    try:
+        return one.samefile(other)
+    except OSError:
+        # One of them is missing, or cannot be looked at.
+        return os.path.realpath(one) == os.path.realpath(other)
+
+
+def check_overwrite(out: Path, kind: str, begins: bytes | re.Pattern[bytes] | None = None) -> None:
     """Raise UserError if `out` is a file of another kind: one that does not begin with `begins`, or is no text.
 
     A missing word in `calibrate --out recordings/*.mcap` would otherwise overwrite a recording. Errors of reading are
@@ -38,8 +65,14 @@ def check_overwrite(out: Path, kind: str, begins: bytes | None = None) -> None:
             head = file.read(_HEAD_BYTES)
     except OSError:
         return
-    if head and not (_is_text(head) if begins is None else head.startswith(begins)):
+    if head and not _is_of_kind(head, begins):
         raise UserError(f"{out} exists and is not {kind}: it was not changed; choose another --out")
+
+
+def _is_of_kind(head: bytes, begins: bytes | re.Pattern[bytes] | None) -> bool:
+    if isinstance(begins, bytes):
+        return head.startswith(begins)
+    return _is_text(head) and (begins is None or begins.match(head) is not None)
 
 
 def _is_text(head: bytes) -> bool:

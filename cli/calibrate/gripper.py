@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option, check_calibration_file
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import Operator, print_result
 from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
@@ -36,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", choices=tuple(MODELS), metavar="MODEL", default=DEFAULT_MODEL, help=text)
     text = "an object's diameter; give it once per object, of at least two; four over half of the stroke show its bow"
     add_option(parser, "--diameter-mm", TOOL_MM, "MM", text, action="append", required=True)
-    add_option(parser, "--out", Path, "FILE", "the calibration file to write", required=True)
+    add_option(parser, "--out", output_path, "FILE", "the calibration file to write", required=True)
     add_json(parser)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.cli.options import add_json, add_option, check_calibration_file, number
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import Operator, print_result
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--lever-arm-mm", number(1.0, 1000.0, unit="mm"), "MM", text, default=35.0)
     text = "the turn that presses on the cell counts as negative torque"
     parser.add_argument("--reverse", action="store_true", help=text)
-    add_option(parser, "--out", Path, "FILE", "the calibration file to write", required=True)
+    add_option(parser, "--out", output_path, "FILE", "the calibration file to write", required=True)
     add_json(parser)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.cli.options import add_json, add_option, add_recipe, check_recipe, of_slices, time_range
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
 from shearloop.estimation.estimator_names import DEFAULT
@@ -30,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices, oldest first", nargs="+")
     add_recipe(parser)
-    add_option(parser, "--out", Path, "CAL", "calibration to write", required=True)
+    add_option(parser, "--out", output_path, "CAL", "calibration to write", required=True)
     add_option(parser, "--bank", Path, "FILE", "a bank, which the estimators paper and bank need")
     text = "fraction of each recording to use, e.g. 0:0.5"
     add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from shearloop.cli.emulate import console
 from shearloop.cli.emulate.devices import Playing, add_load_cell, add_robot, load_cell_sketch, play_robot, robot_make
 from shearloop.cli.options import PORT, TOOL_MM, add_option, number, positive
+from shearloop.cli.output_paths import output_path
 from shearloop.drivers.defaults import DAQ_RATE_HZ
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
 from shearloop.emulators.numbers import number_between
@@ -109,7 +110,7 @@ def _configure_rig(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--diameter-mm", TOOL_MM, "MM", "of the tool (default: 20)", default=20.0)
     add_option(parser, "--gel-stiffness", positive(), "NM_PER_RAD", "of both pads (default: %(default)s)", default=0.8)
     console.add_seed_and_speed(parser, "the pace of gel, fingers and boards")
-    add_option(parser, "--truth", Path, "FILE", "append the true state, ten times a second, as JSON")
+    add_option(parser, "--truth", output_path, "FILE", "append the true state, ten times a second, as JSON")
     text = "the load cell sends N·m, as the paper's, not counts"
     parser.add_argument("--paper-sketch", action="store_true", help=text)
     console.add_sigma(parser)

@@ -53,6 +53,7 @@ def load_token(path: Path, *, new: bool = False) -> str:
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if new:
+            _check_small(path)
             path.unlink(missing_ok=True)
         try:
             return _read_token(path)
@@ -66,6 +67,15 @@ def load_token(path: Path, *, new: bool = False) -> str:
         raise UserError(
             f"the token cannot be kept in {path} ({error.strerror}); name another file with --token-file"
         ) from error
+
+
+def _check_small(path: Path) -> None:
+    """Raise UserError for a file that holds more than a token, and is therefore no token's."""
+    if path.exists() and path.stat().st_size > TOKEN_LENGTHS.stop:
+        raise UserError(
+            f"{path} holds more than a token: it was not changed; remove it yourself, or name another file with "
+            "--token-file"
+        )
 
 
 def _read_token(path: Path) -> str:

@@ -27,6 +27,7 @@ from shearloop.cli.bank import MODEL_NAMES
 from shearloop.cli.command import _lines
 from shearloop.cli.completion import arguments_of, full_parser, parts_of
 from shearloop.cli.options import path_of
+from shearloop.cli.output_paths import output_path
 from shearloop.cli.registry import COMMANDS, GROUPS, OTHER_SPELLINGS, command_module
 from shearloop.cli.terminal import StatusLine, loop_line, message_json, message_line, table
 from shearloop.daemon.app import Daemon
@@ -424,7 +425,8 @@ def path_actions() -> list[tuple[str, argparse.Action]]:
         (f"{parser.prog} {action.dest}", action)
         for parser in parsers(full_parser())
         for action in arguments_of(parser)
-        if action.type in (Path, path_of) or (isinstance(action.metavar, str) and named.fullmatch(action.metavar))
+        if action.type in (Path, path_of, output_path)
+        or (isinstance(action.metavar, str) and named.fullmatch(action.metavar))
     ]
 
 

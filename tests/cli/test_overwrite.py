@@ -1,15 +1,24 @@
 """A slip in --out costs nobody a file: commands write over what is of their own kind, and over nothing else."""
 
+import argparse
 import io
 import os
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.io import savemat
 
+from shearloop.cli.completion import arguments_of, full_parser, parts_of
+from shearloop.cli.options import path_of
+from shearloop.cli.output_paths import output_path
 from shearloop.errors import UserError
-from shearloop.tools.outputs import check_overwrite
+from shearloop.tools.commission.report import earlier_report
+from shearloop.tools.outputs import YAML_KEYS, check_overwrite
+from shearloop.tools.recordings.tables import RecordedTopics
 
 MCAP = b"\x89MCAP0\r\n and what cannot be recorded again"
 
@@ -64,3 +73,146 @@ def test_same_kind_empty_and_special_files_may_be_overwritten(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     check_overwrite(tmp_path / "pipe", "a bank", b"BANK")
     check_overwrite(tmp_path, "a bank", b"BANK")
+
+
+TABLE = "r1_ohm,r2_ohm,shear_n,normal_n\n1.0,2.0,0.1,1.0\n"
+
+
+@pytest.mark.parametrize(
+    ("begins", "is_one"),
+    [
+        ("a: 1\n", True),
+        ("# a remark\n\n---\n'a' : 1\n", True),
+        ("# a remark that is longer than what is looked at" * 20, True),
+        (TABLE, False),
+        ("# a remark\n" + TABLE, False),
+        ("\n" * 600, True),
+        ("- a\n- b\n", False),
+    ],
+)
+def test_keys_overwrite_only_keys(begins, is_one, tmp_path):
+    (tmp_path / "file").write_text(begins)
+    if is_one:
+        check_overwrite(tmp_path / "file", "a calibration file", YAML_KEYS)
+    else:
+        with pytest.raises(UserError, match="is not a calibration file: it was not changed"):
+            check_overwrite(tmp_path / "file", "a calibration file", YAML_KEYS)
+
+
+@pytest.mark.parametrize(
+    ("command", "kind"),
+    [
+        ("skin calibrate no.csv --out", "a calibration file"),
+        ("bank design no.mcap --out", "a configuration"),
+        ("evaluate {cal} no.mcap --estimates", "a table of estimates"),
+        ("evaluate --leave-out twists no.mcap --estimates", "a table of estimates"),
+    ],
+)
+def test_no_command_overwrites_another_table(command, kind, tmp_path, mistake):
+    there = tmp_path / "precious.csv"
+    there.write_text(TABLE)
+    (tmp_path / "cal").touch()
+    said = mistake(*command.format(cal=tmp_path / "cal").split(), there)
+    assert f"{there} exists and is not {kind}: it was not changed" in said
+    assert there.read_text() == TABLE
+
+
+class Slip(NamedTuple):
+    """A command whose option `writes` names the file of its argument `reads`."""
+
+    words: tuple[str, ...]
+    parser: argparse.ArgumentParser
+    writes: argparse.Action
+    reads: argparse.Action
+
+    def typed(self, out: Path, source: Path) -> list[str]:
+        """Return the words of the command line."""
+        values = {id(self.writes): str(out), id(self.reads): str(source)}
+        positional, options = [], []
+        for action in arguments_of(self.parser):
+            value = values.get(id(action)) or (_any_value(action) if action.required else None)
+            if value is not None and action.option_strings:
+                options += [action.option_strings[-1], value]
+            elif value is not None:
+                positional.append(value)
+        return [*self.words, *positional, *options]
+
+
+def _any_value(action: argparse.Action) -> str:
+    return str(next(iter(action.choices))) if action.choices else "1"
+
+
+def slips() -> Iterator[Slip]:
+    """Yield every option of every command that names what is written, with every other path of that command."""
+
+    def below(parser: argparse.ArgumentParser, words: tuple[str, ...]) -> Iterator[Slip]:
+        for name, part in parts_of(parser).items():
+            yield from below(part, (*words, name))
+        paths = [action for action in arguments_of(parser) if action.type in (path_of, output_path)]
+        for writes in paths:
+            for reads in paths:
+                if writes.type is output_path and reads is not writes:
+                    yield Slip(words, parser, writes, reads)
+
+    yield from below(full_parser(), ())
+
+
+def _all_actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    yield from arguments_of(parser)
+    for part in parts_of(parser).values():
+        yield from _all_actions(part)
+
+
+def test_every_option_that_writes_a_file_is_known_as_one():
+    writes = re.compile(r"\bto write\b|\bwrite the\b|\bfigure to draw\b|\bdraw figures\b|\bappend\b")
+    found = {action.dest for action in _all_actions(full_parser()) if action.type is output_path}
+    assert {"out", "estimates", "truth", "token_file"} == found
+    for action in _all_actions(full_parser()):
+        if action.type is path_of:
+            assert "--out" not in action.option_strings
+            assert not writes.search(action.help or ""), action.option_strings
+
+
+@pytest.mark.parametrize("way", ["its name", "relative", "symbolic link", "hard link"])
+@pytest.mark.parametrize(
+    "slip", list(slips()), ids=lambda one: "-".join([*one.words, one.writes.dest, one.reads.dest]).replace(" ", "")
+)
+def test_no_command_writes_over_what_it_reads(slip, way, tmp_path, monkeypatch, mistake):
+    source = out = tmp_path / "source"
+    source.write_text(TABLE)
+    if way == "relative":
+        monkeypatch.chdir(tmp_path)
+        out = Path("source")
+    elif way == "symbolic link":
+        out = tmp_path / "link"
+        out.symlink_to(source)
+    elif way == "hard link":
+        out = tmp_path / "link"
+        out.hardlink_to(source)
+    said = mistake(*slip.typed(out, source))
+    assert "are the same file or folder: nothing was changed" in said
+    assert source.read_text() == TABLE
+
+
+def test_the_default_figure_is_no_calibration_and_no_other_picture(tmp_path, mistake):
+    calibration, recording = tmp_path / "right.png", tmp_path / "twist.mcap"
+    for path in (calibration, recording):
+        path.write_text(TABLE)
+    said = mistake("evaluate", calibration, recording, "--plot")
+    assert f"--out {calibration} and CAL {calibration} are the same file" in said
+    said = mistake("evaluate", tmp_path / "right.cal", recording, "--plot")
+    assert f"{calibration} exists and is not a figure: it was not changed" in said
+    assert calibration.read_text() == TABLE
+
+
+def test_a_table_of_an_export_is_not_the_recording(imported, tmp_path, mistake):
+    content = imported.read_bytes()
+    recording = imported.rename(tmp_path / f"{next(iter(RecordedTopics(imported)))}.csv")
+    said = mistake("recording", "export", recording, "--out", tmp_path)
+    assert f"{recording} and the recording {recording} are the same file" in said
+    assert recording.read_bytes() == content
+
+
+def test_a_report_is_not_its_own_page(tmp_path):
+    with pytest.raises(UserError, match=r"report\.html is the name of the report's page"):
+        earlier_report(tmp_path / "report.html")

@@ -20,9 +20,10 @@ from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.limits import EMULATED
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.remembered import LeftRobot
-from shearloop.tools.commission.report import Measured, earlier_report, report_for, save_report
+from shearloop.tools.commission.report import Measured, earlier_report, page_path, report_for, save_report
 from shearloop.tools.commission.rig import ConnectedRig, Rig
 from shearloop.tools.commission.tactile import calibrated_sessions
+from shearloop.tools.outputs import check_apart
 
 Measure = Callable[[Context], Measured]
 
@@ -58,6 +59,7 @@ def commission(
         raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
     # Before any device is asked: it may be the name of another file.
     earlier = earlier_report(out)
+    check_apart("--out", page_path(out), [(f"the configuration {path}", path)])
     _open_files(config)
     with ExitStack() as opened:
         # A daemon would drive the robot at the same time.

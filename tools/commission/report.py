@@ -86,6 +86,8 @@ def _row(kind: str, cells: Iterable[str], verdict: str = "") -> str:
 
 def earlier_report(path: Path) -> Report | None:
     """Return the report in a file, to continue it, or None if the file does not exist; UserError for another file."""
+    if path == page_path(path):
+        raise UserError(f"--out {path} is the name of the report's page; choose one that ends in .yaml")
     return load_report(path) if path.exists() else None
 
 
@@ -109,10 +111,15 @@ def report_for(rig: RigIdentity, found: Report | None, path: Path) -> Report:
     return found
 
 
+def page_path(report: Path) -> Path:
+    """Return the path of a report's page, beside it."""
+    return report.with_suffix(".html")
+
+
 def save_report(path: Path, report: Report, unmeasured: Sequence[str] = ()) -> Path:
     """Write the report, and its page into the same folder; return the page's path."""
     save_yaml(path, report.model_dump(mode="json", exclude_none=True), UserError)
-    page = path.with_suffix(".html")
+    page = page_path(path)
     try:
         page.write_text(page_of(report, unmeasured), encoding="utf-8")
     except OSError as error:

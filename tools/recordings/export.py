@@ -14,6 +14,7 @@ from scipy.io import savemat
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
+from shearloop.tools.outputs import check_apart
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.message_content import column_units, columns
 from shearloop.tools.recordings.reader import read_messages
@@ -107,6 +108,8 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
         require("pyarrow", "export", "Parquet")
     out.mkdir(parents=True, exist_ok=True)
     paths = {topic: out / f"{topic}.{form}" for topic in topics}
+    for table in paths.values():
+        check_apart("--out", table, [(f"the recording {path}", path)])
     tables: dict[str, _CsvTable | _ParquetTable] = {}
     # Every table ends before the first file is replaced.
     with ExitStack() as files, ExitStack() as ends:

@@ -552,6 +552,12 @@ def test_the_token_is_made_once_and_readable_by_its_owner_only(tmp_path):
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert load_token(path) == token
     assert load_token(path, new=True) != token
+    # Any other file, which a person named by mistake.
+    path.write_text("lines of a table\n" * 20)
+    with pytest.raises(UserError, match="holds more than a token: it was not changed"):
+        load_token(path, new=True)
+    assert path.read_text() == "lines of a table\n" * 20
+    path.unlink()
 
 
 def test_readable_or_invalid_token_files_are_refused(tmp_path):

@@ -102,7 +102,7 @@ def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder,
     assert "give one of the two: a frame that counts twice" in mistake("adapt", calibration, recording, copy, *out)
     before = calibration.read_bytes()
     said = mistake("adapt", calibration, recording, "--time-range", "0:0.38", "--out", calibration)
-    assert "1.cal is CAL itself, which the next grip needs: it was not changed" in said
+    assert "are the same file or folder: nothing was changed; choose another --out" in said
     assert calibration.read_bytes() == before
 
 

@@ -2,13 +2,11 @@
 
 import argparse
 import sys
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final
 
 from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, positive
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.running_rig import EMULATED_HEADING
-from shearloop.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.daemon.messaging.client import Subscriber
@@ -40,25 +38,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print messages until Ctrl-C, or up to `--count`."""
     from shearloop.cli.terminal import message_json, message_line
-    from shearloop.daemon.messaging.client import QUIET_S, Subscriber, receive_messages
-    from shearloop.daemon.messaging.messages import TOPICS
+    from shearloop.daemon.messaging.client import QUIET_S, Subscriber, prefix_of, receive_messages
 
-    known = {*TOPICS, *(topic.partition(".")[0] for topic in TOPICS)}
-    # A first part may end with its point.
-    topics = [topic.removesuffix(".") for topic in args.topics]
-    for topic in topics:
-        if topic not in known:
-            near = "".join(f"; did you mean {name}?" for name in get_close_matches(topic, TOPICS, 1)) or "."
-            raise UserError(f"there is no topic {topic!r}{near} The topics are {', '.join(TOPICS)}")
+    for topic in args.topics:
+        prefix_of(topic)
     write = message_json if args.json else message_line
 
     def print_hint() -> None:
         nothing = f"shearloop listen: no message came from {args.connect} in {QUIET_S:g} s; waiting"
-        asked = f"there (`shearloop run CONFIG`), and does it publish {' or '.join(topics) or 'anything'}?"
+        asked = f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?"
         print(f"{nothing}. Is a daemon running {asked}", file=sys.stderr, flush=True)
 
     keys = client_keys(args)
-    received = receive_messages(args.connect, topics, args.timeout, keys, print_hint)
+    received = receive_messages(args.connect, args.topics, args.timeout, keys, print_hint)
     with Subscriber(args.connect, ("health",), keys=keys) as health:
         for number, (topic, content) in enumerate(received, start=1):
             if number == 1 and _is_emulated(health):

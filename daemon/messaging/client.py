@@ -1,18 +1,21 @@
 """Clients of a daemon: receive its messages, send it a command."""
 
 import asyncio
+import enum
 import logging
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
+from difflib import get_close_matches
 from typing import Any, TypeAlias
 
 import zmq
 import zmq.asyncio
+from zmq.utils.monitor import parse_monitor_message
 
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, READ_ONLY, has_valid_port, needs_keys
 from shearloop.daemon.messaging.deadlines import TYPED_WITHIN_S
 from shearloop.daemon.messaging.keys import ClientKeys
-from shearloop.daemon.messaging.messages import ENVELOPE, decode, encode
+from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, decode, encode
 from shearloop.daemon.messaging.stop_client import foreign_reply
 from shearloop.errors import UserError
 from shearloop.timeouts import timeout
@@ -20,6 +23,13 @@ from shearloop.timeouts import timeout
 TopicContent: TypeAlias = tuple[str, dict[str, Any]]
 # A running daemon sends `health` every second.
 QUIET_S = 3.0
+# A publisher that runs accepts a connection in less.
+PROBE_S = 0.3
+LONGEST_TIMEOUT_S = 86_400.0
+
+
+class UnreachedError(UserError):
+    """No message of a daemon came; its sentence names no option of the command line."""
 
 
 class UnansweredError(UserError):
@@ -29,20 +39,28 @@ class UnansweredError(UserError):
 class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicContent], AsyncIterator[TopicContent]):
     """Messages of a daemon as (topic, content), for `for` and for `async for`; close it, or use `with`.
 
-    It receives the topics that start with one of `topics`, or all. Raises UserError for a malformed address, for
-    messages of another program, and if no message arrives for `timeout_s`. Without `timeout_s` it waits, and calls
-    `on_quiet` once if no message has come in QUIET_S; by default that is a warning.
+    It receives one topic or several, or all: `topics` are names, such as `eit.estimate`, or their first part, such as
+    `eit`. Raises UserError for an unknown topic, for a malformed address, for messages of another program, and if no
+    message arrives for `timeout_s`. Without `timeout_s` it waits, and calls `on_quiet` once if no message has come in
+    QUIET_S; by default that is a warning.
     """
 
     def __init__(
         self,
         address: str = PUBLISH_ADDRESS,
-        topics: Iterable[str] = (),
+        topics: str | Iterable[str] = (),
         timeout_s: float | None = None,
         keys: ClientKeys | None = None,
         on_quiet: Callable[[], None] | None = None,
     ) -> None:
         """Connect; an address on another computer needs keys."""
+        self._topics = [topics] if isinstance(topics, str) else list(topics)
+        prefixes = [prefix_of(topic) for topic in self._topics]
+        if timeout_s is not None and not 0 < timeout_s <= LONGEST_TIMEOUT_S:
+            raise UserError(
+                f"timeout_s is {timeout_s:g}; give seconds above 0 and up to {LONGEST_TIMEOUT_S:g}, or None to wait "
+                "without end"
+            )
         self._address, self._timeout_s, self._keys = address, timeout_s, keys
         self._on_quiet, self._has_waited = on_quiet or self._warn, timeout_s is not None
         self._context = zmq.asyncio.Context()
@@ -54,8 +72,8 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         except Exception:
             self.close()
             raise
-        for topic in tuple(topics) or ("",):
-            self._socket.setsockopt(zmq.SUBSCRIBE, topic.encode())
+        for prefix in prefixes or [b""]:
+            self._socket.setsockopt(zmq.SUBSCRIBE, prefix)
 
     def wait(self, timeout_s: float | None) -> bool:
         """Return whether a message arrives within these seconds; None waits without end."""
@@ -75,7 +93,8 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         if not self._has_waited:
             self._note(came=self.wait(QUIET_S))
         if not self.wait(self._timeout_s):
-            raise self._no_message()
+            with _Probe(self._address, self._keys) as probe:
+                raise self._no_message(probe.found(came=bool(probe.blocking.poll(_milliseconds(PROBE_S)))))
         return self._decoded(self._blocking.recv_multipart())
 
     async def __anext__(self) -> TopicContent:
@@ -83,7 +102,8 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         if not self._has_waited:
             self._note(came=bool(await self._socket.poll(_milliseconds(QUIET_S))))
         if not await self._socket.poll(_milliseconds(self._timeout_s)):
-            raise self._no_message()
+            with _Probe(self._address, self._keys) as probe:
+                raise self._no_message(probe.found(came=bool(await probe.events.poll(_milliseconds(PROBE_S)))))
         return self._decoded(await self._socket.recv_multipart())
 
     def _note(self, *, came: bool) -> None:
@@ -95,11 +115,22 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         waits = "no message came from %s in %g s; waiting. Is a daemon running there?"
         logging.getLogger(__name__).warning(waits, self._address, QUIET_S)
 
-    def _no_message(self) -> UserError:
-        return UserError(
-            f"no message came from {self._address} for {self._timeout_s:g} s; start the daemon with "
-            "`shearloop run CONFIG`, or give the address of its `publish` key with --connect"
-            f"{keys_hint(self._keys)}"
+    def _no_message(self, found: "_Found") -> UserError:
+        nothing = f"no message came from {self._address} for {self._timeout_s:g} s"
+        if found is _Found.PUBLISHER:
+            wanted = f"no {' or '.join(self._topics)}" if self._topics else "nothing"
+            return UserError(
+                f"{nothing}: a daemon is there and publishes {wanted} now; its configuration may have no device for "
+                "it, and `shearloop listen` shows what it publishes"
+            )
+        if found is _Found.OTHER:
+            return UnreachedError(
+                f"{nothing}: the program there does not publish to this client; give the address of the daemon's "
+                f"`publish` key, which is not that of its `commands`{_keys_hint(self._keys)}"
+            )
+        return UnreachedError(
+            f"{nothing}: no daemon publishes there; start it with `shearloop run CONFIG`, or give the address of its "
+            f"`publish` key{_keys_hint(self._keys)}"
         )
 
     def _decoded(self, parts: list[bytes]) -> TopicContent:
@@ -109,11 +140,62 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
             if missing := ENVELOPE - content.keys():
                 raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         except ValueError as error:
-            raise UserError(
+            raise UnreachedError(
                 f"the messages of {self._address} are not shearloop's ({error}); give the address of the daemon's "
-                "`publish` key with --connect"
+                "`publish` key"
             ) from error
         return name.decode(errors="replace"), content
+
+
+def prefix_of(topic: str) -> bytes:
+    """Return what a topic, or the topics of a first part, begin with; raises UserError if there is none.
+
+    ZeroMQ compares beginnings. So a first part ends with its point, and no topic begins with another one.
+    """
+    if not isinstance(topic, str):
+        raise UserError(f"{topic!r} is no topic; give the name of one, such as {next(iter(TOPICS))!r}")
+    name = topic.removesuffix(".")
+    if name in TOPICS:
+        return name.encode()
+    if any(known.startswith(f"{name}.") for known in TOPICS) and "." not in name:
+        return f"{name}.".encode()
+    near = "".join(f"; did you mean {known}?" for known in get_close_matches(topic, TOPICS, 1)) or "."
+    raise UserError(f"there is no topic {topic!r}{near} The topics are {', '.join(TOPICS)}")
+
+
+class _Found(enum.Enum):
+    """What a probe finds at an address."""
+
+    NOTHING = enum.auto()
+    PUBLISHER = enum.auto()
+    # It ended the connection: it has another kind of socket, or other keys.
+    OTHER = enum.auto()
+
+
+class _Probe(AbstractContextManager["_Probe", None]):
+    """A new connection to an address, which shows what is there; `events` and `blocking` tell when it is known."""
+
+    def __init__(self, address: str, keys: ClientKeys | None) -> None:
+        self._context = zmq.asyncio.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        ends = zmq.EVENT_DISCONNECTED
+        failed = zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+        failed |= zmq.EVENT_HANDSHAKE_FAILED_AUTH
+        self.events = self._socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | ends | failed)
+        self.blocking: zmq.Socket[bytes] = zmq.Socket.shadow(self.events.underlying)
+        connect(self._socket, address, keys)
+
+    def found(self, *, came: bool) -> _Found:
+        """Return what is there; `came`: an event is to be read."""
+        if not came:
+            return _Found.NOTHING
+        event = parse_monitor_message(self.blocking.recv_multipart())
+        return _Found.PUBLISHER if event["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED else _Found.OTHER
+
+    def __exit__(self, *_: object) -> None:
+        """Disconnect."""
+        self._socket.disable_monitor()
+        self._context.destroy(linger=0)
 
 
 def _milliseconds(seconds: float | None) -> int | None:
@@ -127,9 +209,12 @@ def receive_messages(
     keys: ClientKeys | None = None,
     on_quiet: Callable[[], None] = lambda: None,
 ) -> Iterator[TopicContent]:
-    """Yield the messages of a Subscriber; calls `on_quiet` if none arrives in the first QUIET_S."""
-    with Subscriber(address, topics, timeout_s, keys, on_quiet) as subscriber:
-        yield from subscriber
+    """Yield the messages of a Subscriber for a command; calls `on_quiet` if none arrives in the first QUIET_S."""
+    try:
+        with Subscriber(address, topics, timeout_s, keys, on_quiet) as subscriber:
+            yield from subscriber
+    except UnreachedError as error:
+        raise UserError(f"{error}; see --connect, --key and --server-key") from error
 
 
 def send_command(
@@ -167,9 +252,10 @@ async def ask(
                 late = ". Nothing says that the arm stands: use the emergency stop. If the stop still arrives, it "
                 late += f"stops what moves then; {_end_sentence(content)}"
             kind = UnansweredError if in_doubt else UserError
+            with_keys = f"{_keys_hint(keys)} (--key and --server-key)"
             raise kind(
                 f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
-                f"or give the address of its `commands` key with --connect{keys_hint(keys)}{late}"
+                f"or give the address of its `commands` key with --connect{with_keys}{late}"
             ) from error
         except ValueError as error:
             raise foreign_reply(address, error) from error
@@ -192,7 +278,7 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = N
         keys.apply(socket)
     elif needs_keys(address):
         raise UserError(
-            f"{address} is not on this machine: give your key with --key and the daemon's with --server-key; "
+            f"{address} is not on this machine: give your key and the daemon's, as `ClientKeys`; "
             "`shearloop keys client` makes yours, docs/service.md shows the rest"
         )
     try:
@@ -203,8 +289,8 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = N
         ) from error
 
 
-def keys_hint(keys: ClientKeys | None) -> str:
+def _keys_hint(keys: ClientKeys | None) -> str:
     """Return a hint about keys: a daemon on the network does not answer a wrong key at all."""
     if keys is None:
-        return "; a daemon with a network address answers only with --key and --server-key"
+        return "; a daemon with a network address answers only with keys"
     return "; it answers only keys that `sudo shearloop keys allow FILE` has added"

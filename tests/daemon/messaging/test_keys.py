@@ -122,6 +122,9 @@ async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, con
             await asking.send(encode({"command": "status"}))
             assert not await asking.poll(SILENCE_MS), who
             assert not await hearing.poll(0), who
+            in_vain = pytest.raises(UserError, match="does not publish to this client")
+            with Subscriber(published, keys=stranger, timeout_s=0.01) as subscriber, in_vain:
+                await anext(subscriber)
         assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
         anyone = partial(asyncio.to_thread, send_to_stop_socket, commands)
         for name in ("start", "resume", "unlock", "tare", "pause"):

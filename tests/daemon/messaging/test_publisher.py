@@ -12,7 +12,7 @@ import zmq.asyncio
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.client import Subscriber, receive_messages
-from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, decode, encode
+from shearloop.daemon.messaging.messages import TOPICS, EitFrame, LoadTorque, decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.errors import UserError
 from tests.fixtures.daemons import DEADLINE_S
@@ -172,6 +172,68 @@ async def test_a_subscriber_is_iterated_with_and_without_asyncio(publisher, tmp_
         with pytest.raises(UserError, match=r"no message came from .* for 0.01 s"):
             await anext(silent)
     until(lambda: not publisher.has_subscribers())
+
+
+def test_one_topic_may_be_given_alone_and_nothing_else_is_received(publisher, tmp_path):
+    address = f"ipc://{tmp_path}/publish"
+    with Subscriber(address, "load.torque", DEADLINE_S) as one, Subscriber(address, "load", DEADLINE_S) as part:
+        until(lambda: not publisher.has_subscriber("eit.frame") and {*publisher.prefixes} == {b"load.", b"load.torque"})
+        publisher.publish(sample(EitFrame))
+        publisher.publish(sample(LoadTorque))
+        assert [next(one)[0], next(part)[0]] == ["load.torque"] * 2
+
+
+def test_no_topic_begins_with_another():
+    # ZeroMQ would send both to a subscriber of the shorter one.
+    assert [(one, other) for one in TOPICS for other in TOPICS if one != other and other.startswith(one)] == []
+
+
+@pytest.mark.parametrize(
+    ("topics", "said"),
+    [
+        (["skin.sheer"], "there is no topic 'skin.sheer'; did you mean skin.shear? The topics are eit.frame"),
+        ("loa", "there is no topic 'loa'"),
+        ("load.torque.x", "there is no topic 'load.torque.x'; did you mean load.torque?"),
+        ([""], "there is no topic ''"),
+        ([7], "7 is no topic; give the name of one, such as 'eit.frame'"),
+    ],
+)
+def test_a_topic_that_does_not_exist_is_refused_at_once(topics, said, tmp_path):
+    with pytest.raises(UserError) as refused:
+        Subscriber(f"ipc://{tmp_path}/publish", topics)
+    assert str(refused.value).startswith(said)
+
+
+@pytest.mark.parametrize("timeout_s", [float("nan"), float("inf"), -1.0, 0.0])
+def test_a_time_that_nobody_can_wait_is_refused(timeout_s, tmp_path):
+    with pytest.raises(UserError, match=r"timeout_s is .*; give seconds above 0 .*or None to wait without end"):
+        Subscriber(f"ipc://{tmp_path}/publish", timeout_s=timeout_s)
+
+
+@pytest.mark.parametrize("with_asyncio", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        (zmq.XPUB, "a daemon is there and publishes no skin.shear now"),
+        (
+            zmq.ROUTER,
+            "the program there does not publish to this client; give the address of the daemon's `publish` key",
+        ),
+        (None, "no daemon publishes there; start it with `shearloop run CONFIG`, or give the address"),
+    ],
+)
+def test_a_subscriber_in_vain_names_the_cause(kind, said, with_asyncio, tmp_path):
+    address = f"ipc://{tmp_path}/publish"
+    with zmq.Context() as context, context.socket(zmq.XPUB if kind is None else kind) as bound:
+        if kind is not None:
+            bound.bind(address)
+        with Subscriber(address, ["skin.shear"], 0.01) as subscriber, pytest.raises(UserError) as failed:
+            _ = asyncio.run(anext(subscriber)) if with_asyncio else next(subscriber)
+        with pytest.raises(UserError) as of_command:
+            next(receive_messages(address, ["skin.shear"], 0.01))
+    assert str(failed.value).startswith(f"no message came from {address} for 0.01 s: {said}")
+    assert "--" not in str(failed.value)
+    assert ("--connect" in str(of_command.value)) == (kind != zmq.XPUB)
 
 
 async def test_an_ipc_path_that_is_removed_while_it_is_looked_at_is_bound(tmp_path, monkeypatch):

@@ -49,20 +49,21 @@ _TOOLS_DIFFER = 2.0
 
 def fit(
     name: EstimatorName,
-    recordings: Sequence[FrameSeries],
+    recordings: FrameSeries | Sequence[FrameSeries],
     source: str,
     physics: Physics | None = None,
     *,
     timing: LoadTiming | None = None,
     nested: bool = False,
 ) -> Calibration:
-    """Calibrate an estimator on recordings, in time order; `source` describes them in words.
+    """Calibrate an estimator on a recording or several, in time order; `source` describes them in words.
 
     `timing` is measured on the recordings where it is not given. With `nested` a fit of motion chooses its settings
     too, instead of the usual ones. Raises CalibrationError for recordings that do not determine the calibration, and
     for missing physics.
     """
     physics, kind = physics or Physics(), estimator_class(name)
+    recordings = [recordings] if isinstance(recordings, FrameSeries) else list(recordings)
     sides = _check_recordings(recordings)
     check_physics(kind, physics)
     chosen = [recording.select_sides(sides) for recording in recordings]
@@ -94,6 +95,8 @@ def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:
     """Return the sides that all recordings have; raises CalibrationError for recordings that do not belong together."""
     if not recordings:
         raise CalibrationError("there is no recording to calibrate on")
+    if strangers := [one for one in recordings if not isinstance(one, FrameSeries)]:
+        raise CalibrationError(f"{strangers[0]!r} is no series of frames; `read_series` reads one from a recording")
     check_finite(recordings)
     if len({recording.table for recording in recordings}) > 1:
         raise CalibrationError("the recordings are of different kinds of fingertips; make a calibration of each")

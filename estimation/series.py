@@ -1,7 +1,7 @@
 """Recordings as series of frames with their torques, for a fit and for its judgement; the daemon runs without them."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -47,6 +47,7 @@ class FrameSeries:
 
     def __post_init__(self) -> None:
         """Check shapes and times."""
+        object.__setattr__(self, "sides", names_of(self.sides))
         n, m = len(self.t_s), len(self.sides)
         expected = n, m, self.table.n_channels
         if self.channels.shape != expected or self.diameter_mm.shape != (n,):
@@ -72,8 +73,9 @@ class FrameSeries:
         """Return the (n,) torque in N·m at the middle of each frame, NaN where no reading is near."""
         return torque_at(self.t_s, self.torque_t_s, self.torque_nm)
 
-    def select_sides(self, sides: tuple[str, ...]) -> Self:
-        """Return the series with these sides only; raises CalibrationError for a side that is missing."""
+    def select_sides(self, sides: str | Iterable[str]) -> Self:
+        """Return the series with one side or several only; raises CalibrationError for a side that is missing."""
+        sides = names_of(sides)
         missing = [side for side in sides if side not in self.sides]
         if missing:
             raise CalibrationError(
@@ -104,6 +106,11 @@ class FrameSeries:
             return None
         known_mm = float(self.diameter_mm[0])
         return Measured(known_mm, 0.0) if np.isfinite(known_mm) else self.gripper_mm
+
+
+def names_of(names: str | Iterable[str]) -> tuple[str, ...]:
+    """Return one name or several as a tuple: a text is one name, not a list of letters."""
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def check_finite(recordings: Sequence[FrameSeries]) -> None:

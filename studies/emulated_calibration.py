@@ -6,7 +6,7 @@ several cylinders. It runs on the emulated rig's physics in simulated time, so t
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.build import build_bank
-from shearloop.daemon.recorder.schema import DIAMETER_NOTE, EMULATED
+from shearloop.daemon.recorder.schema import DIAMETER_NOTE, EMULATED, LARGEST_DIAMETER_MM
 from shearloop.daemon.recorder.writer import McapFile, new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.emulators.boards import LOAD_PERIOD_S
@@ -24,6 +24,7 @@ from shearloop.emulators.emulated_rig import NOISE_NM, SIDES
 from shearloop.emulators.gripper import Gripper, GripperRegisters
 from shearloop.emulators.scene import Scene
 from shearloop.emulators.synthetic_frames import RigFrames
+from shearloop.errors import UserError
 from shearloop.estimation import Calibration, FrameSeries, fit, measure_timing
 from shearloop.tools.bank_config import load_bank_plan
 from shearloop.tools.banks import is_built
@@ -127,11 +128,16 @@ def write_recordings(bank: Path, folder: Path, diameters_mm: tuple[float, ...], 
     """Write the recording of each cylinder, and yield its path."""
     frames = RigFrames(bank, seed)
     for number, diameter_mm in enumerate(diameters_mm):
-        path = folder / f"rig-{diameter_mm:g}mm.mcap"
+        path = folder / _name_of(diameter_mm)
         notes = {DIAMETER_NOTE: f"{diameter_mm:g}", EMULATED: "every device"}
         with new_recording(path, SOURCE, notes, frames.table) as writer:
             TwistPlayer(frames, diameter_mm, seed + number, writer).run()
         yield path
+
+
+def _name_of(diameter_mm: float) -> str:
+    """Return the name of the recording of a cylinder."""
+    return f"rig-{diameter_mm:g}mm.mcap"
 
 
 def record(bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM) -> Iterator[FrameSeries]:
@@ -142,13 +148,20 @@ def record(bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM
 
 
 def emulate_recordings(
-    folder: str | Path, diameters_mm: tuple[float, ...] = DIAMETERS_MM, seed: int = SEED
+    folder: str | Path, diameters_mm: float | Iterable[float] = DIAMETERS_MM, seed: int = SEED
 ) -> list[Path]:
     """Record twists of the emulated rig, a file for each tool, and return the files; the same seed gives the same ones.
 
-    The folder also gets `demo.bank`, the bank that the frames are made of. Raises UserError where it cannot be written.
+    The folder also gets `demo.bank`, the bank that the frames are made of. Raises UserError for a diameter that no tool
+    has, and where the folder cannot be written.
     """
     folder = Path(folder)
+    tools_mm = tuple(diameters_mm) if isinstance(diameters_mm, Iterable) else (diameters_mm,)
+    for number, tool_mm in enumerate(tools_mm):
+        if not 0 < tool_mm < LARGEST_DIAMETER_MM:
+            raise UserError(f"diameters_mm has {tool_mm:g}; give numbers above 0 and below {LARGEST_DIAMETER_MM:g}")
+        if _name_of(tool_mm) in map(_name_of, tools_mm[:number]):
+            raise UserError(f"diameters_mm has {tool_mm:g} twice, and both have one file; give each diameter once")
     bank = folder / "demo.bank"
     with writing(folder, "the folder"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -156,7 +169,7 @@ def emulate_recordings(
         plan = load_bank_plan(config / "banks" / "demo.yaml")
     if not is_built(bank, plan.definition):
         build_bank(*plan, bank, jobs=processors())
-    return list(write_recordings(bank, folder, diameters_mm, seed))
+    return list(write_recordings(bank, folder, tools_mm, seed))
 
 
 def calibrate_rig(bank: Path, folder: Path) -> None:

@@ -7,6 +7,7 @@ from typing import Self, TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.errors import UserError
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.tools.estimate_tracks import UNITS, EstimateTrack, values_of
 
@@ -60,7 +61,7 @@ def judged_frames(track: EstimateTrack) -> BoolArray:
     return judged
 
 
-def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
+def figures_of(tracks: EstimateTrack | Sequence[EstimateTrack]) -> Figures:
     """Return the figures of all frames, by the names that `shearloop evaluate` prints.
 
     Only valid frames with a known truth are judged; with fewer than two of them, errors are None. interval_nm is the
@@ -68,6 +69,7 @@ def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     that is always 0. Known diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a
     torque, coverage_95 is the diameter's.
     """
+    tracks = _several(tracks)
     torque, diameter = (_compare(_known_frames(tracks, quantity), unit) for quantity, unit in UNITS.items())
     valid = [estimate.valid for track in tracks for estimate in track.estimates]
     latency = np.concatenate([track.latency_ms for track in tracks])
@@ -84,14 +86,17 @@ def figures_of(tracks: Sequence[EstimateTrack]) -> Figures:
     return figures
 
 
-def figures_by_load(tracks: Sequence[EstimateTrack], loaded_nm: float = LOADED_NM) -> dict[str, Figures]:
+def figures_by_load(
+    tracks: EstimateTrack | Sequence[EstimateTrack], loaded_nm: float = LOADED_NM
+) -> dict[str, Figures]:
     """Return the torque's figures of `loaded` frames, with a torque of loaded_nm or more in size, and of the others.
 
     n frames have a known truth, and valid_fraction of them an estimate. Only these are judged. gain is the mean
     estimate over the mean truth, both along the truth. baseline_zero_rmse_nm and, for loaded frames,
     baseline_profile_rmse_nm are errors without a sensor, and baseline_ratio is the estimate's over the smaller one.
+    Raises UserError without a track.
     """
-    frames = _known_frames(tracks, "torque")
+    frames = _known_frames(_several(tracks), "torque")
     is_loaded = np.abs(frames.truth) >= loaded_nm
     loaded = frames.where(is_loaded)
     found = {"loaded": _compare(loaded, "nm"), "unloaded": _compare(frames.where(~is_loaded), "nm")}
@@ -132,6 +137,15 @@ def _baselines(frames: Frames) -> Figures:
         "baseline_profile_rmse_nm": profile_nm if known else None,
         "baseline_ratio": own_nm / least_nm if least_nm else None,
     }
+
+
+def _several(tracks: EstimateTrack | Sequence[EstimateTrack]) -> Sequence[EstimateTrack]:
+    """Return one track or several as a list; raises UserError where there is none."""
+    if isinstance(tracks, EstimateTrack):
+        return [tracks]
+    if not tracks:
+        raise UserError("there is no track to judge; `estimate_series` makes one of a recording's frames")
+    return tracks
 
 
 def _known_frames(tracks: Sequence[EstimateTrack], quantity: str) -> Frames:

@@ -1,6 +1,6 @@
 """Recordings as series of frames, with the tool of each and a check for copies."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -13,6 +13,7 @@ from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
 from shearloop.estimation.calibration import LARGEST_TOOL_FRACTION
 from shearloop.estimation.learned_frames import frame_digests
+from shearloop.estimation.series import names_of
 from shearloop.tools.recordings.frames import Recording, read_recording
 from shearloop.words import counted
 
@@ -26,12 +27,12 @@ _MAX_SHARED = 0.5
 
 
 def read_series(
-    path: str | Path, sides: tuple[str, ...] | None = None, tool_mm: float | None = None
+    path: str | Path, sides: str | Iterable[str] | None = None, tool_mm: float | None = None
 ) -> list[FrameSeries]:
     """Return the series of a recording, a list of one.
 
-    `sides` selects the sides of a recording, by default all; `tool_mm` is the diameter of its tool, if the recording
-    does not name it. Raises UserError for anything else.
+    `sides` selects a side of a recording or several, by default all; `tool_mm` is the diameter of its tool, if the
+    recording does not name it. Raises UserError for anything else.
     """
     path = Path(path)
     if path.is_dir():
@@ -39,7 +40,7 @@ def read_series(
             f"{path} is a folder; name a recording (.mcap, from `shearloop run --record` or "
             "`shearloop recording import`)"
         )
-    return [series_of(read_recording(path), sides, tool_mm)]
+    return [series_of(read_recording(path), None if sides is None else names_of(sides), tool_mm)]
 
 
 def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> FrameSeries:
@@ -143,8 +144,8 @@ def tool_of(recording: Recording, t_ns: IntArray, given_mm: float | None = None)
         conflict = f"it names a tool of {named_mm:g} mm, and the gripper held one of {held[0].value:.1f} mm"
     if conflict and given_mm is None:
         raise UserError(
-            f"{recording.path}: {conflict}; record one tool at a time, correct the experiment's `tool_mm`, or "
-            "calibrate with --tool-mm if you know which it was"
+            f"{recording.path}: {conflict}; record one tool at a time, correct the experiment's `tool_mm`, or give the "
+            "tool's diameter (--tool-mm, from Python `tool_mm`) if you know which it was"
         )
     if given_mm is not None and (conflict or np.isnan(named_mm)):
         return given_mm, None

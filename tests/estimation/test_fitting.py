@@ -45,6 +45,16 @@ def test_recordings_that_determine_nothing_are_refused(recorded, recordings_of, 
         fit("motion_regression", recordings_of(recorded), "rig", timing=TRUSTED)
 
 
+def test_a_recording_may_be_given_alone_and_must_be_read():
+    series = twisting(cycles=2)
+    alone, listed = (fit("motion_regression", given, "twists") for given in (series, [series]))
+    assert np.array_equal(alone.validators[0].idle, listed.validators[0].idle)
+    with pytest.raises(CalibrationError, match="'t' is no series of frames; `read_series` reads one"):
+        fit("motion_regression", "twists.mcap", "twists")
+    with pytest.raises(CalibrationError, match=r"'a.mcap' is no series"):
+        fit("motion_regression", ["a.mcap"], "twists")
+
+
 def test_a_diameter_is_not_fitted_before_the_fingertips_were_seen_idle(monkeypatch):
     """The daemon gives no diameter there: without its idle position the gel's position means nothing."""
     fitted = []

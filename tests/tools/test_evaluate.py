@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shearloop.errors import UserError
 from shearloop.estimation import TRUSTED, Estimate, FrameSeries, fit
 from shearloop.estimation.session import FINGERS_MOVED
 from shearloop.tools.estimate_tracks import EstimateTrack, estimate_series
@@ -51,6 +52,15 @@ def test_an_evaluation_judges_no_frame_that_saw_the_fingers_move():
     assert plain.estimates[70].valid
     assert track.estimates[70].reasons == (FINGERS_MOVED,)
     assert sum(one.valid for one in track.estimates) == sum(one.valid for one in plain.estimates) - 1
+
+
+def test_a_track_may_be_given_alone_and_none_has_no_figures():
+    track = track_of([(0.1, (0.1, 0.02, 0.02))] * 3)
+    assert figures_by_load(track) == figures_by_load([track])
+    assert figures_of(track) == figures_of([track])
+    for judge in (figures_by_load, figures_of):
+        with pytest.raises(UserError, match="there is no track to judge; `estimate_series` makes one"):
+            judge([])
 
 
 @given(st.lists(frames, min_size=1, max_size=12), st.floats(0.0, 0.1))

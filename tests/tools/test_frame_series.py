@@ -10,7 +10,7 @@ import pytest
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.errors import UserError
-from shearloop.tools.frame_series import check_no_copies, series_of
+from shearloop.tools.frame_series import check_no_copies, read_series, series_of
 from shearloop.tools.recordings.frames import Recording, SideFrames
 from tests.estimation.conftest import kept, twisting
 
@@ -27,6 +27,16 @@ def test_a_copy_that_lacks_frames_is_a_copy():
     ):
         with pytest.raises(UserError, match=said):
             check_no_copies(named)
+
+
+def test_a_side_may_be_given_alone(imported):
+    (alone,), (listed,) = read_series(imported, "right"), read_series(imported, ["right"])
+    assert alone.sides == listed.sides == ("right",)
+    assert replace(alone, sides="right").sides == ("right",)
+    (both,) = read_series(imported)
+    assert both.select_sides("left").sides == ("left",)
+    with pytest.raises(UserError, match="has frames of right and left, not of middle"):
+        read_series(imported, "middle")
 
 
 def test_parts_and_common_idle_frames_are_no_copies():

@@ -14,6 +14,7 @@ from shearloop.daemon.messaging.bound_requests import LateRequestError, meant_fo
 from shearloop.daemon.messaging.callers import caller
 from shearloop.daemon.messaging.deadlines import NEVER_LATE, TYPED_WITHIN_S, boot_ns
 from shearloop.daemon.running_rig import EMULATED, EMULATED_HEADING
+from shearloop.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.daemon.messaging.keys import ClientKeys
@@ -31,6 +32,12 @@ DAEMON_COMMANDS = {
 }
 # `stop` is never refused, and the others change nothing.
 _ACTS_ON_NOTHING_SHOWN = ("stop", *addresses.READ_ONLY)
+# The option for each argument of a request, and the commands that have it.
+OPTIONS = {
+    "source": ("--source", ("tare",)),
+    "experiment": ("--experiment", ("start",)),
+    "confirmed": ("--yes", ("tare", "unlock", "release")),
+}
 # Their replies are shown as tables.
 _TABLES = ("status", "experiments")
 
@@ -108,6 +115,10 @@ def _request(args: argparse.Namespace) -> dict[str, Any]:
     if args.experiment is not None:
         # The daemon may run in another folder.
         request["experiment"] = str(args.experiment.resolve())
+    for argument, (option, commands) in OPTIONS.items():
+        # Nothing may keep a stop back.
+        if argument in request and args.name not in (*commands, "stop"):
+            raise UserError(f"{option} is for {', '.join(commands)}; leave it out of `{args.name}`")
     return request
 
 
@@ -174,7 +185,6 @@ def mistakes_of(experiment: Path) -> str:
     The daemon may read files that this user may not read. Empty if the file is only on the daemon's computer.
     """
     from shearloop.daemon.experiment_files import read_experiment
-    from shearloop.errors import UserError
 
     try:
         read_experiment(experiment)

@@ -12,9 +12,9 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from shearloop.cli.command import DAEMON_COMMANDS
+from shearloop.cli.command import DAEMON_COMMANDS, OPTIONS
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commands import Commands
+from shearloop.daemon.commands import ARGUMENTS, Commands
 from shearloop.daemon.messaging.bound_requests import LateRequestError, meant_for
 from shearloop.daemon.messaging.callers import UNKNOWN, caller, caller_of
 from shearloop.daemon.messaging.client import ask, receive_messages, send_command
@@ -210,6 +210,11 @@ def test_every_command_has_a_handler_and_a_description_and_the_page_knows_it():
         rig=None, sensors=None, experiment=None, health=None, daemon_end=None, tare_refusal=None
     ).handlers()
     assert set(DAEMON_COMMANDS) == set(handled) == {*server.NEEDS_TOKEN, STATUS, STOP, EXPERIMENTS}
+
+
+def test_the_options_of_a_command_are_the_arguments_that_the_daemon_takes():
+    for argument, (_, commands) in OPTIONS.items():
+        assert {*commands} == {name for name, own in ARGUMENTS.items() if argument in own}, argument
 
 
 async def test_commands_are_reported_with_their_answer_and_questions_are_not():

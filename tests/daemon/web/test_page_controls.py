@@ -199,9 +199,9 @@ def test_a_start_to_a_daemon_that_stands_still_is_in_doubt_and_never_carried_out
 def test_a_start_whose_question_does_not_come_is_in_no_doubt(browsed):
     page = browsed.open(token=True)
     browsed.daemon.say(loop={"phase": "idle"})
-    page.wait_for_selector("#experiment:visible")
+    page.wait_for_selector("[data-command=start]:enabled")
     with browsed.daemon.standing_still():
-        page.click("[data-command=start]:enabled")
+        page.click("[data-command=start]")
         browsed.until("#answer", "start: its question did not come, because the daemon does not answer")
         assert "NOT CONFIRMED" not in browsed.text("#answer")
     assert browsed.daemon.asked == []

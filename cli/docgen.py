@@ -83,7 +83,8 @@ def safety_table() -> str:
 def error_kinds() -> str:
     """Return the kinds of errors that `health` counts of fingertips and of the skin."""
     kinds = [("fingertip", kind.name, kind.value) for kind in FrameErrorKind]
-    kinds += [("skin", fault.name, fault.value) for fault in SkinFault]
+    # A start is no error.
+    kinds += [("skin", fault.name, fault.value) for fault in SkinFault if fault is not SkinFault.SOURCE_STARTING]
     return table(("kind", "of", "meaning"), [(f"`{name.lower()}`", source, what) for source, name, what in kinds])
 
 

@@ -9,7 +9,7 @@ dead in this frame. Values are below 10 V, so a line has cells of eight bytes.
 
 import re
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -65,18 +65,19 @@ class FrameErrorKind(Enum):
 class FrameError:
     """A rejected line: the reason, its beginning or its first bad value, and that one's position, counted from 0.
 
-    `count` is the number of values.
+    `count` is the number of values; so many lines were refused `in_a_row` with it.
     """
 
     kind: FrameErrorKind
     excerpt: bytes
     position: int | None = None
     count: str = ""
+    in_a_row: int = 1
 
     def __str__(self) -> str:
-        """Return the sentence for health and log: text and reason; for a whole line its sender and the cure too."""
+        """Return the sentence for health and log: text and reason; for whole lines in a row their sender too."""
         if self.position is None or b"," in self.excerpt:
-            return refusal_sentence(self.excerpt, f"{self.kind.value}{self.count}", "EIT-kit")
+            return refusal_sentence(self.excerpt, f"{self.kind.value}{self.count}", "EIT-kit", self.in_a_row)
         read = repr(self.excerpt)[1:]
         return f"refused {read} at value {self.position + 1}: {self.kind.value}"
 
@@ -161,6 +162,7 @@ class FrameParser:
         self.frames = 0
         self.errors: Counter[FrameErrorKind] = Counter()
         self.last_error: FrameError | None = None
+        self._refused_in_a_row = 0
         self._zero_slots = zero_slots
         self._lines = LineSplitter(MAX_LINE_BYTES)
         self._first_line = True
@@ -179,7 +181,7 @@ class FrameParser:
 
     @property
     def refusal(self) -> str:
-        """The last refused line, why, and for a whole line who sends such lines and the cure; empty without one."""
+        """The last refused line, why, and the cure; of whole lines in a row who sends them; empty without one."""
         return "" if self.last_error is None else str(self.last_error)
 
     @property
@@ -210,7 +212,7 @@ class FrameParser:
             self._first_line = False
             if values is not None:
                 complete.append((values, self._rejected_since_frame))
-                self._rejected_since_frame = 0
+                self._rejected_since_frame = self._refused_in_a_row = 0
         frames = []
         for number, (values, rejected) in enumerate(complete, 1):
             # Frames that waited together were sent one period apart, the last one by now.
@@ -234,7 +236,8 @@ class FrameParser:
 
     def _reject(self, error: FrameError) -> None:
         self.errors[error.kind] += 1
-        self.last_error = error
+        self._refused_in_a_row += 1
+        self.last_error = replace(error, in_a_row=self._refused_in_a_row)
         if error.kind in _LOST_BYTES:
             self._rejected_since_frame = None
         elif self._rejected_since_frame is not None:

@@ -44,8 +44,9 @@ class LineParser(ABC, Generic[ValueT]):
         self._last_mid_ns = -(2**63)
         self._first = True
         self._rejected: Counter[str] = Counter()
-        # The last refused line and its kind.
-        self._last_refused: tuple[bytes, str] | None = None
+        self._refused_in_a_row = 0
+        # The last refused line and its kind, and how many were refused in a row with it.
+        self._last_refused: tuple[bytes, str, int] | None = None
 
     @property
     def errors(self) -> dict[str, int]:
@@ -59,8 +60,11 @@ class LineParser(ABC, Generic[ValueT]):
 
     @property
     def refusal(self) -> str:
-        """The last refused line, why, who sends such lines, and the cure; empty without one."""
-        return "" if self._last_refused is None else refusal_sentence(*self._last_refused, self.board)
+        """The last refused line, why, who sends such lines where they repeat, and the cure; empty without one."""
+        if self._last_refused is None:
+            return ""
+        line, kind, in_a_row = self._last_refused
+        return refusal_sentence(line, kind, self.board, in_a_row)
 
     @property
     def unfinished(self) -> bytes:
@@ -101,6 +105,7 @@ class LineParser(ABC, Generic[ValueT]):
                 if value is not None:
                     values.append(value)
                     self.count += 1
+                    self._refused_in_a_row = 0
             elif not partial:
                 self._refuse(text, "not a number" if text else "empty")
         return values
@@ -118,4 +123,5 @@ class LineParser(ABC, Generic[ValueT]):
     def _refuse(self, line: bytes, kind: str) -> None:
         self._clock.refused()
         self._rejected[kind] += 1
-        self._last_refused = line, kind
+        self._refused_in_a_row += 1
+        self._last_refused = line, kind, self._refused_in_a_row

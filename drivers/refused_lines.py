@@ -6,6 +6,8 @@ from typing import Final, Literal
 
 BoardKind = Literal["EIT-kit", "load cell", "skin's converter board"]
 
+# So many lines that are refused in a row show who sends them. A single one may be a part of the board's own line.
+REPEATED: Final = 3
 # Characters of a refused line in a message.
 SHOWN_BYTES: Final = 40
 
@@ -80,7 +82,10 @@ def sender_of(line: bytes, expected: BoardKind) -> tuple[str, str]:
     return sender.who, _EXCHANGE
 
 
-def refusal_sentence(line: bytes, reason: str, expected: BoardKind) -> str:
-    """Return the line with the reason against it, who sends such lines, and the cure after a semicolon."""
+def refusal_sentence(line: bytes, reason: str, expected: BoardKind, in_a_row: int = REPEATED) -> str:
+    """Return the line with the reason against it, and the cure after a semicolon; of repeated ones who sends them."""
+    found = f"refused {shown(line)}: {reason}"
+    if in_a_row < REPEATED:
+        return f"{found}. A single line like this has lost bytes on its way; replace the USB cable if more of them come"
     who, cure = sender_of(line, expected)
-    return f"refused {shown(line)}: {reason}. {who[0].upper()}{who[1:].rstrip(',')} sends such lines; {cure}"
+    return f"{found}. {who[0].upper()}{who[1:].rstrip(',')} sends such lines; {cure}"

@@ -18,6 +18,8 @@ SILENT_PERIODS = 8
 # After a timeout, the next wait is twice as long, up to this factor: the board's period can be longer than
 # configured. This many values in time end that.
 LONGEST_PATIENCE, PROMPT_VALUES = 16, 20
+# After this many values without a refused line the last one is history: it stays in the counts.
+FORGET_REFUSAL_VALUES = 100
 # Values in a row that agree with each other and become the new level.
 SETTLE_VALUES = 3
 
@@ -61,7 +63,7 @@ class Parser(Protocol[ValueT_co]):
 
     @property
     def refusal(self) -> str:
-        """The last refused line, why, who sends such lines, and the cure; empty without one."""
+        """The last refused line, why, who sends such lines where they repeat, and the cure; empty without one."""
 
     @property
     def unfinished(self) -> bytes:
@@ -182,6 +184,7 @@ class SerialSensor(Generic[ValueT]):
         self._least_patience = self.patience = patience
         self._prompt_values = 0
         self._value_ns = 0
+        self._values_since_refusal = 0
 
     async def readings(self) -> AsyncGenerator[ValueT]:
         """Yield the values of every line, in order and without end, as `batches` does."""
@@ -232,7 +235,8 @@ class SerialSensor(Generic[ValueT]):
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        return {**self._link.diagnostics(), "last_refusal": self._parser.refusal}
+        recent = self._values_since_refusal < FORGET_REFUSAL_VALUES
+        return {**self._link.diagnostics(), "last_refusal": self._parser.refusal if recent else ""}
 
     def _check_use(self, port: Port, now_ns: int, *, useful: bool) -> None:
         """Raise DeviceLostError if no value has come for long although bytes come."""
@@ -253,7 +257,9 @@ class SerialSensor(Generic[ValueT]):
             self._inputs.record(event)
         before = self._parser.refused
         values = self._parser.handle(event)
+        self._values_since_refusal += len(values)
         if self._parser.refused > before:
+            self._values_since_refusal = 0
             self._link.monitor.refused(self._parser.refusal)
         return values
 

@@ -37,6 +37,7 @@ STUCK_AFTER = 50
 class SkinFault(StrEnum):
     """Faults of the circuit; the text is for the person at the bench."""
 
+    SOURCE_STARTING = "the current source is starting: its first reading has not come yet"
     SOURCE_LOST = "the current source does not answer: see its cable, its address and whether it is on"
     SOURCE_OFF = "the current source's output is off: press its OUTPUT key, or see what opened its interlock"
     COMPLIANCE = "the current source is in compliance: the circuit is open or a contact is bad, follow the two leads"
@@ -100,8 +101,10 @@ class SampleValidator:
         self._repeats = [1, 1]
         self._steps = StepFilter[tuple[float, float]]()
         # The last fault of the source, and the time since when it works.
-        self._source_fault = SkinFault.SOURCE_LOST
+        self._source_fault = SkinFault.SOURCE_STARTING
         self._source_since_ns: int | None = None
+        # When the first voltages came.
+        self._begun_ns: int | None = None
 
     def sample(self, voltages: Voltages, source: SourceReading | None) -> SkinSample:
         """Return the sample of a reading of the voltages, with the latest reading of the source."""
@@ -119,7 +122,7 @@ class SampleValidator:
                 faults = [SkinFault.SPIKE]
             else:
                 r1_ohm, r2_ohm = pair
-        self.faults.update(fault.name.lower() for fault in faults)
+        self.faults.update(fault.name.lower() for fault in faults if fault is not SkinFault.SOURCE_STARTING)
         sample = SkinSample(
             r1_ohm=r1_ohm,
             r2_ohm=r2_ohm,
@@ -140,6 +143,10 @@ class SampleValidator:
             self._repeats[i] = self._repeats[i] + 1 if same else 1
 
     def _find_faults(self, voltages: Voltages, source: SourceReading | None) -> list[SkinFault]:
+        if self._begun_ns is None:
+            self._begun_ns = voltages.t_arrival_ns
+        if source is None and voltages.t_arrival_ns - self._begun_ns <= self._stale_ns:
+            return [SkinFault.SOURCE_STARTING]
         if source is None or voltages.t_arrival_ns - source.t_ns > self._stale_ns:
             self._source_fault, self._source_since_ns = SkinFault.SOURCE_LOST, None
             return [SkinFault.SOURCE_LOST]

@@ -254,4 +254,4 @@ def test_the_last_refused_line_is_quoted_with_its_reason(line):
     assert parser.refused == 2
     kind = "empty" if not line else "too long" if len(line) == 40 else "not a number"
     sent = line.encode() + b"\r" * (kind == "too long")
-    assert parser.refusal == refusal_sentence(sent, kind, "load cell")
+    assert parser.refusal == refusal_sentence(sent, kind, "load cell", in_a_row=1)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.refused_lines import SHOWN_BYTES, refusal_sentence, sender_of, shown
+from shearloop.drivers.refused_lines import REPEATED, SHOWN_BYTES, refusal_sentence, sender_of, shown
 
 EIT_LINE = b"0.1234, " * 100
 # The line, the board that is expected, who sends it, and a part of the cure.
@@ -52,3 +52,11 @@ def test_any_line_is_quoted_short_and_printable(line, expected):
     sentence = refusal_sentence(line, "no number", expected)
     assert len(sentence) < 500
     assert sentence.startswith("refused ")
+
+
+def test_a_single_refused_line_accuses_no_other_board():
+    """Half of a converter board's line looks like a load cell's."""
+    sentence = refusal_sentence(b"0.126000", "not a number", "skin's converter board", in_a_row=1)
+    assert "load cell" not in sentence
+    assert sentence.startswith("refused '0.126000': not a number. A single line like this has lost bytes on its way")
+    assert "load cell" in refusal_sentence(b"0.126000", "not a number", "skin's converter board", in_a_row=REPEATED)

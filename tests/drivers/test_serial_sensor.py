@@ -13,7 +13,15 @@ from shearloop.drivers.connection import Link, LinkEvent, LinkMonitor, Port, Rec
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
-from shearloop.drivers.serial_sensor import BOOT_S, LONGEST_PATIENCE, SILENT_PERIODS, InputKind, RawEvent, SerialSensor
+from shearloop.drivers.serial_sensor import (
+    BOOT_S,
+    FORGET_REFUSAL_VALUES,
+    LONGEST_PATIENCE,
+    SILENT_PERIODS,
+    InputKind,
+    RawEvent,
+    SerialSensor,
+)
 from shearloop.drivers.shear_skin.instruments import AdcBoard
 
 # What each board sends, and a line that it accepts.
@@ -132,6 +140,28 @@ async def test_a_board_that_sends_a_value_now_and_then_among_refused_lines_is_no
     (told,) = link.refusals
     assert "'0,091'" in told
     assert sum(device.diagnostics()["errors"].values()) > 200
+
+
+@pytest.mark.parametrize("board", list(BOARDS))
+async def test_a_torn_line_accuses_no_other_board_and_is_no_error_any_more_after_good_ones(board):
+    make, good = BOARDS[board]
+    good = good or frame_line()
+    # A number without its beginning is a number, and is judged as one.
+    torn = b"0.0.01\n" if board == "load cell" else good[len(good) // 2 :]
+
+    async def refusal_after(n_good: int) -> str:
+        link = PlayedLink(reads=[(0.1, good), (0.2, torn), *((0.3, good) for _ in range(n_good))])
+        device = make(link)
+        await played(device, link, losses=1)
+        assert sum(device.diagnostics()["errors"].values()) == 1
+        return str(device.diagnostics()["last_refusal"])
+
+    assert "has lost bytes on its way; replace the USB cable" in await refusal_after(FORGET_REFUSAL_VALUES // 2)
+    assert await refusal_after(FORGET_REFUSAL_VALUES) == ""
+
+
+def frame_line() -> bytes:
+    return b"".join(b"0.0000, " if is_zero else b"0.1234, " for is_zero in PAPER_TABLE.zero_slots) + b"\n"
 
 
 @pytest.mark.parametrize("board", list(BOARDS))

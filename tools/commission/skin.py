@@ -19,11 +19,12 @@ from shearloop.tools.commission.tap import RISE_S, resistances
 SKIN: Final = "the skin"
 # Enough for the driver to find a converter that stands still.
 _READINGS: Final = STUCK_AFTER + 10
+_NO_SOURCE: Final = {SkinFault.SOURCE_STARTING, SkinFault.SOURCE_LOST}
 
 
 def read_at_rest(skin: Arrivals[SkinSample], rate_hz: float) -> list[SkinSample]:
     """Return readings of a skin that nothing touches, once its current source answers; UserError if it is silent."""
-    skin.wait_for(lambda sample: SkinFault.SOURCE_LOST not in sample.faults, 0, SILENT_S)
+    skin.wait_for(lambda sample: not _NO_SOURCE.intersection(sample.faults), 0, SILENT_S)
     return skin.take(_READINGS, SILENT_S + 1.0 / rate_hz)
 
 

@@ -120,6 +120,7 @@ async def test_a_shear_force_is_streamed_from_either_daq(tmp_path, socket):
         assert status["skin"]["connected"]
         assert status["skin.source"]["connected"]
         assert "MODEL 6430" in status["skin.source"]["instrument"]
+        assert "source_lost" not in status["skin"]["errors"], "a start is no loss"
 
 
 BAD = [
@@ -150,6 +151,7 @@ async def test_no_bad_input_stops_the_daemon_and_each_is_named(tmp_path):
         await bench.valid()
         tasks = (await bench.command("status"))["tasks"]
         assert {"open_1", "short_2", "reversed_1", "compliance", "source_lost"} <= set(tasks["skin"]["errors"])
+        assert "load cell" not in tasks["skin"]["error"]
         assert (tasks["skin"]["restarts"], tasks["skin.source"]["restarts"]) == (0, 0)
 
 

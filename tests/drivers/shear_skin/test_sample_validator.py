@@ -34,7 +34,7 @@ STUCK_OPEN = SourceReading(0, output_on=True, voltage_v=1.0, current_a=1e-9, com
 @pytest.mark.parametrize(
     ("v1_v", "v2_v", "source", "faults"),
     [
-        (0.123, 0.126, None, [SkinFault.SOURCE_LOST]),
+        (0.123, 0.126, None, [SkinFault.SOURCE_STARTING]),
         (0.0, 0.0, SourceReading(0, output_on=False), [SkinFault.SOURCE_OFF]),
         (1.0, 0.0, STUCK_OPEN, [SkinFault.COMPLIANCE, SkinFault.OPEN_1]),
         (0.0, 1.0, STUCK_OPEN, [SkinFault.COMPLIANCE, SkinFault.OPEN_2]),
@@ -119,6 +119,15 @@ def test_a_source_that_falls_silent_is_lost_after_two_seconds():
     assert one.faults == {"source_lost": 1}
 
 
+def test_a_source_is_starting_for_two_seconds_and_that_is_no_error():
+    one = judge()
+    assert one.sample(voltages(0.0, 0.0, 7), None).faults == (SkinFault.SOURCE_STARTING,)
+    assert one.sample(voltages(0.0, 0.0, 27), None).faults == (SkinFault.SOURCE_STARTING,)
+    assert not one.faults
+    assert one.sample(voltages(0.0, 0.0, 28), None).faults == (SkinFault.SOURCE_LOST,)
+    assert one.faults == {"source_lost": 1}
+
+
 def test_a_late_reading_of_a_board_is_none_missing_and_each_count_is_passed_on_once():
     one, found = judge(), []
     for number, (late_s, missed) in enumerate([(0.0, 0), (0.085, 0), (0.0, 0), (0.3, 2), (0.3, 0)]):
@@ -152,7 +161,7 @@ def test_a_jump_is_a_disturbance_until_it_stays():
 def test_voltages_from_before_the_current_flowed_are_not_called_a_short():
     one = judge()
     on = replace(GOOD, t_ns=2 * 10**8)
-    assert one.sample(voltages(0.0, 0.0, 1), on).faults == (SkinFault.SOURCE_LOST,)
+    assert one.sample(voltages(0.0, 0.0, 1), on).faults == (SkinFault.SOURCE_STARTING,)
     assert not one.sample(voltages(0.123, 0.126, 2), on).faults
     off = SourceReading(3 * 10**8, output_on=False)
     assert one.sample(voltages(0.0, 0.0, 3), off).faults == (SkinFault.SOURCE_OFF,)

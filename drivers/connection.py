@@ -370,15 +370,20 @@ class Link(contextlib.AbstractContextManager["Link", None]):
         """Return the connection's part of `health`."""
         return self.monitor.diagnostics(connected=self.port is not None)
 
+    async def open_once(self) -> Port:
+        """Open the port and return it; DriverError if that fails."""
+        self.port = await self._connect()
+        return self.port
+
     async def open(self) -> Port:
         """Return the open port; waits until the device is there."""
         while self.port is None:
             try:
-                self.port = await self._connect()
+                port = await self.open_once()
             except DriverError as error:
                 await self.lost(error)
             else:
-                self.monitor.connected(f"{self.port.path} is open.", time.monotonic_ns())
+                self.monitor.connected(f"{port.path} is open.", time.monotonic_ns())
         return self.port
 
     async def lost(self, error: DriverError) -> None:

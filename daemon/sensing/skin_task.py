@@ -296,20 +296,22 @@ def skin_device(
     check_circuit(config, calibration)
     source, daq = (LinkMonitor(observer_of(name)) for name in ("skin source", "skin daq"))
     return ShearSkin(
-        _current_source(config, source, inputs.get(SKIN_CURRENT)),
-        _daq(config, daq, inputs.get(SKIN_DAQ)),
+        current_source(config, source, inputs.get(SKIN_CURRENT)),
+        voltage_reader(config, daq, inputs.get(SKIN_DAQ)),
         gauge_ohm(calibration),
         averaged,
     )
 
 
-def _current_source(config: SkinConfig, monitor: LinkMonitor, inputs: InputRecorder | None) -> Keithley6430:
+def current_source(config: SkinConfig, monitor: LinkMonitor, inputs: InputRecorder | None = None) -> Keithley6430:
+    """Return the driver of the current source, not yet open."""
     source = config.source
     link = _link(source.socket, source.serial, source.baud, monitor)
     return Keithley6430(link, current_a=source.current_ma * 1e-3, compliance_v=source.compliance_v, inputs=inputs)
 
 
-def _daq(config: SkinConfig, monitor: LinkMonitor, inputs: InputRecorder | None) -> Daq:
+def voltage_reader(config: SkinConfig, monitor: LinkMonitor, inputs: InputRecorder | None = None) -> Daq:
+    """Return the driver of the instrument that reads the voltages, not yet open."""
     rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
     if scanner is not None:
         link = _link(scanner.socket, None, DEFAULT_BAUD, monitor)

@@ -96,6 +96,8 @@ class PolledInstrument(ABC, Generic[ReadingT]):
     inputs: InputRecorder | None = None
     # Its name in messages.
     instrument: ClassVar[str] = ""
+    # Parts of the names that it may give itself; empty for any.
+    models: ClassVar[tuple[str, ...]] = ()
     _lines: LineSplitter = field(default_factory=partial(LineSplitter, MAX_REPLY_BYTES), init=False)
     _count: int = field(default=0, init=False)
     _errors: Counter[str] = field(default_factory=Counter, init=False)
@@ -158,12 +160,19 @@ class PolledInstrument(ABC, Generic[ReadingT]):
             "errors": dict(self._errors + Counter({"too long": self._lines.too_long})),
         }
 
-    async def _identify(self, *models: str) -> str:
+    async def ask_name(self) -> str:
+        """Open the connection once and return the instrument's name, without any setting; DriverError if it fails."""
+        with self.link:
+            await self.link.open_once()
+            return await self._identify()
+
+    async def _identify(self) -> str:
         """Return the reply to *IDN?; ProtocolError unless it names one of the models."""
         name = (await self.ask("*IDN?")).text
-        if models and not any(model in name for model in models):
+        if self.models and not any(model in name for model in self.models):
+            models = " or ".join(self.models)
             raise ProtocolError(
-                f"{self.instrument} says it is {name!r}, and not {' or '.join(models)}; see which instrument is there."
+                f"{self.instrument} says it is {name!r}, and not {models}; see which instrument is there."
             )
         return name
 
@@ -275,6 +284,7 @@ class Keithley6430(PolledInstrument[SourceReading]):
     """The current source: set up, switched on, read until the iteration ends, then switched off."""
 
     instrument = "The current source"
+    models = MODELS
     period_s: float = SOURCE_PERIOD_S
     current_a: float = CURRENT_A
     compliance_v: float = SOURCE_COMPLIANCE_V
@@ -282,7 +292,7 @@ class Keithley6430(PolledInstrument[SourceReading]):
     _may_be_on: bool = field(default=False, init=False)
 
     async def _set_up(self) -> str:
-        name = await self._identify(*MODELS)
+        name = await self._identify()
         if not self._was_reset:
             await self._send("*RST")
         self._may_be_on = True

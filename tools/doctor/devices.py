@@ -12,14 +12,17 @@ from typing import Any
 import numpy as np
 
 from shearloop.daemon.commissioning import commissioning_of
-from shearloop.daemon.config import DaemonConfig, GripperConfig, SerialDevice
+from shearloop.daemon.config import DaemonConfig, GripperConfig, SkinConfig
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.rig_identity import why_not_emulated
 from shearloop.daemon.running_rig import RunningRig
+from shearloop.daemon.sensing.skin_task import current_source, voltage_reader
+from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
+from shearloop.drivers.shear_skin.instruments import PolledInstrument
 from shearloop.drivers.ur.control_box import check_generation, check_ports, query_controller, untested_sentence
 from shearloop.drivers.ur.dashboard import REMOTE_CURE
 from shearloop.drivers.ur.messages import RobotLostError
@@ -53,9 +56,11 @@ async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
     if config.load_cell is not None:
         checks.append(check_load_cell(config.load_cell, seconds))
     if config.skin is not None:
-        if config.skin.source.serial is not None:
-            checks.append(asyncio.to_thread(_check_source, config.skin.source.serial))
-        if config.skin.daq.adc is not None:
+        checks.append(_check_source(config.skin))
+        daq = voltage_reader(config.skin, LinkMonitor())
+        if isinstance(daq, PolledInstrument):
+            checks.append(_check_instrument("skin's scanner", daq))
+        elif config.skin.daq.adc is not None:
             checks.append(check_adc("skin's DAQ", config.skin.daq.adc, config.skin.daq.rate_hz, seconds))
     if config.gripper is not None:
         checks.append(_check_gripper(config.gripper))
@@ -64,8 +69,21 @@ async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
     return [finding for findings in await asyncio.gather(*checks) for finding in findings]
 
 
-def _check_source(device: SerialDevice) -> list[Finding]:
-    return [check_port("skin's source", device)]
+async def _check_source(config: SkinConfig) -> list[Finding]:
+    subject, serial = "skin's source", config.source.serial
+    port = [] if serial is None else [check_port(subject, serial)]
+    if any(finding.state == "trouble" for finding in port):
+        return port
+    return [*port, *await _check_instrument(subject, current_source(config, LinkMonitor()))]
+
+
+async def _check_instrument(subject: str, instrument: PolledInstrument[Any]) -> list[Finding]:
+    """Ask an instrument for its name; nothing is set, and no current flows."""
+    try:
+        name = await instrument.ask_name()
+    except DriverError as error:
+        return [from_error(subject, error, "the skin measures nothing", "check its address, cable and power")]
+    return [good(subject, f"{name} answers")]
 
 
 async def _check_gripper(config: GripperConfig) -> list[Finding]:

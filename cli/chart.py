@@ -1,6 +1,7 @@
 """`shearloop chart NAME [RECORDING…] --out DIR`: measure, and draw as JSON, SVG and PNG."""
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -37,16 +38,24 @@ def run(args: argparse.Namespace) -> int:
     """Draw one chart and print its paths."""
     _check_arguments(args)
     require("matplotlib", "plot", "a chart")
+    from shearloop.tools.drawing import writing_charts
+    from shearloop.tools.outputs import new_folder
+
+    with ExitStack() as folder:
+        with writing_charts(args.out):
+            folder.enter_context(new_folder(args.out))
+            TemporaryFile(dir=args.out).close()
+        return _draw(args)
+
+
+def _draw(args: argparse.Namespace) -> int:
     from shearloop.bank.bank_file import Bank
     from shearloop.studies.charts import scene, simulated_loop, speed_accuracy, stability
     from shearloop.studies.charts.chart_data import GRID, MESH_SIZE_CM, own_fingertip, splits
     from shearloop.tools.bank_config import load_geometry
     from shearloop.tools.banks import cached_bank
-    from shearloop.tools.drawing import chart_folder
     from shearloop.tools.parallel import open_executor
 
-    with chart_folder(args.out), TemporaryFile(dir=args.out):
-        pass
     # A mistake in its name is said before anything is computed.
     given = Bank.open(args.bank) if args.bank else None
     if args.name == "loop":

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from shearloop.cli.options import add_option
 from shearloop.errors import UserError
-from shearloop.tools.outputs import writing
+from shearloop.tools.outputs import new_folder, writing
 
 # Files and folders of the package's `config`.
 STARTERS = ("rig.yaml", "ur.yaml", "experiments", "banks", "fingertips", "schemas", "foxglove.json")
@@ -47,10 +47,10 @@ def packaged_files() -> dict[Path, bytes]:
 
 def write_files(folder: Path, files: dict[Path, bytes]) -> None:
     """Write new files below a folder; raises UserError where that fails, and then none of them is left."""
-    with ExitStack() as undone:
+    with ExitStack() as folders, ExitStack() as undone:
         for path, content in files.items():
             with writing(folder / path, "the file"):
-                (folder / path).parent.mkdir(parents=True, exist_ok=True)
+                folders.enter_context(new_folder((folder / path).parent))
                 undone.callback((folder / path).unlink, missing_ok=True)
                 (folder / path).write_bytes(content)
         undone.pop_all()

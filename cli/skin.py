@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ from shearloop.cli.options import add_action, add_json, add_option, number, run_
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError, require
-from shearloop.tools.outputs import YAML_KEYS, check_overwrite, writing
+from shearloop.tools.outputs import YAML_KEYS, check_overwrite, new_folder, writing
 
 if TYPE_CHECKING:
     from shearloop.studies.skin.characterisation import FigureOfMerit
@@ -47,14 +48,15 @@ def _characterise(args: argparse.Namespace) -> int:
         require("matplotlib", "plot", "a figure")
         from shearloop.studies.charts.skin_figures import draw
 
-        with writing(args.out, "the figures"):
-            args.out.mkdir(parents=True, exist_ok=True)
-    found = characterise()
-    print_result([asdict(row) for row in found.rows], [_table(found.rows)], as_json=args.json)
-    if args.out is not None:
-        with writing(args.out, "the figures"):
+    with ExitStack() as folder:
+        if args.out is not None:
+            folder.enter_context(writing(args.out, "the figures"))
+            folder.enter_context(new_folder(args.out))
+        found = characterise()
+        print_result([asdict(row) for row in found.rows], [_table(found.rows)], as_json=args.json)
+        if args.out is not None:
             written = draw(found, args.out)
-        print(*(f"drawn: {path}" for path in written), sep="\n", file=sys.stderr)
+            print(*(f"drawn: {path}" for path in written), sep="\n", file=sys.stderr)
     return 0
 
 

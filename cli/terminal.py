@@ -272,9 +272,14 @@ def _health(topic: str, content: Mapping[str, Any]) -> str:
     return f"{memory}  {cpu} CPU  " + "; ".join(tasks)
 
 
+def one_line(text: str) -> str:
+    """Return a text as a terminal shows it in one line: a file's name may hold a line feed."""
+    return printable(text).replace("\n", "\\u000a").replace("\t", "\\u0009")
+
+
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return the lines of a table with aligned columns."""
-    every = [tuple(head), *map(tuple, rows)]
+    """Return the lines of a table with aligned columns, a line for each row."""
+    every = [tuple(map(one_line, row)) for row in (head, *rows)]
     widths = [max(map(len, column)) for column in zip(*every, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in every]
 

@@ -31,7 +31,7 @@ from shearloop.tools.banks import is_built
 from shearloop.tools.estimate_tracks import estimate_series
 from shearloop.tools.figures import figures_of
 from shearloop.tools.frame_series import series_of
-from shearloop.tools.outputs import progress_bar, writing
+from shearloop.tools.outputs import new_folder, progress_bar, writing
 from shearloop.tools.parallel import processors
 from shearloop.tools.recordings.frames import read_recording
 
@@ -163,13 +163,12 @@ def emulate_recordings(
         if _name_of(tool_mm) in map(_name_of, tools_mm[:number]):
             raise UserError(f"diameters_mm has {tool_mm:g} twice, and both have one file; give each diameter once")
     bank = folder / "demo.bank"
-    with writing(folder, "the folder"):
-        folder.mkdir(parents=True, exist_ok=True)
     with resources.as_file(resources.files("shearloop") / "config") as config:
         plan = load_bank_plan(config / "banks" / "demo.yaml")
-    if not is_built(bank, plan.definition):
-        build_bank(*plan, bank, jobs=processors())
-    return list(write_recordings(bank, folder, tools_mm, seed))
+    with writing(folder, "the folder"), new_folder(folder):
+        if not is_built(bank, plan.definition):
+            build_bank(*plan, bank, jobs=processors())
+        return list(write_recordings(bank, folder, tools_mm, seed))
 
 
 def calibrate_rig(bank: Path, folder: Path) -> None:

@@ -15,6 +15,7 @@ from shearloop.bank.errors import BankFileError
 from shearloop.bank.mesh import Mesh
 from shearloop.errors import UserError
 from shearloop.tools.bank_config import load_geometry
+from shearloop.tools.outputs import new_folder
 
 MODEL = "gaussian_derivative"
 # The paper's own mesh, next to a folder of recordings.
@@ -74,8 +75,8 @@ def cached_bank(
     if is_built(path, definition):
         return Bank.open(path)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        with new_folder(folder):
+            build_bank(mesh, definition, path, jobs=jobs, on_row=on_row)
     except OSError as error:
         raise UserError(f"{folder}: the folder for banks cannot be made: {error.strerror}") from error
-    build_bank(mesh, definition, path, jobs=jobs, on_row=on_row)
     return Bank.open(path)

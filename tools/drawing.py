@@ -16,6 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
 from shearloop.errors import UserError
+from shearloop.tools.outputs import new_folder
 
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "p", "h")
 LINES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 1, 1, 1)))
@@ -147,10 +148,9 @@ def slug(title: str) -> str:
 
 
 @contextmanager
-def chart_folder(directory: Path) -> Iterator[None]:
-    """Make a folder for charts; raise UserError where that, or writing into it, fails."""
+def writing_charts(directory: Path) -> Iterator[None]:
+    """Raise UserError where making a folder for charts, or writing into it, raises OSError."""
     try:
-        directory.mkdir(parents=True, exist_ok=True)
         yield
     except OSError as error:
         raise UserError(f"{directory}: the chart cannot be written: {error.strerror}; choose another --out") from error
@@ -159,7 +159,7 @@ def chart_folder(directory: Path) -> Iterator[None]:
 def save(made: Figure, content: Mapping[str, Any], directory: Path, name: str) -> list[Path]:
     """Write NAME.json, .svg and .png into a directory and return the paths; raises UserError where that fails."""
     paths = [directory / f"{name}.{suffix}" for suffix in ("json", "svg", "png")]
-    with chart_folder(directory):
+    with writing_charts(directory), new_folder(directory):
         paths[0].write_text(json.dumps(content, indent=1, default=_plain) + "\n", encoding="utf-8")
         for path in paths[1:]:
             made.savefig(path, dpi=130)

@@ -2,12 +2,13 @@
 
 import codecs
 import contextlib
+import io
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from shearloop.errors import UserError
 from shearloop.files import open_file
@@ -82,6 +83,61 @@ def _is_text(head: bytes) -> bool:
     except UnicodeDecodeError:
         return False
     return b"\0" not in head
+
+
+@contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[None]:
+    """Make a folder and those above it; remove the ones that are empty, if they are new and the block fails.
+
+    Raises OSError where it cannot be made.
+    """
+    new = [one for one in (folder, *folder.parents) if not one.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        for one in new:
+            with contextlib.suppress(OSError):
+                one.rmdir()
+        raise
+
+
+@contextlib.contextmanager
+def lent_file(file: BinaryIO) -> Iterator["LentFile"]:
+    """Lend a file to a library that may write once more after the block, where an interrupt left its writer open."""
+    lent = LentFile(file)
+    try:
+        yield lent
+    finally:
+        lent.take_back()
+
+
+class LentFile(io.RawIOBase):
+    """Writes to a file until that is taken back, and then nowhere; it never closes the file."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__()
+        self._file: BinaryIO | None = file
+        self._written = 0
+
+    def take_back(self) -> None:
+        """Let what is still written have no effect."""
+        self._file = None
+
+    def writable(self) -> bool:
+        """Return that it takes bytes."""
+        return True
+
+    def write(self, data: Any) -> int:
+        """Write bytes and return their number; raises OSError of the file."""
+        if self._file is not None:
+            self._file.write(data)
+        self._written += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the number of written bytes."""
+        return self._written
 
 
 @contextlib.contextmanager

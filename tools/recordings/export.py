@@ -14,7 +14,7 @@ from scipy.io import savemat
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
-from shearloop.tools.outputs import check_apart
+from shearloop.tools.outputs import LentFile, check_apart, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.message_content import column_units, columns
 from shearloop.tools.recordings.reader import read_messages
@@ -106,21 +106,23 @@ def _struct_names(topics: Iterable[str]) -> dict[str, str]:
 def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress: Progress) -> list[Path]:
     if form == "parquet":
         require("pyarrow", "export", "Parquet")
-    out.mkdir(parents=True, exist_ok=True)
     paths = {topic: out / f"{topic}.{form}" for topic in topics}
-    for table in paths.values():
-        check_apart("--out", table, [(f"the recording {path}", path)])
+    for target in paths.values():
+        check_apart("--out", target, [(f"the recording {path}", path)])
     tables: dict[str, _CsvTable | _ParquetTable] = {}
-    # Every table ends before the first file is replaced.
-    with ExitStack() as files, ExitStack() as ends:
+    with new_folder(out), ExitStack() as files:
         for topic, content, message in read_messages(path, topics, progress):
             row = row_of(content, message.log_time)
             if topic not in tables:
                 file = files.enter_context(replace_file(paths[topic]))
-                made = _CsvTable(paths[topic], file, row) if form == "csv" else _ParquetTable(file, topic, row)
-                ends.callback(made.close)
-                tables[topic] = made
+                if form == "csv":
+                    tables[topic] = _CsvTable(paths[topic], file, row)
+                else:
+                    tables[topic] = _ParquetTable(files.enter_context(lent_file(file)), topic, row)
             tables[topic].add(row)
+        # Every table ends before the first file is replaced.
+        for table in tables.values():
+            table.close()
         if form == "csv":
             rows = [(topic, *unit) for topic in tables for unit in column_units(topic).items()]
             lines = [",".join(map(_csv_cell, row)) for row in (("topic", "column", "unit"), *rows)]
@@ -170,7 +172,7 @@ def _csv_cell(value: Any) -> str:
 class _ParquetTable:
     """A table with the types of the topic's schema, written in batches; missing elements of arrays are NaN."""
 
-    def __init__(self, file: BinaryIO, topic: str, first: dict[str, Any]) -> None:
+    def __init__(self, file: LentFile, topic: str, first: dict[str, Any]) -> None:
         """Begin the file with the columns of the first row."""
         import pyarrow as pa
         import pyarrow.parquet as pq

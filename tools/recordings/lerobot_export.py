@@ -26,6 +26,7 @@ from shearloop.daemon.messaging.messages import (
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
+from shearloop.tools.outputs import LentFile, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.message_content import ContentError, check_length, column_units
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
@@ -203,7 +204,7 @@ class Dataset:
 
         rows: list[list[NDArray[np.float32]]] = []
         now_ns = -1
-        with pq.ParquetWriter(self._new(f"data/{_FILE}"), self._schema, compression="zstd") as writer:
+        with pq.ParquetWriter(self._lent(f"data/{_FILE}"), self._schema, compression="zstd") as writer:
             for known_ns, _, topic, content, measured_ns in self._known_messages(path, progress):
                 now_ns = max(now_ns, self._started_ns)
                 while now_ns < known_ns:
@@ -299,14 +300,18 @@ class Dataset:
         import pyarrow.parquet as pq
 
         table = pa.table({key: [value] for key, value in row.items()})
-        pq.write_table(table.replace_schema_metadata(metadata), self._new(name))
+        pq.write_table(table.replace_schema_metadata(metadata), self._lent(name))
 
     def _write_json(self, name: str, content: Any) -> None:
         self._new(name).write(json.dumps(content, indent=1, ensure_ascii=False).encode())
 
+    def _lent(self, name: str) -> LentFile:
+        """Return a new file of the dataset for Arrow."""
+        return self._replaced.enter_context(lent_file(self._new(name)))
+
     def _new(self, name: str) -> BinaryIO:
         """Return a new file of the dataset, which stands in its place at the end."""
         path = self._out / name
-        path.parent.mkdir(parents=True, exist_ok=True)
+        self._replaced.enter_context(new_folder(path.parent))
         self._files.append(path)
         return self._replaced.enter_context(replace_file(path))

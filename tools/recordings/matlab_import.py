@@ -303,7 +303,7 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
     load, streams = _read_streams(files, time_format)
     remarks: list[str] = []
     if not TIME_FORMATS[time_format].has_date:
-        remarks.append("The files name no date, so the recording's times begin on 1970-01-02.")
+        remarks.append("The files name no date: their time 0 is 1970-01-02 00:00 UTC in the recording.")
     notes: dict[str, str] = {}
     sure = True
     if load is None:

@@ -7,7 +7,8 @@ frame is the mean of the frames of the latest `tare` step.
 
 import re
 from collections import Counter, deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from shearloop.daemon.messaging.messages import EitFrame, GripperStateMessage, L
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError
 from shearloop.files import replace_file
+from shearloop.tools.outputs import new_folder
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.matlab_import import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
 from shearloop.tools.recordings.message_content import ContentError, check_length
@@ -44,6 +46,11 @@ class _Slice:
     diameter_mm: float | None
     line: FloatArray
     homogeneous_line: FloatArray
+
+    @property
+    def folder(self) -> str:
+        """The folder of its kind."""
+        return TORQUE_FOLDER if self.diameter_mm is None else DIAMETER_FOLDER
 
 
 def export_slices(
@@ -72,6 +79,15 @@ def export_slices(
             "config/experiments/torque_sweep.yaml"
         )
     written: list[Path] = []
+    with ExitStack() as folders:
+        for name in {new_slice.folder for new_slice in slices}:
+            folders.enter_context(new_folder(out / name))
+        _save(slices, out, written)
+    return written, missed
+
+
+def _save(slices: Sequence[_Slice], out: Path, written: list[Path]) -> None:
+    """Write slices, or none of them."""
     try:
         for new_slice in slices:
             _save_slice(out, new_slice, written)
@@ -83,16 +99,14 @@ def export_slices(
         for file in written:
             file.unlink(missing_ok=True)
         raise
-    return written, missed
 
 
 def _save_slice(out: Path, one: _Slice, written: list[Path]) -> None:
     """Write a slice under the number after the highest of its folder."""
-    name, prefix, torque = TORQUE_FOLDER, "Data_Slice_", "torque_value"
+    prefix, torque = "Data_Slice_", "torque_value"
     if one.diameter_mm is not None:
-        name, prefix, torque = DIAMETER_FOLDER, f"{one.diameter_mm:.0f}mm_Data_", "mean_torque"
-    folder = out / name
-    folder.mkdir(parents=True, exist_ok=True)
+        prefix, torque = f"{one.diameter_mm:.0f}mm_Data_", "mean_torque"
+    folder = out / one.folder
     found = (re.fullmatch(rf"{prefix}(\d+)\.mat", path.name) for path in folder.iterdir())
     number = 1 + max((int(match[1]) for match in found if match), default=0)
     arrays = {"data_diff": one.difference[None], torque: [[one.torque_nm]]}

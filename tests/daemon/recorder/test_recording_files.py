@@ -117,6 +117,10 @@ def test_list_shows_the_recordings_of_a_folder_with_what_is_known_of_each(record
     assert [one["closed"] for one in found] == [True, True, True, False]
     assert found[0]["first_unix_ns"] == 10**18
     assert "is no folder" in mistake("recording", "list", recording)
+    recording.rename(recording.with_name("two\nlines.mcap"))
+    assert len(ran("recording", "list", tmp_path).out.splitlines()) == len(lines)
+    assert "two\\u000alines.mcap" in ran("recording", "list", tmp_path).out
+    recording.with_name("two\nlines.mcap").rename(recording)
     later.unlink()
     assert "no recording is in this folder" in ran("recording", "list", later.parent).out
 

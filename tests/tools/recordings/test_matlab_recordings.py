@@ -456,3 +456,14 @@ def test_missing_load_values_are_named(tmp_path):
     result = import_mat([tmp_path / "device.mat", tmp_path / "load.mat"], tmp_path / "a.mcap")
     missing = [one for one in result.remarks if one.startswith("Load values are missing in 1 place, for up to 18.")]
     assert len(missing) == 1
+
+
+def test_times_without_a_date_count_from_the_named_one(tmp_path):
+    t_s, volts = 0.54 * np.arange(1, 41), np.random.default_rng(0).uniform(0.01, 0.5, (40, 1024))
+    frames = np.column_stack([t_s, volts])
+    savemat(tmp_path / "right.mat", {"Right_Data": frames})
+    found = import_mat([tmp_path / "right.mat"], tmp_path / "a.mcap", "elapsed")
+    assert found.remarks[0] == "The files name no date: their time 0 is 1970-01-02 00:00 UTC in the recording."
+    # A frame is measured before it arrives, here before the time 0.
+    began_ns = summarise(tmp_path / "a.mcap").first_unix_ns
+    assert abs(began_ns - 86_400e9) < 1e9

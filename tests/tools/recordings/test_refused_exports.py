@@ -1,8 +1,11 @@
 """An export that a later message ends leaves no file of its own, and changes none that was there."""
 
 import errno
+import gc
 import os
 import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +94,64 @@ def test_the_disk_is_full(form, tmp_path, ran, mistake, monkeypatch):
     if form == "slices":
         assert after == before
     assert after.keys() == before.keys()
+
+
+@pytest.mark.parametrize("after", [0, 5, 20])
+@pytest.mark.parametrize("form", FORMS)
+def test_an_interrupt_leaves_nothing(form, after, tmp_path, ran, monkeypatch):
+    if form in ("parquet", "lerobot"):
+        pytest.importorskip("pyarrow", reason="needs the extra `export`")
+
+    @contextmanager
+    def interrupting(*_: object) -> Iterator[Callable[[int], None]]:
+        def show(done: int) -> None:
+            if done >= after:
+                raise KeyboardInterrupt
+
+        yield show
+
+    monkeypatch.setattr("shearloop.cli.recording.progress_bar", interrupting)
+    whole = sweep(tmp_path / "whole").end_with("load.torque")
+    # A single file makes no folders.
+    out = tmp_path / "x" if form in ("mat", "rrd") else tmp_path / "some" / "x"
+    said = ran("recording", "export", whole, "--format", form, "--out", out, status=130).err
+    assert said == "shearloop recording: interrupted before it was done\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["whole"]
+
+
+@pytest.mark.parametrize("at", [1, 2])
+def test_an_interrupt_between_the_ends_of_two_parquet_files_is_silent(at, tmp_path, monkeypatch):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    close, calls = parquet.ParquetWriter.close, []
+
+    def interrupted(writer: object) -> None:
+        calls.append(None)
+        if len(calls) == at:
+            raise KeyboardInterrupt
+        close(writer)
+
+    monkeypatch.setattr(parquet.ParquetWriter, "close", interrupted)
+    whole = sweep(tmp_path / "whole").end_with("load.torque")
+    with pytest.raises(KeyboardInterrupt):
+        export.export(whole, "parquet", tmp_path / "x", ["eit.frame.right", "load.torque", "loop.state"])
+    # A writer ends its file when it goes; an error in that would be printed.
+    gc.collect()
+    assert len(calls) > at
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("small_disk", ["16k"], indirect=True)
+@pytest.mark.parametrize("form", FORMS)
+def test_a_small_disk_has_no_folder_afterwards(form, small_disk, tmp_path, mistake):
+    if form in ("parquet", "lerobot"):
+        pytest.importorskip("pyarrow", reason="needs the extra `export`")
+    whole = sweep(tmp_path / "whole").end_with("load.torque")
+    out = small_disk / ("x.rrd" if form == "rrd" else "x")
+    said = mistake("recording", "export", whole, "--format", form, "--out", out)
+    assert "the export cannot be written: " in said
+    assert "No space left on device" in said
+    gc.collect()
+    assert not list(small_disk.iterdir())
 
 
 def test_a_later_matlab_file_is_not_overwritten(tmp_path, mistake, monkeypatch):

@@ -63,7 +63,7 @@ class Format:
                         np.save(member, np.ascontiguousarray(array), allow_pickle=False)
         except OSError as error:
             raise CalibrationError(
-                f"{path}: the calibration cannot be written: {error.strerror}; choose another --out"
+                f"{path}: the calibration cannot be written: {error.strerror}; choose another path"
             ) from error
 
     def load(

@@ -207,7 +207,7 @@ class Calibration:
 def check_bank(estimator: Estimator, identity: str, bank: "Bank | None") -> "Bank":
     """Return the bank of an estimator; raises CalibrationError where it is missing or has another identity."""
     if bank is None:
-        raise CalibrationError(f"the estimator {estimator.name} needs its bank; name it with --bank")
+        raise CalibrationError(f"the estimator {estimator.name} needs its bank: --bank, in Python `bank`")
     if bank.identity != identity:
         raise CalibrationError(
             f"the calibration was made with the bank {identity[:12]}…, and {bank.path} is {bank.identity[:12]}…; name "

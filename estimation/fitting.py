@@ -88,7 +88,7 @@ def fit(
 def check_physics(kind: type[Estimator], physics: Physics) -> None:
     """Raise CalibrationError for an estimator without its bank or mesh."""
     if kind.needs and getattr(physics, kind.needs) is None:
-        raise CalibrationError(f"the estimator {kind.name} needs a {kind.needs}; name it with --{kind.needs}")
+        raise CalibrationError(f"the estimator {kind.name} needs a {kind.needs}: --{kind.needs}, in Python `Physics`")
 
 
 def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:

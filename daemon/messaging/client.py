@@ -3,6 +3,7 @@
 import asyncio
 import enum
 import logging
+import math
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from difflib import get_close_matches
@@ -56,11 +57,9 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         """Connect; an address on another computer needs keys."""
         self._topics = [topics] if isinstance(topics, str) else list(topics)
         prefixes = [prefix_of(topic) for topic in self._topics]
-        if timeout_s is not None and not 0 < timeout_s <= LONGEST_TIMEOUT_S:
-            raise UserError(
-                f"timeout_s is {timeout_s:g}; give seconds above 0 and up to {LONGEST_TIMEOUT_S:g}, or None to wait "
-                "without end"
-            )
+        # A connection takes a moment: without any time no message comes.
+        if timeout_s is not None and _milliseconds(timeout_s) == 0:
+            raise _no_such_time(timeout_s)
         self._address, self._timeout_s, self._keys = address, timeout_s, keys
         self._on_quiet, self._has_waited = on_quiet or self._warn, timeout_s is not None
         self._context = zmq.asyncio.Context()
@@ -76,7 +75,10 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
             self._socket.setsockopt(zmq.SUBSCRIBE, prefix)
 
     def wait(self, timeout_s: float | None) -> bool:
-        """Return whether a message arrives within these seconds; None waits without end."""
+        """Return whether a message arrives within these seconds; None waits without end.
+
+        Raises UserError for seconds that nobody can wait.
+        """
         return bool(self._blocking.poll(_milliseconds(timeout_s)))
 
     def close(self) -> None:
@@ -198,8 +200,17 @@ class _Probe(AbstractContextManager["_Probe", None]):
         self._context.destroy(linger=0)
 
 
-def _milliseconds(seconds: float | None) -> int | None:
-    return None if seconds is None else int(1000 * seconds)
+def _milliseconds(timeout_s: float | None) -> int | None:
+    if timeout_s is None:
+        return None
+    if not 0 <= timeout_s <= LONGEST_TIMEOUT_S:
+        raise _no_such_time(timeout_s)
+    return math.ceil(1000 * timeout_s)
+
+
+def _no_such_time(timeout_s: float) -> UserError:
+    allowed = f"seconds above 0 and up to {LONGEST_TIMEOUT_S:g}, or None to wait without end"
+    return UserError(f"timeout_s is {timeout_s:g}; give {allowed}")
 
 
 def receive_messages(

@@ -132,7 +132,7 @@ def test_an_array_without_its_data_is_refused(tmp_path):
 def test_values_that_cannot_be_kept_and_files_that_cannot_be_written_are_errors(tmp_path, motion_calibration):
     with pytest.raises(TypeError, match="cannot be kept"):
         replace(motion_calibration, source={"a": 1}).save(tmp_path / "x.cal")
-    with pytest.raises(CalibrationError, match="choose another --out"):
+    with pytest.raises(CalibrationError, match="choose another path"):
         motion_calibration.save(tmp_path / "none" / "x.cal")
 
 

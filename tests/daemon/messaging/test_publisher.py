@@ -208,6 +208,9 @@ def test_a_topic_that_does_not_exist_is_refused_at_once(topics, said, tmp_path):
 def test_a_time_that_nobody_can_wait_is_refused(timeout_s, tmp_path):
     with pytest.raises(UserError, match=r"timeout_s is .*; give seconds above 0 .*or None to wait without end"):
         Subscriber(f"ipc://{tmp_path}/publish", timeout_s=timeout_s)
+    if timeout_s != 0:
+        with Subscriber(f"ipc://{tmp_path}/publish") as subscriber, pytest.raises(UserError, match="timeout_s is"):
+            subscriber.wait(timeout_s)
 
 
 @pytest.mark.parametrize("with_asyncio", [False, True])

@@ -88,6 +88,7 @@ def _calibrate(args: argparse.Namespace) -> int:
         "path": str(args.out),
         "friction_given": args.friction is not None,
         "tension_n": [calibration.tension_n[0], calibration.tension_n[-1]],
+        "missing_side": calibration.missing_side,
         **{name: getattr(calibration, name) for name in named},
     }
     sentences = [
@@ -102,4 +103,6 @@ def _calibrate(args: argparse.Namespace) -> int:
         f"rows left out beyond the curve       {calibration.rows_beyond}",
         f"written: {args.out}",
     ]
+    if side := calibration.missing_side:
+        sentences.insert(-1, f"The table has no {side} shear forces, and the skin measures none; record both signs.")
     return print_result(result, sentences, as_json=args.json)

@@ -237,7 +237,7 @@ def _clients(curve: "CurveConfig") -> str:
 
 def _skin(config: "SkinConfig") -> str:
     from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE
-    from shearloop.daemon.sensing.skin_task import check_circuit
+    from shearloop.daemon.sensing.skin_task import check_circuit, friction_band_n
     from shearloop.estimation.skin.calibration import load_calibration
 
     calibration = load_calibration(config.calibration)
@@ -245,8 +245,11 @@ def _skin(config: "SkinConfig") -> str:
     radius = "without torque: no tool_radius_mm" if config.tool_radius_mm is None else "with torque"
     text = (
         f"calibration {config.calibration} to {calibration.tension_n[0]:+.1f} … {calibration.tension_n[-1]:+.1f} N, "
-        f"± {calibration.prediction_half_width_n:.3f} N, {radius}"
+        f"± {calibration.prediction_half_width_n:.3f} N and {friction_band_n(config, calibration):.2f} N of friction, "
+        f"{radius}"
     )
+    if side := calibration.missing_side:
+        text += f"; it has no {side} shear forces, and measures none"
     if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MAX_CHANGE:
         text += "; its gauges are too similar at rest to detect swapped wires: check the sign of a push"
     return text

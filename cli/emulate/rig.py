@@ -56,7 +56,8 @@ Commands, one a line on standard input:
   open 1|2, short 1|2, reversed 1|2, swapped, leads OHM, mend
                                  faults of the circuit
   source silence [SECONDS] | unplug [SECONDS] | normal
-  daq silence [SECONDS] | unplug [SECONDS] | normal; of a converter board missing, garbage, torn, stuck [SECONDS]
+  daq silence [SECONDS] | unplug [SECONDS] | normal; of a converter board also stuck [SECONDS],
+                                 and for one line each: missing, garbage, torn
   robot FAULT                    any fault of `emulate ur`
   normal                         end all faults of circuit and instruments
 """

@@ -268,7 +268,7 @@ class SkinEstimator:
         wider = self.zero.uncertainty + self._drift.per_s * (time_s - self._zero_s) + deviation
         interval = self._calibration.shear_from_response(response, self._normal_n, direction, wider)
         if math.isinf(interval.low_n) or math.isinf(interval.high_n):
-            reasons = (*reasons, "the response is beyond the calibrated curve; take load off, or calibrate further")
+            reasons = (*reasons, _beyond_curve(self._calibration, response))
         if reasons:
             return SkinReading(response_1, response_2, direction=direction, reasons=reasons)
         band = self._follower.update(response, self._normal_n, direction)
@@ -290,6 +290,16 @@ class SkinEstimator:
     def _forget_direction(self) -> None:
         if self.zero is not None:
             self._finder.restart()
+
+
+def _beyond_curve(calibration: SkinCalibration, response: float) -> str:
+    side = "negative" if response < 0 else "positive"
+    if calibration.missing_side == side:
+        return (
+            f"the shear force is {side}, and the calibration has none of that sign; take load off, or record both "
+            "signs and calibrate again"
+        )
+    return "the response is beyond the calibrated curve; take load off, or calibrate further"
 
 
 def _deviation(

@@ -31,6 +31,8 @@ SKIN_CURRENT, SKIN_DAQ = f"{SKIN}.source", f"{SKIN}.daq"
 SKIN_SOURCES = SKIN, SKIN_CURRENT, SKIN_DAQ
 # The paper's bound.
 MAX_WARMING_K = 5.0
+# The last digit of a converter board's line, 1 µV, is then a response of 3e-4, 4 mN.
+MIN_GAUGE_V = 3e-3
 # The recorded data of a zero that is given up before its time is over, because its step has ended.
 GIVEN_UP = b"given up"
 _NO_RADIUS = "it has no torque without `skin.tool_radius_mm`"
@@ -232,7 +234,17 @@ def skin_torque_source(config: SkinConfig) -> TorqueSource | None:
 
 
 def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:
-    """Raise UserError if the gauges would get too warm, or their voltages exceed source or converter."""
+    """Raise UserError if the skin cannot be measured so.
+
+    The gauges would get too warm, their voltages are too small or exceed source or converter, or friction hides the
+    whole calibrated range.
+    """
+    largest_n = max(calibration.tension_n[-1], -calibration.tension_n[0])
+    if friction_band_n(config, calibration) > largest_n:
+        raise UserError(
+            f"`skin.normal_n`: {config.normal_n:g} N hide {friction_band_n(config, calibration):.1f} N of shear by "
+            f"friction, and the calibration ends at {largest_n:.1f} N; give the force that presses on the skin, in N"
+        )
     current_a = config.source.current_ma * 1e-3
     max_ohm = max(calibration.rest_ohm) * (1.0 + max(calibration.response[-1], -calibration.response[0]))
     gauge_v, whole_v = max_ohm * current_a, (max_ohm + min(calibration.rest_ohm)) * current_a
@@ -242,6 +254,11 @@ def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:
         raise UserError(
             f"{setting} warm a gauge of {max(calibration.rest_ohm):.1f} Ω by {warming_k:.1f} K, more than the "
             f"{MAX_WARMING_K:g} K that are allowed; take 5"
+        )
+    if (rest_v := min(calibration.rest_ohm) * current_a) < MIN_GAUGE_V:
+        raise UserError(
+            f"{setting} make {1e3 * rest_v:.2g} mV of a gauge at rest, less than the {1e3 * MIN_GAUGE_V:g} mV that "
+            "can be read well enough; take 5"
         )
     if whole_v > config.source.compliance_v:
         raise UserError(
@@ -257,6 +274,11 @@ def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:
         )
     if scanner is not None and gauge_v > scanner.range_v:
         raise UserError(f"{at_end} `skin.daq.scanner.range_v` is {scanner.range_v:g}; take the next range")
+
+
+def friction_band_n(config: SkinConfig, calibration: SkinCalibration) -> float:
+    """Return the width of the forces that a skin that sticks leaves open, 2 μFₙ."""
+    return 2.0 * calibration.friction * config.normal_n
 
 
 def zero_timeout_s(config: SkinConfig) -> float:

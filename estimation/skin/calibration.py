@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
@@ -47,6 +47,8 @@ NOT_RISING = (
 # A response has moved when it differs by this many standard deviations of the compared means: by chance about once a
 # week at ten responses a second.
 STANDARD_DEVIATIONS = 5.0
+# A curve that ends closer to zero has no data of that side.
+MIN_SIDE_N = 0.1
 # Of the search for the response that friction leaves: to 1e-6 of the straight piece.
 BISECTIONS = 20
 # Responses averaged before they are compared.
@@ -146,6 +148,13 @@ class SkinCalibration(BaseModel):
         capstan = math.exp(self.friction * math.radians(self.gauge_angle_deg))
         return self.response_half_width / self.slope_per_n * capstan
 
+    @property
+    def missing_side(self) -> Literal["", "positive", "negative"]:
+        """The sign of the shear forces that were not recorded; empty where both were."""
+        if self.tension_n[0] > -MIN_SIDE_N:
+            return "negative"
+        return "positive" if self.tension_n[-1] < MIN_SIDE_N else ""
+
     def friction_response(self, normal_n: float) -> float:
         """Return the largest response, of either sign, that friction can leave without a shear force."""
         low, high = 0.0, self.slope_per_n * self.linear_to_n
@@ -169,11 +178,16 @@ class SkinCalibration(BaseModel):
         """Return the shear force (N) and its 95 % interval, which includes what friction leaves open.
 
         A known direction of loading takes the deadband out; an unknown one adds it to the interval. An end beyond the
-        calibrated curve is infinite. `wider` is a further uncertainty of the response, either way.
+        calibrated curve is infinite. The responses of a skin at rest are within it, also where one side was not
+        recorded. `wider` is a further uncertainty of the response, either way.
         """
         half, shear_n = self.response_half_width + wider, self.band(response, normal_n, direction).shear_n
         ends = response - half, response + half
         tensions = self._tension(ends[0], left=-math.inf), self._tension(ends[1], right=math.inf)
+        if self.missing_side and abs(response) <= self.friction_response(normal_n) + half:
+            # The straight line through the origin, which the other side gave.
+            low, high = (end / self.slope_per_n for end in ends)
+            tensions = max(tensions[0], low), min(tensions[1], high)
         low, high = (
             self._shear_range(end, tension, normal_n, direction)[side]
             for side, (end, tension) in enumerate(zip(ends, tensions, strict=True))

@@ -73,6 +73,27 @@ def test_calibrate_takes_a_table_to_a_file(tmp_path, ran, result_of):
     assert result["rows"] == calibration.rows
 
 
+def test_a_table_of_one_sign_is_said_by_calibrate_and_check(tmp_path, ran):
+    table, out = tmp_path / "table.csv", tmp_path / "skin.yaml"
+    write_table(table)
+    header, *rows = table.read_text().splitlines()
+    # Of each loading, what comes before the first negative force.
+    kept, negative = [header], False
+    for row in rows:
+        shear_n, normal_n = map(float, row.split(",")[2:])
+        negative = (negative or shear_n < -1e-9) and normal_n > 0
+        kept += [] if negative else [row]
+    table.write_text("\n".join([*kept, ""]))
+    printed = ran("skin", "calibrate", table, "--out", out).out
+    assert "The table has no negative shear forces, and the skin measures none; record both signs." in printed
+    rig = tmp_path / "rig.yaml"
+    instruments = "{source: {serial: {path: a}}, daq: {adc: {device: {path: b}}}, calibration: skin.yaml}"
+    rig.write_text(f"skin: {instruments}\n")
+    checked = ran("check", rig).out
+    assert "it has no negative shear forces, and measures none" in " ".join(checked.split())
+    assert "N of friction" in " ".join(checked.split())
+
+
 def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path, mistake):
     table, out = tmp_path / "table.csv", tmp_path / "skin.yaml"
     write_table(table)

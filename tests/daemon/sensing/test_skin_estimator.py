@@ -329,6 +329,41 @@ def test_a_force_beyond_the_curve_is_not_a_force(bench):
     assert "beyond the calibrated curve" in bench.push(6.0).reasons[0]
 
 
+@pytest.fixture(scope="module")
+def one_sided() -> SkinCalibration:
+    """Recorded with positive shear forces alone."""
+    table = calibration_table(SyntheticSkin(seed=7), NOISE)
+    kept = np.ones(len(table.shear_n), dtype=bool)
+    # The loops begin with the positive half; the rest of a loading follows the first negative force.
+    loading = np.cumsum((table.shear_n == 0) & (table.normal_n == 0))
+    for number in set(loading.tolist()):
+        rows = np.flatnonzero(loading == number)
+        negative = np.flatnonzero(table.shear_n[rows] < -1e-9)
+        kept[rows[negative[0] :] if negative.size else []] = False
+    columns = (table.r1_ohm, table.r2_ohm, table.shear_n, table.normal_n)
+    return fit_calibration(CalibrationTable(*(column[kept] for column in columns)))
+
+
+def test_with_one_calibrated_side_a_skin_at_rest_is_valid_and_the_other_side_is_named(one_sided):
+    assert one_sided.missing_side == "negative"
+    bench = Bench(one_sided).zeroed()
+    assert all(bench.at(0.0).valid for _ in range(20))
+    for shear_n in (1.0, 0.0):
+        readings = list(bench.to(shear_n))
+        assert all(reading.valid for reading in readings)
+        assert holds(readings[-1], shear_n)
+    # What friction leaves after a load of the other sign, which is too small to be seen.
+    assert all(reading.valid for reading in bench.to(-0.03))
+    (reason,) = bench.push(-1.0).reasons
+    assert reason.startswith("the shear force is negative, and the calibration has none of that sign; take load off")
+    assert all(reading.valid for reading in list(bench.to(0.0))[-1:])
+    assert "beyond the calibrated curve" in bench.push(6.0).reasons[0]
+
+
+def test_a_calibration_of_both_sides_lacks_none(calibration):
+    assert calibration.missing_side == ""
+
+
 def test_turning_the_tool_stretches_contact_and_skin_in_series():
     skin = SyntheticSkin(normal_n=1.0)
     hold_n = skin.membrane.belt.friction

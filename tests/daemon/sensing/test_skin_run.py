@@ -276,6 +276,14 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
             "`skin.source.current_ma`: 7 mA warm a gauge of 25.3 Ω by 5.9 K, more than the 5 K that are allowed",
         ),
         (
+            {"skin": section(ADC, source={**SOURCE, "current_ma": 0.001})},
+            "0.001 mA make 0.025 mV of a gauge at rest, less than the 3 mV that can be read well enough; take 5",
+        ),
+        (
+            {"skin": section(ADC, normal_n=100)},
+            "`skin.normal_n`: 100 N hide 6.7 N of shear by friction, and the calibration ends at 5.2 N; give the",
+        ),
+        (
             {"skin": section(ADC, source={**SOURCE, "compliance_v": 0.2})},
             "5 mA need 0.31 V at the end of the calibration, and `skin.source.compliance_v` is 0.2",
         ),

@@ -16,8 +16,8 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Answered, Commands
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging.callers import caller_of
+from shearloop.daemon.messaging.client_authenticator import ClientAuthenticator
 from shearloop.daemon.messaging.command_server import CommandServer
-from shearloop.daemon.messaging.keys import ClientAuthenticator, load_server_keys
 from shearloop.daemon.messaging.messages import DaemonCommand
 from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.messaging.refusals import Refusals
@@ -33,8 +33,9 @@ from shearloop.daemon.torques import LatestTorques
 from shearloop.printable import printable
 
 if TYPE_CHECKING:
-    # Only a rig with a robot, or one that records, loads them.
+    # Only a rig with a robot, or one that records, or one with a network address, loads them.
     from shearloop.daemon.configured_experiment import ConfiguredExperiment
+    from shearloop.daemon.messaging.keys import KeyPair
     from shearloop.daemon.recorder.recorder import Recorder
     from shearloop.daemon.rig import Rig
     from shearloop.daemon.robot_files import RobotFiles
@@ -72,7 +73,7 @@ class Daemon:
         self._summary = summary or RunSummary()
         self.ending = asyncio.Event()
         with contextlib.ExitStack() as opened:
-            keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
+            keys = _server_keys(config)
             refusals = Refusals()
             # It must exist before a socket is bound.
             clients = config.curve.clients if config.curve is not None and config.network_addresses else None
@@ -221,6 +222,14 @@ def _recorder_of(config: DaemonConfig, clock: Clock) -> "Recorder | None":
     from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 
     return Recorder(config.recording.folder, daemon_identity(config), clock)
+
+
+def _server_keys(config: DaemonConfig) -> "KeyPair | None":
+    if config.curve is None:
+        return None
+    from shearloop.daemon.messaging.keys import load_server_keys
+
+    return load_server_keys(config.curve.server_key)
 
 
 def _take_robot(config: DaemonConfig, opened: contextlib.ExitStack) -> "tuple[UrSettings, RobotFiles] | None":

@@ -3,14 +3,19 @@
 import errno
 import os
 import stat
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zmq
 
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, is_local, network_refusal, probe
-from shearloop.daemon.messaging.keys import ZAP_DOMAIN, KeyPair
 from shearloop.errors import UserError
 
+if TYPE_CHECKING:
+    # Only a network address has keys.
+    from shearloop.daemon.messaging.keys import KeyPair
+
+# libzmq asks the authenticator about each new client of this domain.
+ZAP_DOMAIN = "shearloop"
 # A connection that has not introduced itself by then is closed; one without an acknowledgement for 60 s is closed too.
 _OPTIONS = {
     zmq.HANDSHAKE_IVL: 2000,
@@ -21,7 +26,7 @@ _OPTIONS = {
 }
 
 
-def bind(bound: "zmq.Socket[Any]", address: str, setting: str, keys: KeyPair | None = None) -> None:
+def bind(bound: "zmq.Socket[Any]", address: str, setting: str, keys: "KeyPair | None" = None) -> None:
     """Bind a socket; a network address needs `keys`. Raises UserError that names `setting` of the configuration."""
     try:
         if "://" in address and not is_local(address):
@@ -34,7 +39,6 @@ def bind(bound: "zmq.Socket[Any]", address: str, setting: str, keys: KeyPair | N
                 "use e.g. tcp://127.0.0.1:7761"
             )
         _check_ipc_path(address, setting)
-        # With a domain, libzmq asks the authenticator about each new client.
         bound.setsockopt(zmq.ZAP_DOMAIN, ZAP_DOMAIN.encode())
         for option, value in _OPTIONS.items():
             bound.setsockopt(option, value)

@@ -8,7 +8,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from functools import lru_cache
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import structlog
 import zmq
@@ -17,10 +17,13 @@ import zmq.asyncio
 from shearloop.daemon.messaging.addresses import READ_ONLY
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.deadlines import NEVER_LATE, boot_ns
-from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.late_requests import LateRequests
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
+
+if TYPE_CHECKING:
+    # Only a network address has keys.
+    from shearloop.daemon.messaging.keys import KeyPair
 
 # Of each frame. libzmq has no limit for the number of frames; more than one are refused.
 LARGEST_REQUEST_BYTES = 4096
@@ -151,7 +154,7 @@ class CommandServer:
         address: str,
         handlers: Mapping[str, Handler],
         refusals: Refusals,
-        keys: KeyPair | None = None,
+        keys: "KeyPair | None" = None,
     ) -> None:
         """Bind the socket; raises UserError if the address is in use, malformed, or needs keys."""
         self._requests = RequestExecutor(handlers, refusals)

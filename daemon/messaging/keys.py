@@ -1,38 +1,30 @@
-"""CURVE keys: the daemon's own pair, the clients' public keys, and the check of each new connection.
+"""CURVE keys: the daemon's own pair, and the clients' public keys.
 
 Key files have the format of `zmq.auth` (ZeroMQ RFC 26): `NAME.key` holds the public key, `NAME.key_secret` both. The
-folder of the allowed clients' `.key` files is read again for each new connection.
+folder of the allowed clients' `.key` files is read again for each new connection (`client_authenticator`).
 """
 
-import asyncio
 import os
 import stat
 import struct
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-import structlog
 import zmq
 import zmq.asyncio
-from zmq.auth.base import Authenticator
 from zmq.auth.certs import load_certificate
 from zmq.utils import z85
 
-from shearloop.daemon.messaging.refusals import Refusals, TokenBucket
 from shearloop.errors import UserError
 from shearloop.files import read_file
 
 # The unit's `SetCredential` gives this value until the server key exists.
 _NO_CREDENTIAL = "none"
 _WHO_MAKES_KEYS = "`sudo shearloop keys server` makes the daemon's keys, `shearloop keys client` a client's"
-ZAP_DOMAIN = "shearloop"
 _LARGEST_KEY_BYTES = 1 << 14
-# New clients that are admitted at once, and then per second.
-NEW_BURST, NEW_PER_S = 50.0, 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,64 +166,6 @@ def check_allowed_clients(folder: Path) -> AllowedClients:
         why = "; ".join(clients.unusable) or f"{folder} holds no key"
         raise UserError(f"{why}, so no client could connect; allow one with `sudo shearloop keys allow FILE`")
     return clients
-
-
-class ClientAuthenticator:
-    """Admits new clients at a bounded rate; at a network address also by their keys (ZAP, ZeroMQ RFC 27).
-
-    libzmq makes the event loop's thread work for each new client, but asks here first. It must exist before a socket
-    is bound.
-    """
-
-    def __init__(self, context: "zmq.Context[Any]", clients: Path | None, refusals: Refusals) -> None:
-        """Raise UserError if the folder `clients` is unreadable or empty."""
-        self._clients = clients
-        self._refusals = refusals
-        self._new = TokenBucket(NEW_BURST, NEW_PER_S)
-        self._authenticator = Authenticator(context)
-        if clients is not None:
-            for why in check_allowed_clients(clients).unusable:
-                structlog.get_logger().warning("a client's key cannot be used", reason=why)
-            self._authenticator.configure_curve_callback(ZAP_DOMAIN, self)
-        self._authenticator.start()
-
-    async def callback(self, _domain: str, key: bytes) -> bool:
-        """Return whether a client with this public key may connect; pyzmq's authenticator awaits it."""
-        log = structlog.get_logger()
-        try:
-            # In a thread: the folder may be on a slow drive.
-            allowed = await asyncio.to_thread(allowed_clients, self._clients) if self._clients is not None else None
-            name = allowed.names.get(key) if allowed is not None else None
-        except UserError as error:
-            self._refusals.counts["allow-list cannot be read"] += 1
-            log.warning("client refused", reason=str(error))
-            return False
-        if name is not None:
-            log.info("client accepted", client=name)
-            return True
-        self._refusals.counts["key is not allowed"] += 1
-        if self._refusals.counts["key is not allowed"] == 1:
-            log.warning("client refused: its key is not in the allow-list", key=key.decode())
-        return False
-
-    async def run(self) -> None:
-        """Answer libzmq's authentication requests until cancelled."""
-        requests = zmq.asyncio.Socket.from_socket(self._authenticator.zap_socket)
-        while True:
-            request = await requests.recv_multipart()
-            if self._new.allow(time.monotonic_ns()):
-                await self._authenticator.handle_zap_message(request)
-            else:
-                reason = f"more than {NEW_PER_S:g} clients a second connect; others wait"
-                self._refusals.add("too many new clients", reason, frequent=True)
-                # A temporary failure: the client tries again.
-                await requests.send_multipart([b"1.0", request[1], b"300", b"", b"", b""])
-            # Requests that have already arrived do not yield to other tasks.
-            await asyncio.sleep(0)
-
-    def close(self) -> None:
-        """Stop; no client can connect any more."""
-        self._authenticator.stop()
 
 
 def _load(path: Path) -> tuple[bytes, bytes | None]:

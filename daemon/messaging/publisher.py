@@ -3,7 +3,7 @@
 import asyncio
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import structlog
 import zmq
@@ -11,9 +11,12 @@ import zmq.asyncio
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.bound_sockets import bind
-from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_map
 from shearloop.daemon.messaging.refusals import is_logged
+
+if TYPE_CHECKING:
+    # Only a network address has keys.
+    from shearloop.daemon.messaging.keys import KeyPair
 
 # Messages kept for a slow subscriber. It loses later ones; others are not delayed.
 HIGH_WATER_MARK = 1000
@@ -34,7 +37,7 @@ class Publisher:
     Sending never blocks. A slow subscriber loses messages and sees gaps in `seq`.
     """
 
-    def __init__(self, context: "zmq.Context[Any]", address: str, clock: Clock, keys: KeyPair | None = None) -> None:
+    def __init__(self, context: "zmq.Context[Any]", address: str, clock: Clock, keys: "KeyPair | None" = None) -> None:
         """Bind the socket; raises UserError if the address is in use, malformed, or needs keys."""
         self._clock = clock
         self._next_seq: Counter[tuple[str, str]] = Counter()

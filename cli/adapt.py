@@ -4,7 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from shearloop.cli.options import DELAY_S, TOOL_MM, add_json, add_option, load_calibration, time_range
+from shearloop.cli.calibrations import DELAY_S, load_calibration, time_range
+from shearloop.cli.options import TOOL_MM, add_json, add_option
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result
 from shearloop.tools.outputs import check_overwrite

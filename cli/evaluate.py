@@ -7,16 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import (
-    add_cluster,
-    add_json,
-    add_option,
-    add_recipe,
-    check_recipe,
-    number,
-    of_slices,
-    time_range,
-)
+from shearloop.cli.calibrations import add_recipe, check_recipe, of_slices, time_range
+from shearloop.cli.options import add_cluster, add_json, add_option, number
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError, missing
@@ -94,7 +86,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and draw on request."""
-    from shearloop.cli.options import judges_slices, read_judged
+    from shearloop.cli.calibrations import judges_slices, read_judged
     from shearloop.tools.evaluate import ESTIMATES_MAGIC, evaluate_recordings, write_estimates
     from shearloop.tools.figures import figures_by_load, figures_of
     from shearloop.tools.outputs import check_overwrite

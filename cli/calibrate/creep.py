@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from shearloop.cli.options import add_json, add_option, judges_slices, read_judged
+from shearloop.cli.calibrations import judges_slices, read_judged
+from shearloop.cli.options import add_json, add_option
 from shearloop.cli.terminal import print_result
 from shearloop.words import counted
 

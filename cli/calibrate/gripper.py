@@ -7,7 +7,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option, check_calibration_file
+from shearloop.cli.calibrations import check_calibration_file
+from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import Operator, print_result
 from shearloop.drivers.defaults import URCAP_PORT

@@ -7,7 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import add_json, add_option, check_calibration_file, number
+from shearloop.cli.calibrations import check_calibration_file
+from shearloop.cli.options import add_json, add_option, number
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import Operator, print_result
 

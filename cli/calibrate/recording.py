@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import add_json, add_option, add_recipe, check_recipe, of_slices, time_range
+from shearloop.cli.calibrations import add_recipe, check_recipe, of_slices, time_range
+from shearloop.cli.options import add_json, add_option
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError

@@ -8,8 +8,7 @@ dead in this frame. Values are below 10 V, so a line has cells of eight bytes.
 """
 
 import re
-from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -19,7 +18,7 @@ from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.frame_clock import LONGEST_GAP, FrameClock
 from shearloop.drivers.refused_lines import refusal_sentence
-from shearloop.drivers.serial_sensor import InputKind, InputRecorder, LineSplitter, RawEvent, SerialSensor
+from shearloop.drivers.serial_sensor import InputKind, InputRecorder, Parser, RawEvent, SerialSensor
 
 CELL_BYTES = len(b"0.1234, ")
 # Twice a line of 32 electrodes: a line with a wrong count is shorter, a stream without newlines is longer.
@@ -65,19 +64,18 @@ class FrameErrorKind(Enum):
 class FrameError:
     """A rejected line: the reason, its beginning or its first bad value, and that one's position, counted from 0.
 
-    `count` is the number of values; so many lines were refused `in_a_row` with it.
+    `count` is the number of values.
     """
 
     kind: FrameErrorKind
     excerpt: bytes
     position: int | None = None
     count: str = ""
-    in_a_row: int = 1
 
-    def __str__(self) -> str:
-        """Return the sentence for health and log: text and reason; for whole lines in a row their sender too."""
+    def sentence(self, in_a_row: int) -> str:
+        """Return the line for health and log, and the reason; of whole lines in a row who sends them."""
         if self.position is None or b"," in self.excerpt:
-            return refusal_sentence(self.excerpt, f"{self.kind.value}{self.count}", "EIT-kit", self.in_a_row)
+            return refusal_sentence(self.excerpt, f"{self.kind.value}{self.count}", "EIT-kit", in_a_row)
         read = repr(self.excerpt)[1:]
         return f"refused {read} at value {self.position + 1}: {self.kind.value}"
 
@@ -147,8 +145,8 @@ class Frame:
     repeated: bool
 
 
-class FrameParser:
-    """Turns chunks of bytes into frames; counts rejected lines by kind. No I/O.
+class FrameParser(Parser[Frame]):
+    """Turns chunks of bytes into frames. No I/O.
 
     `zero_slots` (v,) is true where the injection pattern makes the value 0. A cut line at the opening of the
     port is not an error. `patience` is the factor on the pause after which the board counts as stopped. It is above 1
@@ -158,13 +156,10 @@ class FrameParser:
     def __init__(
         self, zero_slots: NDArray[np.bool_], *, nominal_period_ns: int = NOMINAL_PERIOD_NS, patience: float = 1.0
     ) -> None:
+        super().__init__(MAX_LINE_BYTES)
         self.clock = FrameClock(nominal_period_ns, patience * LONGEST_GAP)
         self.frames = 0
-        self.errors: Counter[FrameErrorKind] = Counter()
-        self.last_error: FrameError | None = None
-        self._refused_in_a_row = 0
         self._zero_slots = zero_slots
-        self._lines = LineSplitter(MAX_LINE_BYTES)
         self._first_line = True
         # Lines; None once bytes were lost, which may be those of many.
         self._rejected_since_frame: int | None = 0
@@ -173,21 +168,6 @@ class FrameParser:
         self._last_mid_ns = -(2**63)
         self._last_channels = np.full(np.count_nonzero(~zero_slots), np.nan)
         self._equal_readings = np.zeros(len(self._last_channels), np.int64)
-
-    @property
-    def refused(self) -> int:
-        """The number of refused lines since the beginning."""
-        return self.errors.total()
-
-    @property
-    def refusal(self) -> str:
-        """The last refused line, why, and the cure; of whole lines in a row who sends them; empty without one."""
-        return "" if self.last_error is None else str(self.last_error)
-
-    @property
-    def unfinished(self) -> bytes:
-        """The received beginning of the next line."""
-        return self._lines.partial
 
     def handle(self, event: RawEvent) -> list[Frame]:
         """Process a live or recorded event; return the frames that it completes."""
@@ -235,9 +215,7 @@ class FrameParser:
         return None
 
     def _reject(self, error: FrameError) -> None:
-        self.errors[error.kind] += 1
-        self._refused_in_a_row += 1
-        self.last_error = replace(error, in_a_row=self._refused_in_a_row)
+        self.refusal = error.sentence(self._count_refused(error.kind))
         if error.kind in _LOST_BYTES:
             self._rejected_since_frame = None
         elif self._rejected_since_frame is not None:

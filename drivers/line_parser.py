@@ -1,14 +1,13 @@
 """Boards that send a line for each conversion: bytes become values with the times of their measurement. No I/O."""
 
 import re
-from abc import ABC, abstractmethod
-from collections import Counter
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, TypeVar
 
 from shearloop.drivers.line_clock import LineClock
 from shearloop.drivers.refused_lines import BoardKind, refusal_sentence
-from shearloop.drivers.serial_sensor import InputKind, LineSplitter, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, Parser, RawEvent
 
 ValueT = TypeVar("ValueT")
 
@@ -27,7 +26,7 @@ class TimedLine:
     partial: bool
 
 
-class LineParser(ABC, Generic[ValueT]):
+class LineParser(Parser[ValueT]):
     """Turns the bytes of a board that sends a line for each conversion, in any slices, into values. No I/O."""
 
     # The board that should send the lines.
@@ -35,41 +34,14 @@ class LineParser(ABC, Generic[ValueT]):
 
     def __init__(self, pattern: re.Pattern[bytes], max_bytes: int, baud: int, rate_hz: float) -> None:
         """Accept lines that match the pattern, of at most `max_bytes`; the board sends `rate_hz` lines a second."""
+        super().__init__(max_bytes)
         self.count = 0
         self._pattern = pattern
-        self._lines = LineSplitter(max_bytes)
         self._byte_ns = 10 * 10**9 // baud  # with start and stop bit
         self._period_ns = round(1e9 / rate_hz)
         self._clock = LineClock(self._period_ns)
         self._last_mid_ns = -(2**63)
         self._first = True
-        self._rejected: Counter[str] = Counter()
-        self._refused_in_a_row = 0
-        # The last refused line and its kind, and how many were refused in a row with it.
-        self._last_refused: tuple[bytes, str, int] | None = None
-
-    @property
-    def errors(self) -> dict[str, int]:
-        """The number of rejected lines, by kind."""
-        return dict(self._rejected)
-
-    @property
-    def refused(self) -> int:
-        """The number of refused lines since the beginning."""
-        return self._rejected.total()
-
-    @property
-    def refusal(self) -> str:
-        """The last refused line, why, who sends such lines where they repeat, and the cure; empty without one."""
-        if self._last_refused is None:
-            return ""
-        line, kind, in_a_row = self._last_refused
-        return refusal_sentence(line, kind, self.board, in_a_row)
-
-    @property
-    def unfinished(self) -> bytes:
-        """The received beginning of the next line."""
-        return self._lines.partial
 
     @abstractmethod
     def _value(self, line: TimedLine) -> ValueT | None:
@@ -122,6 +94,4 @@ class LineParser(ABC, Generic[ValueT]):
 
     def _refuse(self, line: bytes, kind: str) -> None:
         self._clock.refused()
-        self._rejected[kind] += 1
-        self._refused_in_a_row += 1
-        self._last_refused = line, kind, self._refused_in_a_row
+        self.refusal = refusal_sentence(line, kind, self.board, self._count_refused(kind))

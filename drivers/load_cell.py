@@ -227,4 +227,4 @@ class LoadCell(serial_sensor.SerialSensor[LoadSample]):
         """Return the board's values for `health`; counts are since the process began."""
         parser = self._load_parser
         counts = {"samples": parser.count, "flagged": parser.flagged}
-        return {**super().diagnostics(), **counts, "errors": parser.errors}
+        return {**super().diagnostics(), **counts, "errors": dict(parser.errors)}

@@ -2,10 +2,12 @@
 
 import contextlib
 import time
-from collections.abc import AsyncGenerator, Callable, Sequence
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import AsyncGenerator, Callable, Hashable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.errors import DeviceLostError, DriverError
@@ -24,7 +26,6 @@ FORGET_REFUSAL_VALUES = 100
 SETTLE_VALUES = 3
 
 ValueT = TypeVar("ValueT")
-ValueT_co = TypeVar("ValueT_co", covariant=True)
 
 
 class InputKind(Enum):
@@ -52,25 +53,6 @@ class RawEvent:
     kind: InputKind
     t_ns: int
     data: bytes = b""
-
-
-class Parser(Protocol[ValueT_co]):
-    """Turns events into values, and counts the refused ones."""
-
-    @property
-    def refused(self) -> int:
-        """The number of refused lines since the beginning."""
-
-    @property
-    def refusal(self) -> str:
-        """The last refused line, why, who sends such lines where they repeat, and the cure; empty without one."""
-
-    @property
-    def unfinished(self) -> bytes:
-        """The received beginning of the next line."""
-
-    def handle(self, event: RawEvent) -> Sequence[ValueT_co]:
-        """Process a live or recorded event; return the values that it completes."""
 
 
 class InputRecorder(Protocol):
@@ -126,6 +108,41 @@ class LineSplitter:
         self.too_long += 1
         self.too_long_start = line[:60]
         return None
+
+
+class Parser(ABC, Generic[ValueT]):
+    """Turns events into values, and counts the refused lines by their kind, since the beginning. No I/O.
+
+    `refusal` is the sentence on the last refused line, empty without one.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        """Accept lines of at most `max_bytes`."""
+        self.errors: Counter[Any] = Counter()
+        self.refusal = ""
+        self._lines = LineSplitter(max_bytes)
+        # Without a value in between.
+        self._refused_in_a_row = 0
+
+    @property
+    def refused(self) -> int:
+        """The number of refused lines since the beginning."""
+        return self.errors.total()
+
+    @property
+    def unfinished(self) -> bytes:
+        """The received beginning of the next line."""
+        return self._lines.partial
+
+    @abstractmethod
+    def handle(self, event: RawEvent) -> Sequence[ValueT]:
+        """Process a live or recorded event; return the values that it completes."""
+
+    def _count_refused(self, kind: Hashable) -> int:
+        """Count a refused line; return how many were refused in a row."""
+        self.errors[kind] += 1
+        self._refused_in_a_row += 1
+        return self._refused_in_a_row
 
 
 class StepFilter(Generic[ValueT]):

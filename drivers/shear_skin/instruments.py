@@ -470,7 +470,7 @@ class AdcBoard(SerialSensor[Voltages]):
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        return {**super().diagnostics(), "lines": self._pair_parser.count, "errors": self._pair_parser.errors}
+        return {**super().diagnostics(), "lines": self._pair_parser.count, "errors": dict(self._pair_parser.errors)}
 
 
 Daq: TypeAlias = ScpiScanner | AdcBoard

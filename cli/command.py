@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, with_connection
+from shearloop.cli.options import TIMEOUT_S, MissingKeyError, add_connection, add_option, client_keys, with_connection
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.bound_requests import LateRequestError, meant_for
 from shearloop.daemon.messaging.callers import caller
@@ -97,7 +97,17 @@ def _asked(args: argparse.Namespace, request: dict[str, Any]) -> dict[str, Any]:
         except TimeoutError:
             # The daemon may have stopped the motion by now. A second `stop` must not end the daemon.
             request = {**request, "spare_daemon": True}
-    return _sent(args, request, client_keys(args)) if reply is None else reply
+    return _sent(args, request, _keys(args)) if reply is None else reply
+
+
+def _keys(args: argparse.Namespace) -> "ClientKeys | None":
+    """Return the keys for the daemon; a `stop` on its own machine is tried without them too."""
+    try:
+        return client_keys(args)
+    except MissingKeyError:
+        if args.name != "stop" or addresses.needs_keys(args.connect):
+            raise
+        return None
 
 
 def _age_s(args: argparse.Namespace) -> float:

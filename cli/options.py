@@ -119,7 +119,9 @@ def _address(text: str) -> str:
 def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) -> None:
     """Add `--connect`, `--key` and `--server-key`; `purpose` describes the address."""
     add_option(parser, "--connect", _daemon, "ADDRESS", f"{purpose} (default: %(default)s)", default=default)
-    add_option(parser, "--key", Path, "FILE", "your .key_secret, for a daemon on the network (default: in ~/.config)")
+    add_option(
+        parser, "--key", Path, "FILE", "your .key_secret, for a daemon open to the network (default: in ~/.config)"
+    )
     add_option(parser, "--server-key", Path, "FILE", "that daemon's .key (default: in ~/.config)")
 
 
@@ -151,9 +153,25 @@ def user_key_folder() -> Path:
     return (Path(home) if home else Path.home() / ".config") / "shearloop"
 
 
-def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
-    """Return the keys for the address, None for an address on this machine; raises UserError for missing keys."""
-    if args.key is None and args.server_key is None and not addresses.needs_keys(args.connect):
+class MissingKeyError(UserError):
+    """A file of the client's keys does not exist."""
+
+
+def client_keys(args: argparse.Namespace, address: str | None = None) -> "ClientKeys | None":
+    """Return the keys for an address, by default that of `--connect`; None where the daemon needs none.
+
+    A daemon that is open to the network needs them on a loopback address too. Raises MissingKeyError for missing keys.
+    """
+    # The daemon itself needs no client.
+    from shearloop.daemon.messaging import stop_client
+
+    address = address or args.connect
+    why = ""
+    if addresses.needs_keys(address):
+        why = f"{address} is not on this machine"
+    elif stop_client.is_open_to_network(address):
+        why = f"the daemon at {address} is open to the network and answers only with keys"
+    if not why and args.key is None and args.server_key is None:
         return None
     from shearloop.daemon.messaging.keys import ClientKeys
 
@@ -165,7 +183,5 @@ def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
         (server_key, "--server-key", "copy the daemon's server.key there"),
     ):
         if not path.exists():
-            raise UserError(
-                f"{args.connect} is not on this machine, and there is no key {path}: {cure}, or give {option}"
-            )
+            raise MissingKeyError(f"{f'{why}, and ' if why else ''}there is no key {path}: {cure}, or give {option}")
     return ClientKeys.load(key, server_key)

@@ -2,12 +2,25 @@
 
 import argparse
 import asyncio
+import sys
+from typing import TYPE_CHECKING
 
-from shearloop.cli.options import PORT, add_connection, add_fingertip, add_option, client_keys, load_fingertip
+from shearloop.cli.options import (
+    PORT,
+    MissingKeyError,
+    add_connection,
+    add_fingertip,
+    add_option,
+    client_keys,
+    load_fingertip,
+)
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result
-from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
+from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys
 from shearloop.errors import UserError, require
+
+if TYPE_CHECKING:
+    from shearloop.daemon.messaging.keys import ClientKeys
 
 PAGE_PORT = 7760
 
@@ -46,7 +59,7 @@ def _serve_page(args: argparse.Namespace) -> int:
             f"the page would show the daemon at {args.connect} and stop the one at {args.commands}; give both "
             "--connect and --commands of the same daemon"
         )
-    address = DaemonAddress(args.connect, args.commands, client_keys(args))
+    address = DaemonAddress(args.connect, args.commands, _keys(args, args.connect), _keys(args, args.commands))
     path = args.token_file or default_token_path()
     token = load_token(path, new=args.new_token)
     fingertip = load_fingertip(args.fingertip)
@@ -60,6 +73,17 @@ def _serve_page(args: argparse.Namespace) -> int:
     with logging_to_stderr():
         asyncio.run(serve(address, args.port, token, fingertip, print_address))
     return 0
+
+
+def _keys(args: argparse.Namespace, address: str) -> "ClientKeys | None":
+    """Return the keys for an address; without them a page on the daemon's own machine can still stop."""
+    try:
+        return client_keys(args, address)
+    except MissingKeyError as error:
+        if needs_keys(address):
+            raise
+        print(f"shearloop view: {error}. Without it the page can only stop.", file=sys.stderr, flush=True)
+        return None
 
 
 def _serve_foxglove(args: argparse.Namespace) -> int:

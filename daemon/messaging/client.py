@@ -17,7 +17,7 @@ from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, 
 from shearloop.daemon.messaging.deadlines import TYPED_WITHIN_S
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, decode, encode
-from shearloop.daemon.messaging.stop_client import foreign_reply
+from shearloop.daemon.messaging.stop_client import foreign_reply, is_open_to_network, other_listeners
 from shearloop.errors import UserError
 from shearloop.timeouts import timeout
 
@@ -130,6 +130,9 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
                 f"{nothing}: the program there does not publish to this client; give the address of the daemon's "
                 f"`publish` key, which is not that of its `commands`{_keys_hint(self._keys)}"
             )
+        if others := other_listeners(self._address):
+            listens = f"a program of this computer listens at {others[0]}: if it is the daemon, give that address"
+            return UnreachedError(f"{nothing}: {listens}{_keys_hint(self._keys)}")
         return UnreachedError(
             f"{nothing}: no daemon publishes there; start it with `shearloop run CONFIG`, or give the address of its "
             f"`publish` key{_keys_hint(self._keys)}"
@@ -263,13 +266,31 @@ async def ask(
                 late = ". Nothing says that the arm stands: use the emergency stop. If the stop still arrives, it "
                 late += f"stops what moves then; {_end_sentence(content)}"
             kind = UnansweredError if in_doubt else UserError
-            with_keys = f"{_keys_hint(keys)} (--key and --server-key)"
             raise kind(
-                f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
-                f"or give the address of its `commands` key with --connect{with_keys}{late}"
+                f"no daemon answered at {address} within {timeout_s:g} s; {_cure(address, keys)}{late}"
             ) from error
         except ValueError as error:
             raise foreign_reply(address, error) from error
+
+
+def _cure(address: str, keys: ClientKeys | None) -> str:
+    """Return what to do about a command that nobody answers, by what listens on this computer."""
+    options = "--key and --server-key"
+    if is_open_to_network(address):
+        if keys is None:
+            return (
+                f"a daemon that is open to the network, as the program there is, answers only with keys: give {options}"
+            )
+        return (
+            "a program listens there: if it is the daemon, your key is not allowed (`sudo shearloop keys allow FILE`), "
+            f"or your server.key is another daemon's ({options})"
+        )
+    if others := other_listeners(address):
+        return f"a program of this computer listens at {others[0]}: if it is the daemon, give --connect {others[0]}"
+    return (
+        "start it with `shearloop run CONFIG`, or give the address of its `commands` key with --connect"
+        f"{_keys_hint(keys)} ({options})"
+    )
 
 
 def _end_sentence(stop: Mapping[str, Any]) -> str:

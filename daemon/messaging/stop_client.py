@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import msgpack
 
-from shearloop.daemon.messaging.addresses import ASKED, ELSEWHERE, stop_name
+from shearloop.daemon.messaging.addresses import ASKED, ELSEWHERE, is_local, stop_name
 from shearloop.errors import UserError
 
 _IpAddress: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
@@ -33,13 +33,46 @@ def owners(address: str) -> set[int]:
         with suppress(OSError):
             found.add(os.stat(address.removeprefix("ipc://")).st_uid)
         return found
-    host, _, port = address.removeprefix("tcp://").rpartition(":")
-    listeners = [(ip, uid) for ip, listens_at, uid in _listeners() if str(listens_at) == port]
-    # A connection goes to the listener at this address, and only without one to a listener at all addresses. Any user
-    # may listen at another address of this computer, such as 127.0.0.2.
+    return found | {uid for _, uid in _reached_listeners(address)}
+
+
+def is_open_to_network(address: str) -> bool:
+    """Return whether a connection from this computer to a tcp address goes to a listener at all of its addresses.
+
+    A daemon that listens there answers only with keys, also on a loopback address.
+    """
+    return any(ip.is_unspecified for ip, _ in _reached_listeners(address))
+
+
+def other_listeners(address: str) -> list[str]:
+    """Return the network addresses of this computer at which a program listens on the port of a loopback address.
+
+    Empty where a program listens at that address itself.
+    """
+    if not is_local(address) or _reached_listeners(address):
+        return []
+    found = sorted({str(ip) for ip, _ in _port_listeners(address) if not ip.is_loopback})
+    return [f"tcp://{f'[{ip}]' if ':' in ip else ip}:{address.rpartition(':')[2]}" for ip in found]
+
+
+def _port_listeners(address: str) -> list[tuple[_IpAddress, int]]:
+    """Return address and user of each listener on the port of a tcp address."""
+    port = address.rpartition(":")[2]
+    if not address.startswith("tcp://"):
+        return []
+    return [(ip, uid) for ip, listens_at, uid in _listeners() if str(listens_at) == port]
+
+
+def _reached_listeners(address: str) -> list[tuple[_IpAddress, int]]:
+    """Return the listeners that a connection to a tcp address of this computer may reach.
+
+    It goes to the listener at this address, and only without one to a listener at all addresses. Any user may listen at
+    another address of this computer, such as 127.0.0.2.
+    """
+    host, listeners = address.removeprefix("tcp://").rpartition(":")[0], _port_listeners(address)
     asked_ip = "127.0.0.1" if host == "localhost" else host.strip("[]")
-    at_address = {uid for ip, uid in listeners if str(ip) == asked_ip}
-    return found | (at_address or {uid for ip, uid in listeners if ip.is_unspecified})
+    at_address = [listener for listener in listeners if str(listener[0]) == asked_ip]
+    return at_address or [listener for listener in listeners if listener[0].is_unspecified]
 
 
 def is_here(address: str) -> bool:

@@ -31,11 +31,12 @@ HIGH_WATER_MARK = 1000
 
 @dataclass(frozen=True, slots=True)
 class DaemonAddress:
-    """A daemon's sockets, with the keys if it is on the network."""
+    """A daemon's sockets, with the keys of each that is open to the network."""
 
     publish: str
     commands: str
-    keys: ClientKeys | None = None
+    publish_keys: ClientKeys | None = None
+    command_keys: ClientKeys | None = None
 
 
 class Bridge:
@@ -54,9 +55,9 @@ class Bridge:
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
         try:
-            connect(self._socket, address.publish, address.keys)
+            connect(self._socket, address.publish, address.publish_keys)
             with context.socket(zmq.DEALER) as commands:
-                connect(commands, address.commands, address.keys)
+                connect(commands, address.commands, address.command_keys)
         except UserError:
             self._socket.close()
             raise
@@ -140,7 +141,7 @@ class Bridge:
         return reply
 
     async def _request(self, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
-        return await ask(self._context, self.address.commands, content, timeout_s, self.address.keys)
+        return await ask(self._context, self.address.commands, content, timeout_s, self.address.command_keys)
 
     async def close(self) -> None:
         """Close the socket; wait for a stop that is on its way."""

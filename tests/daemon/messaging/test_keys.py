@@ -1,7 +1,9 @@
 """CURVE on anything but loopback and ipc, keys by `shearloop keys`, an allow-list, and no way round them."""
 
 import asyncio
+import ipaddress
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -10,6 +12,8 @@ import pytest
 import zmq
 import zmq.asyncio
 
+from shearloop.cli import main
+from shearloop.daemon.messaging import stop_client
 from shearloop.daemon.messaging.addresses import has_valid_port, is_local, needs_keys
 from shearloop.daemon.messaging.bound_sockets import bind
 from shearloop.daemon.messaging.client import Subscriber
@@ -131,6 +135,47 @@ async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, con
             assert "this command needs a key" in (await anyone({"command": name}, DEADLINE_S))["reason"]
         assert (await anyone({"command": "stop", **of_now()}, DEADLINE_S))["ok"]
         await daemon.ending.wait()
+
+
+async def test_a_loopback_address_of_a_daemon_that_is_open_to_the_network_needs_keys_too(
+    config, keys, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    own = tmp_path / "shearloop"
+    path = config(publish=NETWORK, commands=NETWORK, curve=curve(keys))
+    async with running_daemon(path) as daemon:
+        commands = reachable(daemon.tasks["commands"].address)
+        published = reachable(daemon.publisher.address)
+
+        async def told(*arguments: str) -> tuple[int, str]:
+            status = await asyncio.to_thread(main, list(arguments))
+            return status, capsys.readouterr().err
+
+        pause = ("command", "pause", "--connect", commands)
+        heard = ("listen", "health", "--count", "1", "--timeout", "20", "--connect", published)
+        for command, address in ((pause, commands), (heard, published)):
+            status, said = await told(*command)
+            assert status == 2
+            assert f"the daemon at {address} is open to the network and answers only with keys" in said
+            assert f"there is no key {own / 'client.key_secret'}: make one" in said
+        own.mkdir()
+        for file in (keys / "ada/client.key_secret", keys / "keys/server.key"):
+            shutil.copy(file, own)
+        status, said = await told(*pause)
+        assert (status, "no robot" in said) == (1, True)
+        assert (await told(*heard))[0] == 0
+        (keys / "keys/clients/ada.key").unlink()
+        status, said = await told(*pause, "--timeout", "0.5")
+        assert status == 2
+        assert "a program listens there: if it is the daemon, your key is not allowed" in said
+
+
+def test_a_daemon_at_the_network_address_alone_is_named(monkeypatch, mistake):
+    listeners = [(ipaddress.ip_address("192.0.2.7"), 7769, 0)]
+    monkeypatch.setattr(stop_client, "_listeners", lambda: iter(listeners))
+    for command in (("command", "pause"), ("listen", "health")):
+        said = mistake(*command, "--connect", "tcp://127.0.0.1:7769", "--timeout", "0.01")
+        assert "a program of this computer listens at tcp://192.0.2.7:7769" in said
 
 
 def test_a_client_needs_keys_for_another_machine(tmp_path, monkeypatch, ran, mistake):

@@ -95,6 +95,7 @@ class ControlLoop:
         self._zero_known: dict[str, bool] = {}
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
+        self._ticked_ns = 0
         self.operator = OperatorView(
             self.inputs, self.tool, self.safety, sources, self._zero_known, running=lambda: self.running
         )
@@ -193,6 +194,19 @@ class ControlLoop:
         """Return whether a source's zero was taken since this process began, or is kept from the one before."""
         return self._zero_known.get(source, False)
 
+    def start_refusal(self) -> str | None:
+        """Return why no experiment at all can begin, by the latest tick, or None.
+
+        Whether a torque is too large depends on the experiment. A pause of the loop is over once it is found.
+        """
+        if (reason := self.operator.start_refusal()) is not None:
+            return reason
+        found = self._unless_enabled_by_start(
+            detect_faults(self.inputs, self._watched, DEFAULT_LIMITS, None, self._ticked_ns)
+        )
+        lasting = [one for one in found if not one.rule.is_past and one.code is not FaultCode.TORQUE_LIMIT]
+        return _refusal_by(lasting) or self._awaited_judgement()
+
     def start(self, file: ExperimentFile, t_ns: int) -> str | None:
         """Begin an experiment; return None, or why it cannot begin."""
         if (reason := self.operator.start_refusal()) is not None:
@@ -205,13 +219,8 @@ class ControlLoop:
         driving = self._sources[file.torque_source]
         watched = replace(self._watched, driving=driving, supervising=self._others(driving))
         faults = detect_faults(self.inputs, watched, file.limits, None, t_ns)
-        refusals = [fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START]
-        if refusals:
-            return " ".join(refusals)
-        if (reason := self.operator.why_not_with_tool(file)) is not None:
+        if reason := _refusal_by(faults) or self.operator.why_not_with_tool(file) or self._awaited_judgement():
             return reason
-        if self.tool.awaits_judgement:
-            return "the fingers move, and an earlier daemon had gripped a tool: wait until they stand still"
         speeds = Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
         self.experiment, self._watched = Experiment(file, t_ns, speeds), watched
         self.wrist = self._wrists[file.torque_source]
@@ -252,7 +261,7 @@ class ControlLoop:
         if sent_rad_per_s is not None:
             self.wrist.sent(sent_rad_per_s)
         running, arm = self.running, self.inputs.arm
-        self.inputs.late_s = late_s
+        self.inputs.late_s, self._ticked_ns = late_s, t_ns
         limits = self.experiment.limits if self.experiment is not None else DEFAULT_LIMITS
         awaited = self._awaited_torques(t_ns)
         step = self._running_step(running, awaited) if running is not None else None
@@ -290,15 +299,25 @@ class ControlLoop:
 
     def _at_rest(self, found: Sequence[Fault]) -> list[Fault]:
         """Return the faults while no experiment runs, with what the operator should know of a held tool."""
-        faults, arm = list(found), self.inputs.arm
+        faults = list(found)
         if self.safety.waiting is not None and (held := self.tool.may_still_hold) is not None:
             is_held = self.tool.held is not None
             faults.append(Fault(FaultCode.TOOL_GRIPPED if is_held else FaultCode.TOOL_MAY_BE_GRIPPED, held))
         if unknown := self.tool.unknown_grip:
             faults.append(Fault(FaultCode.GRIP_UNKNOWN, unknown))
-        if arm is not None and arm.enabled_by_start:
-            faults = [fault for fault in faults if fault.code is not FaultCode.ROBOT_BLOCKED]
-        return faults
+        return self._unless_enabled_by_start(faults)
+
+    def _unless_enabled_by_start(self, faults: Sequence[Fault]) -> list[Fault]:
+        """Return the faults without the block of an arm that the start of an experiment enables."""
+        arm = self.inputs.arm
+        enabled = arm is not None and arm.enabled_by_start
+        return [fault for fault in faults if not (enabled and fault.code is FaultCode.ROBOT_BLOCKED)]
+
+    def _awaited_judgement(self) -> str | None:
+        """Return why the gripper cannot yet say whether it has an earlier daemon's grip, or None."""
+        if self.tool.awaits_judgement:
+            return "the fingers move, and an earlier daemon had gripped a tool: wait until they stand still"
+        return None
 
     def _others(self, driving: TorqueSource) -> tuple[TorqueSource, ...]:
         return tuple(source for source in self._sources.values() if source is not driving)
@@ -435,3 +454,8 @@ class ControlLoop:
 
 def _turns(command: StepCommand) -> bool:
     return not isinstance(command.wrist, Hold) or isinstance(command.action, IdentifyStep)
+
+
+def _refusal_by(faults: Sequence[Fault]) -> str | None:
+    """Return the sentences of the faults in whose presence no experiment starts, or None."""
+    return " ".join(fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START) or None

@@ -172,7 +172,7 @@ class ControlLoopRunner:
             return ENDING
         if self.operator_action.under_way:
             return UNLOCKING
-        return self._control_loop.operator.start_refusal() or self._taring()
+        return self._control_loop.start_refusal() or self._taring()
 
     def _taring(self) -> str | None:
         """Return why no experiment can begin with the zeros of now, or None."""

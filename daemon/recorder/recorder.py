@@ -179,7 +179,7 @@ class _CurrentFile:
 class Recorder:
     """Writes files in a folder. `record_message`, `input_recorder` and `record_experiment` never block.
 
-    `failure` is the error of the last flush, empty without one. `closed_files` are complete.
+    `failure` is the error of the last finished flush, empty without one. `closed_files` are complete.
     """
 
     def __init__(self, folder: Path, identity: Identity, clock: Clock) -> None:
@@ -194,6 +194,8 @@ class Recorder:
         # A flush may still run in its thread when the recorder is closed.
         self._lock = threading.Lock()
         self.failure = ""
+        # The error of the present flush. `failure` keeps the last one's meanwhile: a disk that stays full stays known.
+        self._failing = ""
         self.closed_files: list[Path] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -275,6 +277,7 @@ class Recorder:
         with self._lock:
             if not self._current.closed:
                 self._write()
+                self.failure = self._failing
 
     def close(self) -> None:
         """Write the queue and close the file; an error is stored in `failure`."""
@@ -286,6 +289,7 @@ class Recorder:
             finally:
                 self._current.closed = True
                 self._finish_file(self._current, self._counts.dropped + self._counts.unwritable)
+                self.failure = self._failing
 
     @property
     def _waiting_bytes(self) -> int:
@@ -301,7 +305,7 @@ class Recorder:
         return True
 
     def _write(self) -> None:
-        self.failure = ""
+        self._failing = ""
         if self._current.file.is_removed():
             self._change_file(self._queue[0].dropped if self._queue else self._counts.dropped)
             if self._current.file.is_removed():
@@ -323,7 +327,7 @@ class Recorder:
         try:
             self._current.file.flush()
         except OSError as error:
-            self.failure = f"{self.path}: {error.strerror}"
+            self._failing = f"{self.path}: {error.strerror}"
             return False
         return True
 
@@ -342,7 +346,7 @@ class Recorder:
         try:
             self._current = self._new_file(lost)
         except OSError as error:
-            self.failure = f"{self._folder}: {error.strerror}"
+            self._failing = f"{self._folder}: {error.strerror}"
             return
         if not states_follow:
             self._carried.want_states()
@@ -390,7 +394,7 @@ class Recorder:
             file.add_metadata(schema.END_METADATA, {"dropped": str(lost - current.lost_before)})
             file.close(path)
         except OSError as error:
-            self.failure = f"{file.partial}: {error.strerror}"
+            self._failing = f"{file.partial}: {error.strerror}"
         else:
             self.closed_files.append(path)
 

@@ -226,6 +226,42 @@ def test_a_set_point_without_identification_at_its_gain_is_refused_with_the_cure
     assert "put an `identify` step before" in rig.control_loop.experiment.stop_reason
 
 
+def _gone(device: str):
+    return lambda rig: rig.control_loop.on_link(device, f"the {device} is unplugged", up=False)
+
+
+HINDRANCES = {
+    "a full disk": lambda rig: rig.control_loop.on_recording_error("/data: No space left on device"),
+    "no gripper": _gone("gripper"),
+    "a required sensor": _gone("right"),
+    "a dead task": lambda rig: setattr(rig.control_loop.inputs, "died", {"load_cell": "ValueError: no"}),
+    "an emergency stop": lambda rig: setattr(rig, "arm", replace(rig.arm, emergency_stop=True)),
+    "a blocked arm": lambda rig: setattr(rig, "arm", replace(rig.arm, blocked="it is switched off")),
+    "a faulty gripper": lambda rig: setattr(rig, "hand", replace(rig.hand, fault="it is too hot")),
+    "a silent arm": lambda rig: rig.silent.add("arm"),
+}
+
+
+@pytest.mark.parametrize("hindrance", HINDRANCES)
+def test_what_refuses_every_start_is_said_before_the_start_in_the_same_words(hindrance):
+    rig = Rig(new_loop())
+    rig.run(1.0)
+    assert rig.control_loop.start_refusal() is None
+    HINDRANCES[hindrance](rig)
+    rig.run(1.0)
+    before = rig.control_loop.start_refusal()
+    assert before
+    file = ExperimentFile.model_validate({"name": "test", "steps": [{"do": "wait", "wait_s": 1}]})
+    assert rig.control_loop.start(file, rig.t_ns) == before
+
+
+def test_an_arm_that_the_start_enables_refuses_none():
+    rig = Rig(new_loop())
+    rig.arm = replace(rig.arm, blocked="motion is not enabled", enabled_by_start=True)
+    rig.run(1.0)
+    assert rig.control_loop.start_refusal() is None
+
+
 def test_a_pause_holds_the_wrist_and_is_refused_with_the_reason():
     rig = twisting()
     assert rig.control_loop.pause() is None

@@ -381,6 +381,14 @@ async def test_no_start_while_a_zero_is_taken():
         assert cell.runner.start_refusal() == "the experiment 'test' is still running; stop it first"
 
 
+async def test_a_full_disk_is_said_before_the_start():
+    async with with_gripper() as cell:
+        cell.control_loop.on_recording_error("/data: No space left on device")
+        assert "No space left on device" in (cell.runner.start_refusal() or "")
+        cell.control_loop.on_recording_error("")
+        assert cell.runner.start_refusal() is None
+
+
 class Tared:
     """A sensor whose zero takes long."""
 

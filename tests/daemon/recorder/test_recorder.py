@@ -312,6 +312,29 @@ def test_a_full_disk_keeps_all_flushed_data(tmp_path, disks):
         assert numbers == list(range(safe + 1))
 
 
+def test_a_failure_stays_known_while_the_next_flush_is_under_way(tmp_path, monkeypatch, disks):
+    disks(5_000)
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
+    for number in range(5):
+        recorder.record_message("eit.frame", frame(number))
+    recorder.write()
+    failure = recorder.failure
+    assert "No space left on device" in failure
+    said = []
+    full = SmallDisk.write
+
+    def write(disk: SmallDisk, data: Any, /) -> int:
+        # As `health` may do while the writing thread waits for the disk.
+        said.append(recorder.diagnostics()["error"])
+        return full(disk, data)
+
+    monkeypatch.setattr(SmallDisk, "write", write)
+    recorder.record_message("eit.frame", frame(5))
+    recorder.write()
+    recorder.close()
+    assert set(said) == {failure}
+
+
 def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path, disks):
     opened = disks(20_000)
     recorder = Recorder(tmp_path, IDENTITY, Clock())

@@ -8,7 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shearloop.cli.options import TIMEOUT_S, MissingKeyError, add_connection, add_option, client_keys, with_connection
+from shearloop.cli.connection import MissingKeyError, add_connection, client_keys, with_connection
+from shearloop.cli.options import TIMEOUT_S, add_option
 from shearloop.daemon.messaging import addresses, stop_client
 from shearloop.daemon.messaging.bound_requests import LateRequestError, meant_for
 from shearloop.daemon.messaging.callers import caller

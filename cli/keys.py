@@ -6,7 +6,8 @@ import shlex
 from collections.abc import Callable
 from pathlib import Path
 
-from shearloop.cli.options import add_action, add_json, add_option, run_action, user_key_folder
+from shearloop.cli.connection import user_key_folder
+from shearloop.cli.options import add_action, add_json, add_option, run_action
 from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
 

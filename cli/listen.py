@@ -4,7 +4,8 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Final
 
-from shearloop.cli.options import TIMEOUT_S, add_connection, add_option, client_keys, positive
+from shearloop.cli.connection import add_connection, client_keys
+from shearloop.cli.options import TIMEOUT_S, add_option, positive
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.running_rig import EMULATED_HEADING
 

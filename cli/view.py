@@ -5,15 +5,8 @@ import asyncio
 import sys
 from typing import TYPE_CHECKING
 
-from shearloop.cli.options import (
-    PORT,
-    MissingKeyError,
-    add_connection,
-    add_fingertip,
-    add_option,
-    client_keys,
-    load_fingertip,
-)
+from shearloop.cli.connection import MissingKeyError, add_connection, client_keys
+from shearloop.cli.options import PORT, add_fingertip, add_option, load_fingertip
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys

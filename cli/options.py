@@ -8,7 +8,6 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from shearloop.errors import UserError
 from shearloop.files import expanded_path
 
 if TYPE_CHECKING:
@@ -121,5 +120,3 @@ def load_fingertip(path: Path | None) -> "Fingertip":
 
     with resources.as_file(resources.files("shearloop.daemon.web") / "assets" / "fingertip.yaml") as paper:
         return load_yaml_model(path or paper, FingertipGeometryConfig).fingertip()
-
-

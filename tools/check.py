@@ -1,5 +1,6 @@
 """Describes each part of a configuration, or its mistake; opens every file that it names."""
 
+import errno
 import math
 import os
 import stat
@@ -204,16 +205,34 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
 
 
 def _check_paths(config: "DaemonConfig", parts: Parts) -> None:
-    """Check that no port is a file, and that the recordings' folder is no file; a missing path is accepted."""
+    """Check that no port is a file, and that recordings can be written; a missing path is accepted."""
     from shearloop.daemon.config import SerialDevice
 
     for key, section in config.walk():
         if isinstance(section, SerialDevice) and section.path is not None and (kind := _no_port(section.path)):
             parts.mistakes[key] = f"`{key}.path: {section.path}` is {kind}; name a serial port: `shearloop ports`"
-    if (recording := config.recording) is not None:
-        exists = next((path for path in (recording.folder, *recording.folder.parents) if path.exists()), None)
-        if exists is not None and not exists.is_dir():
-            parts.mistakes["recording"] = f"`recording.folder: {recording.folder}`: {exists} is a file; name a folder"
+    if (recording := config.recording) is not None and (reason := why_not_recorded(recording.folder)):
+        parts.mistakes["recording"] = f"`recording.folder: {recording.folder}`: {reason}"
+
+
+def why_not_recorded(folder: Path) -> str:
+    """Return why this user cannot record in a folder that exists or is still to be made, with the cure, or nothing."""
+    try:
+        existing = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+        if existing.is_symlink() and not existing.exists():
+            return f"{existing} is a link to {existing.readlink()}, which does not exist; choose another folder"
+        if not existing.is_dir():
+            return f"{existing} is a file; name a folder"
+        file_system = os.statvfs(existing)
+    except OSError as error:
+        return f"{error.filename}: {error.strerror}; choose another folder"
+    if not os.access(existing, os.W_OK | os.X_OK):
+        read_only = file_system.f_flag & os.ST_RDONLY
+        why = os.strerror(errno.EROFS if read_only else errno.EACCES)
+        return f"you may not write in {existing} ({why}); choose another folder, or make this one writable"
+    if not file_system.f_bavail:
+        return f"the disk of {existing} is full; free some space, or choose another folder"
+    return ""
 
 
 def _no_port(path: Path) -> str:

@@ -20,7 +20,7 @@ from shearloop.daemon.running_rig import EMULATED, whose_daemon
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import missing_library
 from shearloop.errors import UserError
-from shearloop.tools.check import OPEN_KEYS, CheckEmulators, check_parts
+from shearloop.tools.check import OPEN_KEYS, CheckEmulators, check_parts, why_not_recorded
 from shearloop.tools.doctor.devices import (
     DAEMON_TIMEOUT_S,
     ask_status,
@@ -82,7 +82,7 @@ def examine(
     yield good("configuration", f"{config_path} is in order")
     if config.emulated:
         yield good(EMULATED, "every device of this configuration is emulated: nothing here is said of real ones")
-    yield check_disk(Path() if config.recording is None else config.recording.folder)
+    yield check_disk(Path()) if config.recording is None else check_recording(config.recording.folder)
     yield from check_files(config, config_path, check_emulators, own)
     if config.robot is not None and not config.emulated:
         yield from check_robot_values(config.robot)
@@ -170,6 +170,13 @@ def check_disk(folder: Path) -> Finding:
     return good("disk", found)
 
 
+def check_recording(folder: Path) -> Finding:
+    """Check that the daemon can record in a folder, and the space for it."""
+    if reason := why_not_recorded(folder):
+        return from_error("disk", reason, "the daemon does not start")
+    return check_disk(folder)
+
+
 def check_ports() -> Iterator[Finding]:
     """List the USB serial ports with their serial numbers, and the boards that have none."""
     ports, hidden = list_serial_ports(), list_hidden_boards()
@@ -211,7 +218,7 @@ def check_files(
         if name != "keys":
             yield good(f"files of {name}", text)
     # Other findings name these.
-    elsewhere = ("keys", OPEN_KEYS)
+    elsewhere = ("keys", "recording", OPEN_KEYS)
     for name, mistake in parts.mistakes.items():
         kind = from_file if "\n" in mistake else from_error
         finding = kind(f"files of {name}", mistake, "the daemon does not start")

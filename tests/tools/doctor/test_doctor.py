@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -204,6 +205,35 @@ def test_an_experiment_that_check_refuses_is_wrong(config, tmp_path):
     assert "hold_torque needs an identified tool" in first
     assert "grip needs a gripper" in second
     assert found.next_step.startswith("correct the file")
+
+
+@pytest.mark.parametrize(
+    ("flags", "free", "writable", "part"),
+    [
+        (os.ST_RDONLY, 9, False, "you may not write in {folder} (Read-only file system)"),
+        (0, 9, False, "you may not write in {folder} (Permission denied)"),
+        (0, 0, True, "the disk of {folder} is full"),
+    ],
+)
+def test_a_folder_in_which_nothing_can_be_recorded_is_wrong(
+    config, tmp_path, monkeypatch, mistake, flags, free, writable, part
+):
+    path = config(recording={"folder": str(tmp_path / "later/recordings")})
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=flags, f_bavail=free))
+    monkeypatch.setattr(os, "access", lambda *_: writable)
+    part = part.format(folder=tmp_path)
+    assert f"`recording.folder: {tmp_path}/later/recordings`: {part}" in mistake("check", path)
+    finding = doctor.check_recording(tmp_path / "later/recordings")
+    assert (finding.state, finding.found, finding.means) == ("trouble", part, "the daemon does not start")
+
+
+def test_a_recording_folder_that_is_a_lost_link_is_wrong(config, tmp_path, mistake):
+    (tmp_path / "recordings").symlink_to(tmp_path / "unmounted")
+    path = config(recording={"folder": str(tmp_path / "recordings")})
+    assert f"is a link to {tmp_path}/unmounted, which does not exist" in mistake("check", path)
+    found = {finding.subject: finding for finding in doctor.examine(path, 0.1, check_emulators)}
+    assert found["disk"].state == "trouble"
+    assert "files of recording" not in found
 
 
 def test_a_secret_key_that_others_can_read_is_reported(tmp_path):

@@ -306,6 +306,13 @@ def load_report(path: Path) -> Report:
     return load_model(path, Report, UserError, "report of a commissioning", "; make it with `shearloop commission`")
 
 
+def measures_diameters(config: DaemonConfig, robot: Commissioning | None) -> bool:
+    """Return whether the gripper measures a tool's diameter: by its calibration, or by the report's table of widths."""
+    if config.gripper is None:
+        return False
+    return config.gripper.calibration is not None or (robot is not None and robot.supplied.widths is not None)
+
+
 def measured_widths(found: Supplied, model: ModelName) -> WidthCalibration | None:
     """Return the gripper's calibration by a report's table, or None without one."""
     if found.widths is None:

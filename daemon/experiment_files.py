@@ -22,7 +22,7 @@ import structlog
 
 from shearloop.daemon.commissioning import Commissioning, MotionCap
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.control.experiment_check import check_steps, experiment_mistakes
+from shearloop.daemon.control.experiment_check import check_steps, experiment_mistakes, tool_note
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
@@ -146,6 +146,10 @@ class ExperimentFiles:
     def gripper(self) -> GripperModel | None:
         """The rig's gripper, if one is known."""
         return self.config.gripper_model if self.config is not None else None
+
+    def tool_note(self, file: ExperimentFile) -> str:
+        """Return what the driving torque rests on that nothing will check about the tool; empty without anything."""
+        return "" if self.config is None else tool_note(file, self.config, self.sources, self.robot)
 
     async def read(self, path: Path) -> ReadExperiment:
         """Return the experiment of a file; raises UserError without the file's content, at the latest after 5 s."""

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 # What `status` shows of `loop.state`.
 LOOP_KEYS = (
     *("phase", "run", "experiment", "step", "steps", "step_name", "activity", "progress"),
-    *("stop", "cause", "faults", "reasons"),
+    *("stop", "cause", "faults", "reasons", "torque_note"),
 )
 # The cure of a start that expires while its file is read.
 _SLOW_FILE = "copy the file to a local drive, or end what keeps this computer busy; then "
@@ -309,6 +309,8 @@ class Rig:
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=warm_up_s, start=start)
         note = operator.activation_note(file)
         text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
+        if tool_note := self.experiments.tool_note(file):
+            sentences = (*sentences, f"  {tool_note}")
         held = operator.release_stakes() if tool.may_hold() else ()
         # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.
         digest = digest_of(experiment.data, text, *sentences, *self.occasion(), *held)

@@ -89,6 +89,8 @@ class _Run:
     last: Mapping[str, Any]
     steps: list[_StepSummary] = field(default_factory=list)
     identified: str = ""
+    # What the driving torque rests on that nothing checks.
+    torque_note: str = ""
     held_s: float = 0.0
     # The part of it with a fault that a busy computer can cause.
     late_s: float = 0.0
@@ -197,6 +199,7 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
     if content["response"] == "hold" and run.last["response"] != "hold":
         run.hold_reasons[FaultCode.of_text(_codes(content)[0]).value.kind] += 1
     run.last = content
+    run.torque_note = content.get("torque_note") or run.torque_note
     if run.steps:
         run.steps[-1].to_ns = now_ns
     if content["phase"] in _ENDS:
@@ -242,6 +245,8 @@ def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[s
             yield from _held(step, step.set_point_nm, step.held_from_ns, run, truth, here)
         if step.name == "tighten":
             yield from _turned(step, run, truth)
+    if run.torque_note:
+        yield f"  {run.torque_note}"
     yield from _counted(run)
 
 

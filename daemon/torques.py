@@ -5,10 +5,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from statistics import fmean
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
+
+if TYPE_CHECKING:
+    # A rig without a fingertip does not load it.
+    from shearloop.estimation import Calibration
 
 # The paper's ten frames take 5.4 s.
 LONGEST_TARE_S = 30.0
@@ -30,7 +34,8 @@ class TorqueSample:
     `torque_nm` is None if it is not valid, for `reason`. `low_nm` and `high_nm` bound the friction band that
     hides the torque. A torque beyond `loaded_nm` is a load; a smaller one may be drift of the zero. `loading` is a load
     in the source's own unit, of a source that gives no torque. `load` says why no zero can be taken under the present
-    load, for instance where it is too large for a torque; empty if one can.
+    load, for instance where it is too large for a torque; empty if one can. `note` is what the torque rests on
+    that nothing checks.
     """
 
     source: str
@@ -43,6 +48,7 @@ class TorqueSample:
     loaded_nm: float = LARGEST_DRIFT_NM
     loading: str = ""
     load: str = ""
+    note: str = ""
 
     def __post_init__(self) -> None:
         """Treat NaN and infinity as no torque."""
@@ -61,7 +67,8 @@ class TorqueSource:
     the first torque; 0 for a source that measures without a grip. `has_gain`: an `adapt` step can correct its gain.
     `noise_nm`: the torque is known to this; such a source supervises beyond it only, and drives nothing gentler.
     `needs_zero`: its torques count from a zero that has to be taken. `only_sign`: of the only torques that it
-    measures, 0 for both; a torque of the other sign may read as 0.
+    measures, 0 for both; a torque of the other sign may read as 0. `calibration` is a fingertip's, where it could be
+    opened: it says on which tools there is a torque.
     """
 
     name: str
@@ -75,6 +82,7 @@ class TorqueSource:
     noise_nm: float = 0.0
     needs_zero: bool = False
     only_sign: int = 0
+    calibration: "Calibration | None" = None
 
     def fresh_s(self, config: LoopConfig) -> float:
         """Return how long after its arrival a torque is fresh."""
@@ -96,6 +104,10 @@ class TorqueSource:
 class SensorListener(Protocol):
     """Takes what all sensors report: the control loop, or `LatestTorques` without a robot."""
 
+    @property
+    def stated_tool_mm(self) -> float | None:
+        """The diameter of the tool that the latest experiment states; None without one."""
+
     def on_link(self, device: str, sentence: str, *, up: bool) -> None:
         """Take the return or the loss of a device, with a sentence."""
 
@@ -114,6 +126,9 @@ class SensorListener(Protocol):
 
 class LatestTorques:
     """The listener of sensors without a robot: it knows which of them is loaded."""
+
+    # No experiment states one.
+    stated_tool_mm: float | None = None
 
     def __init__(self) -> None:
         self._torques: dict[str, TorqueSample] = {}

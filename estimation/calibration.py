@@ -19,7 +19,7 @@ from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import UNKNOWN_FRAMES, LearnedFrames
 from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.torque_profile import TorqueProfile
-from shearloop.estimation.values import INLINE, Measured
+from shearloop.estimation.values import INLINE, LARGEST_TOOL_FRACTION, Measured
 
 if TYPE_CHECKING:
     from shearloop.bank.bank_file import Bank
@@ -39,8 +39,6 @@ _ONE_SIGN = {
     sign: f"no torque is {other}, because its recordings have {recorded} torques alone"
     for sign, recorded, other in ((1, "positive", "negative"), (-1, "negative", "positive"))
 }
-# Tools differ if their diameters differ by a larger fraction.
-LARGEST_TOOL_FRACTION = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +91,21 @@ class Calibration:
             )
         regressor = self.torque.regressor.scaled(gain, law.spread)
         return replace(self, torque=replace(self.torque, regressor=regressor), tools=None, tool_mm=tool.value)
+
+    def tool_note(self, source: str, *, tool_known: bool) -> str:
+        """Return what the torque of a source rests on that nothing checks about the held tool; empty for nothing.
+
+        A calibration of several tools has no torque without a diameter.
+        """
+        if self.torque is None or self.tools is not None:
+            return ""
+        if math.isnan(self.tool_mm):
+            cure = "calibrate on one tool, and name its diameter"
+            return f"the calibration of {source} names no single tool, so nothing checks that it holds for this: {cure}"
+        if not tool_known:
+            only = f"the torque of {source} holds for a tool of {self.tool_mm:g} mm alone"
+            return f"the tool's diameter is not known, and {only}: state `tool_mm` in the experiment"
+        return ""
 
     def gain_regressor(self) -> IntervalRegressor:
         """Return the torque's regressor, for a correction of its gain; raises CalibrationError without one."""

@@ -81,6 +81,7 @@ class Session:
         self._period_s = period_s
         self._baseline_frames = baseline_frames
         self._matcher = matcher or calibration.matcher(bank)
+        self._tool_reasons: tuple[str, ...]
         self.set_tool(None)
         self.reset()
 
@@ -96,15 +97,21 @@ class Session:
             self.give_up_tare()
         if before.tool is not None:
             self.set_tool(before.tool.diameter)
+            if conflict := before.tool.conflict:
+                self._tool_reasons = (conflict,)
 
     def set_tool(self, tool: Measured | None) -> None:
         """Set the diameter in mm of the held tool, None where unknown."""
         self._tool = tool
-        self._tool_reasons: tuple[str, ...] = ()
+        self._tool_reasons = ()
         try:
             self._calibration = self.calibration.for_tool(tool)
         except CalibrationError as error:
             self._calibration, self._tool_reasons = self.calibration, (str(error),)
+
+    def tool_note(self, source: str) -> str:
+        """Return what a torque, under the name of its source, rests on that nothing checks about the held tool."""
+        return self.calibration.tool_note(source, tool_known=self._tool is not None)
 
     def tare(self, frames: int | None = None) -> None:
         """Forget the session; the next `frames` usable frames, of untouched fingertips, make the idle frame."""

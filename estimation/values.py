@@ -14,6 +14,8 @@ from shearloop.estimation.confidence import TWO_SIDED_95
 INLINE = {"inline": True}
 # Load cells on a lever bear some N·m; larger readings come from a damaged line.
 LARGEST_TORQUE_NM = 20.0
+# Tools differ if their diameters differ by a larger fraction.
+LARGEST_TOOL_FRACTION = 0.15
 # Recorded loads change by up to 0.76 N·m/s, so older readings say nothing.
 _MAX_TORQUE_AGE_S = 1.0
 
@@ -59,9 +61,33 @@ class TactileFrame:
 
 @dataclass(frozen=True, slots=True)
 class HeldTool:
-    """What the fingers hold: the tool's diameter in mm, None where unknown."""
+    """The diameter of the held tool in mm: as the gripper measures it, and as the experiment states it; None without.
 
-    diameter: Measured | None
+    The stated one counts: it is exact. A measured one of another tool contradicts it, and then there is no torque.
+    """
+
+    measured: Measured | None
+    stated_mm: float | None = None
+
+    @property
+    def diameter(self) -> Measured | None:
+        """The diameter that counts, None where nothing is known."""
+        return self.measured if self.stated_mm is None else Measured(self.stated_mm, 0.0)
+
+    @property
+    def conflict(self) -> str:
+        """How the measured diameter contradicts the stated one; empty where it does not."""
+        if self.measured is None or self.stated_mm is None or not is_another_tool(self.stated_mm, self.measured):
+            return ""
+        return (
+            f"the experiment states a tool of {self.stated_mm:g} mm, and the gripper measures "
+            f"{self.measured.value:.1f} mm: put that tool between the fingers, or correct `tool_mm`"
+        )
+
+
+def is_another_tool(diameter_mm: float, tool: Measured) -> bool:
+    """Return whether a diameter cannot be the tool's."""
+    return abs(diameter_mm - tool.value) > LARGEST_TOOL_FRACTION * tool.value + tool.half_width
 
 
 @dataclass(frozen=True, slots=True, eq=False)

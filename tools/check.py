@@ -108,7 +108,7 @@ def _check_experiment(
     config: "DaemonConfig", parts: Parts, sources: Mapping[str, "TorqueSource"], robot: "Commissioning | None"
 ) -> None:
     """Add the plan of the configured experiment, its mistakes, and what drives it."""
-    from shearloop.daemon.control.experiment_check import experiment_mistakes
+    from shearloop.daemon.control.experiment_check import experiment_mistakes, tool_note
     from shearloop.daemon.experiment_files import check_experiment, read_document
     from shearloop.daemon.torques import WRENCH
 
@@ -127,6 +127,8 @@ def _check_experiment(
             noise_nm = robot.settings.facts.mean_noise_nm
             if noise_nm:
                 text += f"; the wrench supervises it to {noise_nm:g} N·m beyond its limits only"
+        if note := tool_note(experiment, config, sources, robot):
+            text += f"; {note}"
         parts.texts["experiment"] = text
 
 

@@ -11,9 +11,9 @@ from shearloop.daemon.recorder.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM,
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries, Measured
-from shearloop.estimation.calibration import LARGEST_TOOL_FRACTION
 from shearloop.estimation.learned_frames import frame_digests
 from shearloop.estimation.series import names_of
+from shearloop.estimation.values import is_another_tool
 from shearloop.tools.recordings.frames import Recording, read_recording
 from shearloop.words import counted
 
@@ -140,7 +140,7 @@ def tool_of(recording: Recording, t_ns: IntArray, given_mm: float | None = None)
     conflict = ""
     if len(held) > 1:
         conflict = f"the gripper held tools of {' and '.join(f'{tool.value:.1f}' for tool in held)} mm"
-    elif held and _is_another(held[0].value, Measured(named_mm, held[0].half_width)):
+    elif held and is_another_tool(held[0].value, Measured(named_mm, held[0].half_width)):
         conflict = f"it names a tool of {named_mm:g} mm, and the gripper held one of {held[0].value:.1f} mm"
     if conflict and given_mm is None:
         raise UserError(
@@ -175,12 +175,8 @@ def _held_mm(recording: Recording, t_ns: IntArray) -> list[Measured]:
     if not held:
         return []
     usual = sorted(held, key=lambda tool: tool.value)[len(held) // 2]
-    others = [tool for tool in held if _is_another(tool.value, usual)]
+    others = [tool for tool in held if is_another_tool(tool.value, usual)]
     return [usual] if len(others) <= _MOMENTARY * len(held) else [usual, others[len(others) // 2]]
-
-
-def _is_another(diameter_mm: float, tool: Measured) -> bool:
-    return abs(diameter_mm - tool.value) > LARGEST_TOOL_FRACTION * tool.value + tool.half_width
 
 
 def check_paths_differ(paths: Sequence[Path]) -> None:

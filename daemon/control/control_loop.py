@@ -110,6 +110,11 @@ class ControlLoop:
         """The experiment while it may still move something."""
         return self.experiment if self.experiment is not None and self.experiment.running else None
 
+    @property
+    def stated_tool_mm(self) -> float | None:
+        """The diameter of the tool that the latest experiment states: after its end, the tool may still be held."""
+        return self.experiment.file.tool_mm if self.experiment is not None else None
+
     def on_torque(self, torque: TorqueSample) -> None:
         """Accept a torque sample from any source."""
         creep = self._creep.get(torque.source)

@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 
-from shearloop.daemon.commissioning import Commissioning, MotionCap
+from shearloop.bank.errors import CalibrationError
+from shearloop.daemon.commissioning import Commissioning, MotionCap, measures_diameters
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
@@ -30,6 +31,7 @@ from shearloop.daemon.control.step_demands import demand
 from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
+from shearloop.estimation import Measured
 
 # Numbers of a file may differ from a cap by rounding.
 _ROUNDING = 1e-9
@@ -218,7 +220,40 @@ def experiment_mistakes(
             for number, step in enumerate(file.steps)
             if isinstance(step, GripperStep)
         ]
+    wrong = _wrong_tools(file, sources, measured=measures_diameters(config, robot))
+    place = "torque_source" if file.tool_mm is None else "tool_mm"
+    mistakes += [((place,), why) for why in wrong]
     return mistakes + _unadaptable(file, sources)
+
+
+def _wrong_tools(file: ExperimentFile, sources: Mapping[str, TorqueSource], *, measured: bool) -> Iterator[str]:
+    """Yield why the calibration of a source has no torque on the experiment's tool; `measured`: by the gripper.
+
+    One that only supervises holds the wrist as well, as soon as it turns.
+    """
+    turns = any(isinstance(step, TwistingStep | TurnToStep) for step in file.steps)
+    tool = None if file.tool_mm is None else Measured(file.tool_mm, 0.0)
+    for name, source in sources.items():
+        if source.calibration is None or not source.measures_torque or (tool is None and measured):
+            continue
+        try:
+            source.calibration.for_tool(tool)
+        except CalibrationError as error:
+            if name == file.torque_source:
+                yield f"{name} has no torque on this tool: {error}, or correct `tool_mm`"
+            elif turns:
+                yield f"{name}, which supervises, has no torque on this tool: {error}, or run without {name}"
+
+
+def tool_note(
+    file: ExperimentFile, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None
+) -> str:
+    """Return what the driving torque rests on that nothing will check about the tool; empty without anything."""
+    driving = sources.get(file.torque_source)
+    if driving is None or driving.calibration is None:
+        return ""
+    known = file.tool_mm is not None or measures_diameters(config, robot)
+    return driving.calibration.tool_note(driving.name, tool_known=known)
 
 
 def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[Mistake]:

@@ -249,7 +249,9 @@ class ExperimentFile(ConfigModel):
         description="torque that drives the loop: a fingertip's name, `combined`, `skin`, `load_cell` or `wrench`",
     )
     limits: ExperimentLimits = Field(ExperimentLimits(), description="limits of all steps")
-    tool_mm: float | None = Field(None, gt=0, lt=LARGEST_STROKE_MM, description="diameter of the tool, for recordings")
+    tool_mm: float | None = Field(
+        None, gt=0, lt=LARGEST_STROKE_MM, description="the tool's diameter: see calibrations.md"
+    )
     slices: Literal["torque", "diameter"] | None = Field(
         None,
         description="kind of slice that `recording export --format slices` makes of each held angle; none by default",
@@ -304,10 +306,12 @@ def outline(content: object) -> ExperimentFile:
         limits = ExperimentLimits.model_validate(given.get("limits", {}))
     except ValidationError:
         limits = ExperimentLimits.model_construct(torque_nm=math.inf, angle_rad=math.inf)
+    tool_mm = given.get("tool_mm")
     source = given.get("torque_source", ExperimentFile.model_fields["torque_source"].default)
     return ExperimentFile.model_construct(
         torque_source=source if isinstance(source, str) else "",
         limits=limits,
+        tool_mm=tool_mm if isinstance(tool_mm, int | float) and 0 < tool_mm < LARGEST_STROKE_MM else None,
         steps=tuple(map(_outlined, steps)) if isinstance(steps, list) else (),
     )
 

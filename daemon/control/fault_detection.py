@@ -196,7 +196,9 @@ def _disagreement(inputs: LatestInputs, other: TorqueSource, watched: Watched, t
         f"{slow.name} measured {latest.torque_nm:+.3f} N·m and {fast.name} {other_nm:+.3f} N·m, "
         f"{apart_nm:.3f} N·m apart where {allowed_nm:g} are allowed"
     )
-    return [Fault(FaultCode.TORQUES_DISAGREE, apart, t_ns=latest.t_mid_ns)]
+    # A torque on another tool than the calibrated one may be off by any factor.
+    notes = [one.note for source in (slow, fast) if (one := inputs.torques.get(source.name)) is not None and one.note]
+    return [Fault(FaultCode.TORQUES_DISAGREE, "; ".join((apart, *notes)), t_ns=latest.t_mid_ns)]
 
 
 def _torque_at(inputs: LatestInputs, source: TorqueSource, t_ns: int, half_s: float) -> float | None:

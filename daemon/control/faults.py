@@ -112,8 +112,8 @@ class FaultCode(Enum):
     TORQUES_DISAGREE = Rule(
         _HOLD,
         "two torque measurements disagree: {detail}.",
-        "Tare both with nothing gripped; if they still disagree, calibrate again. If the wrist stopped, send "
-        "`shearloop command unlock`.",
+        "Tare both with nothing gripped; if they still disagree, calibrate again with the held tool. If the wrist "
+        "stopped, send `shearloop command unlock`.",
         hold_at_most_s=3.0,
     )
     PROTECTIVE_STOP = Rule(

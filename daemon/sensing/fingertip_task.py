@@ -91,7 +91,7 @@ class FingertipTask:
     _zero: ZeroRequest | None = None
     # Why the frames of the present tare gave no estimate.
     _refused: CountedReasons = field(default_factory=CountedReasons)
-    _held: Measured | None = None
+    _held: HeldTool = field(default_factory=lambda: HeldTool(None))
     # Whether an idle frame was taken without a request, before the gripper has reported that it held nothing.
     _unconfirmed: bool = field(init=False)
     # The step that waits for a correction of the gain, which the next frame makes.
@@ -120,7 +120,8 @@ class FingertipTask:
             t_mid_ns = message.t_mono_ns - round(1e9 * estimate.lag_s)
             # An estimate is valid also with a diameter alone.
             reason = message.reason or self.session.why_no_torque
-            self.loop.on_torque(TorqueSample(self.name, estimate.torque_nm, reason, t_mid_ns, now_ns))
+            note = "" if estimate.torque_nm is None else self.session.tool_note(self.name)
+            self.loop.on_torque(TorqueSample(self.name, estimate.torque_nm, reason, t_mid_ns, now_ns, note=note))
         if self.gripper is not None:
             self.gripper.diameters.update(self.name, estimate, now_ns)
         self.publisher.publish(message)
@@ -192,10 +193,11 @@ class FingertipTask:
         return refused
 
     def _changed_tool(self, now_ns: int) -> HeldTool | None:
-        """Return what the gripper holds, None if it is what it was before the last frame."""
+        """Return what is known of the tool's diameter, None if it is what it was before the last frame."""
         before = self._held
-        self._held = self.gripper.held_tool(now_ns) if self.gripper is not None else None
-        return None if self._held == before else HeldTool(self._held)
+        measured = self.gripper.held_tool(now_ns) if self.gripper is not None else None
+        self._held = HeldTool(measured, self.loop.stated_tool_mm if self.loop is not None else None)
+        return None if self._held == before else self._held
 
     def _fingers_moved(self, frames: tuple[Frame, ...]) -> bool:
         """Return whether the fingers moved during any part of the frames' acquisition."""

@@ -10,6 +10,8 @@ from shearloop.estimation import BeforeFrame, HeldTool, KnownTorques, Measured
 # The kinds of these inputs. A load cell and a skin have tares of another form.
 SESSION_KINDS = frozenset({InputKind.TARE, InputKind.TOOL, InputKind.MOVED, InputKind.ADAPT})
 _GIVEN_UP = " given up"
+# Comes before the diameter that the experiment states.
+_STATED = "stated"
 
 
 def session_inputs(frame: int, before: BeforeFrame, t_ns: int) -> Iterator[RawEvent]:
@@ -19,8 +21,10 @@ def session_inputs(frame: int, before: BeforeFrame, t_ns: int) -> Iterator[RawEv
     if before.gives_up_tare:
         yield _input(InputKind.TARE, t_ns, f"{frame}{_GIVEN_UP}")
     if before.tool is not None:
-        mm = before.tool.diameter
-        yield _input(InputKind.TOOL, t_ns, f"{frame}" if mm is None else f"{frame} {mm.value!r} {mm.half_width!r}")
+        mm, stated_mm = before.tool.measured, before.tool.stated_mm
+        measured = [] if mm is None else [repr(mm.value), repr(mm.half_width)]
+        stated = [] if stated_mm is None else [_STATED, repr(stated_mm)]
+        yield _input(InputKind.TOOL, t_ns, " ".join([f"{frame}", *measured, *stated]))
     if before.fingers_moved:
         yield _input(InputKind.MOVED, t_ns, f"{frame}")
     if before.known_torques is not None:
@@ -47,10 +51,14 @@ def before_frame(event: RawEvent) -> tuple[int, BeforeFrame]:
 
 
 def _tool(values: list[str]) -> HeldTool:
+    stated_mm = None
+    if _STATED in values:
+        *values, _, last = values
+        stated_mm = float(last)
     if not values:
-        return HeldTool(None)
+        return HeldTool(None, stated_mm)
     value, half_width = map(float, values)
-    return HeldTool(Measured(value, half_width))
+    return HeldTool(Measured(value, half_width), stated_mm)
 
 
 def _input(kind: InputKind, t_ns: int, text: str) -> RawEvent:

@@ -148,6 +148,7 @@ def _torque_source(session: Session, name: str, period_s: float) -> TorqueSource
         warm_up_s=_WARM_UP_FACTOR * max(calibration.estimator.motion.n_needed, 2) * period_s,
         has_gain=calibration.measures_torque,
         only_sign=calibration.only_sign,
+        calibration=calibration,
     )
 
 

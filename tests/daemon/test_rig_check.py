@@ -7,17 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.experiment_files import check_experiment
+from shearloop.daemon.experiment_files import ExperimentFiles, check_experiment
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.ur.settings import ForceBound, TorqueBound, read_settings
 from shearloop.errors import UserError
+from tests.paper_curve import paper_curve
 
 SERIAL = {"device": {"path": "port"}}
 STEPS = [{"do": "tare"}, {"do": "wait", "wait_s": 1}]
@@ -173,6 +175,60 @@ def test_a_torque_that_the_driving_calibration_reads_as_none_is_refused(tmp_path
     file = check_experiment(experiment, {"right": both_ways})
     loop = ControlLoop(LoopConfig(), {"right": one_sided}, ("robot",))
     assert f"step 2: {step['do']} turns clockwise" in loop.start(file, 0), "a running daemon refuses it too"
+
+
+def of_tool(tool_mm: float) -> TorqueSource:
+    """Return a fingertip whose calibration is of a tool of this diameter."""
+    sigma = np.linspace(0.9, 2.1, 30)
+    calibration = replace(paper_curve("bank", torque=(sigma, 0.3 - 0.1 * sigma)), tool_mm=tool_mm)
+    return TorqueSource(name="right", period_s=0.5, calibration=calibration)
+
+
+CELL = {"load_cell": {"device": {"path": "load"}}}
+TURN = [{"do": "turn_to", "angle_rad": 0.1}]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"tool_mm": 40}, "tool_mm: right has no torque on this tool: the tool has 40 mm, and"),
+        ({"tool_mm": 40, "torque_source": "load_cell", "steps": TURN}, "tool_mm: right, which supervises, has no"),
+        ({"tool_mm": 40, "torque_source": "load_cell"}, ""),
+        ({"tool_mm": 22}, ""),
+        ({}, ""),
+    ],
+)
+async def test_an_experiment_on_another_tool_than_the_calibrated_one_is_refused(tmp_path, content, said):
+    content = {"torque_source": "right", **content}
+    daemon, sources = config(tmp_path, content, **CELL), {"right": of_tool(20.0), **LOAD}
+    files = ExperimentFiles((tmp_path,), daemon, sources)
+    if not said:
+        assert check_experiment(daemon, sources) is not None
+        assert (await files.read(daemon.experiment)).file.tool_mm == content.get("tool_mm")
+        return
+    with pytest.raises(UserError, match=re.escape(said)):
+        check_experiment(daemon, sources)
+    with pytest.raises(UserError, match=re.escape(said)):
+        await files.read(daemon.experiment)
+
+
+@pytest.mark.parametrize(
+    ("content", "gripper", "said"),
+    [
+        ({}, {}, "the tool's diameter is not known, and the torque of right holds for a tool of 20 mm alone"),
+        ({}, {"calibration": "gripper.yaml"}, ""),
+        ({"tool_mm": 20}, {}, ""),
+        ({"torque_source": "load_cell"}, {}, ""),
+    ],
+)
+def test_a_plan_says_that_nothing_will_know_the_tool(tmp_path, content, gripper, said):
+    gripper = {"gripper": {"socket": {"host": "127.0.0.1"}, **gripper}}
+    daemon = config(tmp_path, {"torque_source": "right", **content}, **CELL, **gripper)
+    sources = {"right": of_tool(20.0), **LOAD}
+    file = check_experiment(daemon, sources)
+    note = ExperimentFiles((tmp_path,), daemon, sources).tool_note(file)
+    assert said in note
+    assert bool(note) is bool(said)
 
 
 def test_every_mistake_of_an_experiment_has_a_line_of_its_own(tmp_path):

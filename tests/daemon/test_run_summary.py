@@ -143,6 +143,13 @@ def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others, judge)
     assert f"    within ± 10% 3.0 s after the set point changed, by {judge}\n" in text
 
 
+def test_what_the_torque_rests_on_is_said_once():
+    note = "the tool's diameter is not known"
+    states = [loop_state(0), loop_state(1, torque_note=note), loop_state(2, torque_note=note)]
+    assert summary_of(*states, loop_state(3, phase="done", torque_note="")).count(note) == 1
+    assert note not in summary_of(loop_state(0), loop_state(3, phase="done"))
+
+
 def test_holds_are_counted_by_their_kind():
     stale = FaultCode.ESTIMATE_STALE
     faults = f"{stale.text}, {FaultCode.STATE_STALE.text}"

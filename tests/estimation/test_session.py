@@ -1,5 +1,6 @@
 """Sessions on a rig that is played by formulas: another recording, tool or board, and frames that are spoilt."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -208,6 +209,51 @@ def test_tools_that_turn_differently_give_no_torque_where_their_diameters_are_on
     short = [replace(twisting(cycles=3, tips=(0,)), gripper_mm=Measured(mm, 1.0)) for mm in (10.0, 20.0)]
     with pytest.raises(CalibrationError, match="the tools of 10 and 20 mm turn so differently"):
         fit("motion_regression", short, "rig", timing=TRUSTED)
+
+
+TWENTY, FORTY = Measured(20.2, 0.5), Measured(40.3, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("held", "why"),
+    [
+        (HeldTool(None), ""),
+        (HeldTool(None, 20.0), ""),
+        (HeldTool(TWENTY, 20.0), ""),
+        (HeldTool(None, 40.0), "the tool has 40 mm, and the calibration was made with a tool of 20 mm"),
+        (HeldTool(FORTY, 40.0), "the tool has 40 mm, and the calibration was made with a tool of 20 mm"),
+        (HeldTool(FORTY, 20.0), "states a tool of 20 mm, and the gripper measures 40.3 mm"),
+        (HeldTool(TWENTY, 40.0), "states a tool of 40 mm, and the gripper measures 20.2 mm"),
+    ],
+)
+def test_a_tool_that_is_stated_or_measured_has_a_torque_only_if_it_is_the_calibrated_one(motion_calibration, held, why):
+    twisted, session = twisting(seed=5), Session(replace(motion_calibration, tool_mm=20.0))
+    session.prepare(BeforeFrame(tool=held))
+    found = [session.estimate(frame) for frame in twisted.frames()]
+    assert why in session.why_no_torque
+    assert any(one.valid for one in found) is not bool(why)
+    assert any(why in reason for one in found for reason in one.reasons)
+    if why:
+        # It is no correction of the gain.
+        with pytest.raises(CalibrationError, match=re.escape(why)):
+            session.adapt(np.full(len(session.grip_t_s), 0.1))
+
+
+@pytest.mark.parametrize(
+    ("calibrated_mm", "held", "said"),
+    [
+        (20.0, HeldTool(None), "the tool's diameter is not known, and the torque of right holds for a tool of 20 mm"),
+        (20.0, HeldTool(None, 20.0), ""),
+        (20.0, HeldTool(TWENTY), ""),
+        (np.nan, HeldTool(TWENTY), "the calibration of right names no single tool"),
+    ],
+)
+def test_what_nothing_checks_about_the_tool_is_said(motion_calibration, calibrated_mm, held, said):
+    session = Session(replace(motion_calibration, tool_mm=calibrated_mm))
+    session.prepare(BeforeFrame(tool=held))
+    note = session.tool_note("right")
+    assert said in note
+    assert bool(note) is bool(said)
 
 
 def test_another_tool_is_refused_for_as_long_as_it_is_held(motion_calibration):

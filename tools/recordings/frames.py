@@ -119,7 +119,7 @@ class _Messages:
             return
         number, before = before_frame(schema.input_event(content))
         if before.tool is not None:
-            self.tools.append((t_ns, before.tool.diameter))
+            self.tools.append((t_ns, before.tool.measured))
         if before.fingers_moved:
             self.moved[side].add(number)
 

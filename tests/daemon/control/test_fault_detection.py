@@ -102,6 +102,16 @@ def test_a_torque_that_a_one_sided_calibration_reads_as_none_is_no_disagreement(
     assert FaultCode.TORQUES_DISAGREE in events, "it reads a torque where there is one of the other sign"
 
 
+@pytest.mark.parametrize("driving", [EIT, LOAD])
+def test_a_disagreement_says_that_another_tool_may_be_held(driving):
+    note = "the tool's diameter is not known"
+    estimate = replace(torque(EIT, 0.03), note=note)
+    supervising = tuple(one for one in (EIT, LOAD) if one is not driving)
+    said = found(estimate, torque(LOAD, 0.13), driving=driving, supervising=supervising)
+    assert note in said[FaultCode.TORQUES_DISAGREE]
+    assert said[FaultCode.TORQUES_DISAGREE].count(note) == 1
+
+
 @pytest.mark.parametrize("wrench_came_s", [0.0, 0.05, 0.1])
 def test_a_disagreement_lasts_where_no_torque_is_of_the_same_moment(wrench_came_s):
     """Two sensors never measure at once: a hold that blinked let the wrist turn in its gaps, and a step end in one."""

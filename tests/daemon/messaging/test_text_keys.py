@@ -29,7 +29,7 @@ VALUES: dict[tuple[str, str], Iterable[str]] = {
 FREE = {
     "activity", "blocked", "by", "cap", "cause", "command", "experiment", "fault_text", "faults", "host", "model",
     "reason", "reasons", "refusal", "release_refusal", "rig", "source", "start_refusal", "step_name", "subject",
-    "request_id", "summary", "tare_refusal", "torque_source",
+    "request_id", "summary", "tare_refusal", "torque_note", "torque_source",
 }  # fmt: skip
 
 

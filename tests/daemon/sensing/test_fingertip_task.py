@@ -186,9 +186,32 @@ async def test_the_loop_gets_the_reason_why_a_valid_estimate_has_no_torque():
             return Estimate(valid=True, diameter_mm=20.0, diameter_low_mm=18.0, diameter_high_mm=22.0)
 
     heard: list[TorqueSample] = []
-    loop = SimpleNamespace(on_torque=heard.append)
+    loop = SimpleNamespace(on_torque=heard.append, stated_tool_mm=None)
     await estimates("right", RecordingPublisher(), DiameterAlone(), loop=loop).process(frame(0))
     assert [(one.torque_nm, one.reason) for one in heard] == [(None, "there is no torque without the tool's diameter")]
+
+
+async def test_the_tool_that_an_experiment_states_is_known_before_a_frame_and_recorded_once():
+    tools: list[Measured | None] = []
+
+    class Noting(FakeSession):
+        def set_tool(self, tool: Measured | None) -> None:
+            tools.append(tool)
+
+    recorded: list[RawEvent] = []
+    inputs = SimpleNamespace(record=recorded.append)
+    loop = SimpleNamespace(on_torque=lambda _: None, stated_tool_mm=None)
+    gripper = resting_gripper()
+    gripper.is_holding = True
+    task = estimates("right", RecordingPublisher(), Noting(), loop=loop, gripper=gripper, inputs=inputs)
+    await task.process(frame(0))
+    loop.stated_tool_mm = 40.0
+    await task.process(frame(1))
+    await task.process(frame(2))
+    gripper.held_tool = lambda _: Measured(40.5, 0.5)
+    await task.process(frame(3))
+    assert tools == [Measured(40.0, 0.0), Measured(40.0, 0.0)], "what it states is exact"
+    assert [event.data for event in recorded] == [b"1 stated 40.0", b"3 40.5 0.5 stated 40.0"]
 
 
 async def test_an_error_of_the_estimator_ends_the_task():

@@ -51,16 +51,17 @@ def test_all_inputs_of_a_frame_together_say_what_was_recorded():
 POSITIVE = st.floats(0.0, allow_nan=False, allow_infinity=False)
 
 
-@given(st.integers(0), st.none() | st.builds(Measured, POSITIVE, POSITIVE))
-def test_a_tool_is_read_as_it_was_written(frame, tool):
-    (event,) = session_inputs(frame, BeforeFrame(tool=HeldTool(tool)), 0)
+@given(st.integers(0), st.none() | st.builds(Measured, POSITIVE, POSITIVE), st.none() | POSITIVE)
+def test_a_tool_is_read_as_it_was_written(frame, measured, stated_mm):
+    tool = HeldTool(measured, stated_mm)
+    (event,) = session_inputs(frame, BeforeFrame(tool=tool), 0)
     number, before = before_frame(event)
-    assert (number, before.tool) == (frame, HeldTool(tool))
+    assert (number, before.tool) == (frame, tool)
 
 
 @pytest.mark.parametrize(
     ("kind", "data"),
-    [(InputKind.TOOL, data) for data in (b"", b"x", b"3 20", b"3 20 x", b"3 20 1 1")]
+    [(InputKind.TOOL, data) for data in (b"", b"x", b"3 20", b"3 20 x", b"3 20 1 1", b"3 stated", b"3 20 stated 20")]
     + [(InputKind.TARE, data) for data in (b"", b"8388607.0", b" given up", b"3 given")]
     + [(InputKind.MOVED, b""), (InputKind.ADAPT, b"3"), (InputKind.ADAPT, b"3 load_cell x"), (InputKind.DATA, b"3")],
 )

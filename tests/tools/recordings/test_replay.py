@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.schema import message_json, recorded_topic
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.drivers.serial_sensor import InputKind
-from shearloop.estimation import Measured, Session
+from shearloop.estimation import Calibration, Measured, Session
 from shearloop.estimation.session import FINGERS_MOVED
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.message_content import read_content
@@ -300,6 +301,33 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     for one in after:
         assert [estimates[one["frame"]][key] for key in said] == [one[key] for key in said]
     assert estimates[zeroed]["reason"].startswith("taking the idle frame, 1 of")
+
+
+STATED = 40
+
+
+async def record_stated_tool(config: Path) -> list[dict[str, Any]]:
+    """Run a daemon while an experiment states a tool that is not the calibration's; return its estimates."""
+    async with recording_daemon(config) as (daemon, _, published, until):
+        await until(STATED)
+        daemon.sensors.tasks["right"].loop.stated_tool_mm = 40.0
+        await until(STATED + 15)
+    return [content for topic, content in published if topic == "eit.estimate"]
+
+
+def test_a_stated_tool_leaves_no_torque_live_and_the_replay_is_the_same(config, tmp_path, tiny_calibration):
+    of_twenty = tmp_path / "twenty.cal"
+    replace(Calibration.load(tiny_calibration), tool_mm=20.0).save(of_twenty)
+    path = config(right={"calibration": str(of_twenty), "average_frames": 1}, recording={"folder": "recordings"})
+    live = asyncio.run(record_stated_tool(path))
+    assert any(one["valid"] for one in live), Counter(one["reason"] for one in live)
+    refused = "the tool has 40 mm, and the calibration was made with a tool of 20 mm"
+    from_frame = next(one["frame"] for one in live if refused in one["reason"])
+    assert not any(one["valid"] for one in live if one["frame"] >= from_frame)
+    (recorded_file,) = (tmp_path / "recordings").iterdir()
+    _, comparison = asyncio.run(replayed(recorded_file, math.inf))
+    assert comparison.compared["eit.estimate"] >= ENOUGH
+    assert comparison.different == Counter(), comparison.examples
 
 
 async def record_motion(config: Path) -> list[dict[str, Any]]:

@@ -57,6 +57,11 @@ class ChannelTable:
         """Channels of a frame."""
         return len(self.line_slots)
 
+    @property
+    def description(self) -> str:
+        """The kind of fingertip, in words."""
+        return f"{self.n_channels} channels of {self.n_electrodes} electrodes with {self.injection} injection"
+
     @cached_property
     def zero_slots(self) -> BoolArray:
         """(L²,) True at the values of a line with a pair that touches a driven electrode."""

@@ -217,6 +217,15 @@ class Calibration:
         return self.estimator.matcher(self.check_bank(bank)) if self.estimator.needs == "bank" else None
 
 
+def check_bank_table(bank: "Bank", table: ChannelTable, what: str) -> None:
+    """Raise CalibrationError for a bank of another kind of fingertip than this table, which is of `what`, in words."""
+    if bank.table != table:
+        raise CalibrationError(
+            f"{bank.path} is the bank of another kind of fingertip: it has {bank.table.description}, and {what} "
+            f"{table.description}; build a bank of this fingertip with `shearloop bank build`"
+        )
+
+
 def check_bank(estimator: Estimator, identity: str, bank: "Bank | None") -> "Bank":
     """Return the bank of an estimator; raises CalibrationError where it is missing or has another identity."""
     if bank is None:

@@ -11,9 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.bank_match import BankMatcher
-from shearloop.estimation.calibration import Calibration
+from shearloop.estimation.calibration import Calibration, check_bank_table
 from shearloop.estimation.channel_imputer import ChannelImputer
 from shearloop.estimation.estimator import (
     MIN_DIAMETERS,
@@ -65,7 +66,7 @@ def fit(
     physics, kind = physics or Physics(), estimator_class(name)
     recordings = [recordings] if isinstance(recordings, FrameSeries) else list(recordings)
     sides = _check_recordings(recordings)
-    check_physics(kind, physics)
+    check_physics(kind, physics, recordings[0].table)
     chosen = [recording.select_sides(sides) for recording in recordings]
     timing = timing or measure_timing(recordings)
     material = replace(_material(chosen, physics), nested=nested)
@@ -85,10 +86,17 @@ def fit(
     return fitted if timing.references else replace(fitted, assumptions=("load timing",))
 
 
-def check_physics(kind: type[Estimator], physics: Physics) -> None:
-    """Raise CalibrationError for an estimator without its bank or mesh."""
+def check_physics(kind: type[Estimator], physics: Physics, table: ChannelTable) -> None:
+    """Raise CalibrationError for an estimator without its bank or mesh, or with that of another kind of fingertip."""
     if kind.needs and getattr(physics, kind.needs) is None:
         raise CalibrationError(f"the estimator {kind.name} needs a {kind.needs}: --{kind.needs}, in Python `Physics`")
+    if kind.needs == "bank" and physics.bank is not None:
+        check_bank_table(physics.bank, table, "the recordings have")
+    if kind.needs == "mesh" and physics.mesh is not None and physics.mesh.n_electrodes != table.n_electrodes:
+        raise CalibrationError(
+            f"the mesh is of another kind of fingertip: it has {physics.mesh.n_electrodes} electrodes, and the "
+            f"recordings have {table.description}; give the mesh of this fingertip"
+        )
 
 
 def _check_recordings(recordings: Sequence[FrameSeries]) -> tuple[str, ...]:

@@ -5,8 +5,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
+from shearloop.bank.bank_file import Bank
 from shearloop.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
+from shearloop.estimation.bank_match import find_numberings
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.gain import GainCorrection
 from shearloop.estimation.interval_regressor import IntervalRegressor
@@ -94,6 +97,40 @@ def calibrate(
     frames = sum(len(part.t_s) for part in read.parts)
     tools = distinct([part.tool_mm for part in read.parts if part.tool_mm is not None])
     return CalibrationResult(calibration, frames, read.timing, read.doubts, tools, read.parts, fit_s, read.left_out)
+
+
+@dataclass(frozen=True, slots=True)
+class UsedBank:
+    """What is known of the bank of a calibration: only its geometry says whether it is of this fingertip.
+
+    `likeness` is the correlation of its voltages without a touch with the idle frames of the first side, None for
+    slices, which have none.
+    """
+
+    bank: Bank
+    likeness: float | None = None
+
+    @classmethod
+    def of(cls, calibration: Calibration, bank: Bank) -> Self:
+        """Return the bank of a calibration on recordings."""
+        best = find_numberings(calibration.validators[0].idle, bank.homogeneous, bank.table)[0]
+        return cls(bank, best.score)
+
+    def figures(self) -> dict[str, object]:
+        """Return the bank for scripts."""
+        likeness = {} if self.likeness is None else {"idle_likeness": round(self.likeness, 3)}
+        return {"bank": {"path": str(self.bank.path), "geometry_hash": self.bank.geometry_hash, **likeness}}
+
+    def sentences(self) -> list[str]:
+        """Return what the user should know of the bank."""
+        bank = self.bank
+        found = f"The bank {bank.path} has {bank.table.description} and the geometry {bank.geometry_hash[:12]}."
+        if self.likeness is not None:
+            found += (
+                f" Its voltages without a touch correlate with the idle frames to {self.likeness:.2f}; another outline "
+                "lowers this."
+            )
+        return [f"{found} `shearloop doctor CONFIG --geometry FILE` compares it with the file of your fingertip."]
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _calibrate_recordings(args: argparse.Namespace, physics: "Physics") -> tuple[dict[str, object], list[str]]:
     """Write a calibration on recordings; return its figures, and what the user should know of it."""
-    from shearloop.tools.calibrate import calibrate
+    from shearloop.tools.calibrate import UsedBank, calibrate
     from shearloop.tools.estimate_tracks import estimate_series
     from shearloop.tools.leave_out import MEAN_TWIST, Recipe, advice_unjudged, plan_left_out
     from shearloop.tools.left_out_blocks import usual_kind
@@ -74,6 +74,9 @@ def _calibrate_recordings(args: argparse.Namespace, physics: "Physics") -> tuple
     )  # fmt: skip
     result.calibration.save(args.out)
     figures, sentences = result.figures(), sentences_of(result)
+    if result.calibration.bank_identity and physics.bank is not None:
+        used = UsedBank.of(result.calibration, physics.bank)
+        figures, sentences = {**figures, **used.figures()}, sentences + used.sentences()
     if result.calibration.torque is None:
         judged, said = _unjudged_diameters()
         return {**figures, **judged}, sentences + said
@@ -96,6 +99,7 @@ def _calibrate_slices(args: argparse.Namespace, physics: "Physics") -> tuple[dic
     from shearloop.studies.slices.calibrate import calibrate_slices
     from shearloop.studies.slices.evaluate import estimate_slices
     from shearloop.studies.slices.leave_out import LEVELS, MEAN_OF_PLACE, SliceRecipe, plan_levels
+    from shearloop.tools.calibrate import UsedBank
     from shearloop.tools.leave_out import advice_unjudged
 
     result = calibrate_slices(
@@ -104,6 +108,9 @@ def _calibrate_slices(args: argparse.Namespace, physics: "Physics") -> tuple[dic
     )  # fmt: skip
     result.calibration.save(args.out)
     figures, sentences = result.figures(), result.sentences()
+    if result.calibration.estimator.needs == "bank" and physics.bank is not None:
+        used = UsedBank(physics.bank)
+        figures, sentences = {**figures, **used.figures()}, sentences + used.sentences()
     if result.calibration.torque is None:
         judged, said = _unjudged_diameters()
         return {**figures, **judged}, sentences + said

@@ -14,6 +14,7 @@ from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 from shearloop.daemon.torques import LOAD_CELL, TorqueSource
 from shearloop.errors import UserError
 from shearloop.estimation import Calibration, Session
+from shearloop.estimation.calibration import check_bank_table
 from shearloop.estimation.defaults import MAX_GAP_S
 
 if TYPE_CHECKING:
@@ -162,6 +163,8 @@ def _open(path: Path, calibration: Calibration, config: FingertipConfig) -> Sess
 def _session(calibration: Calibration, config: FingertipConfig) -> Session:
     """Return a session; raises CalibrationError for a bank that is missing or another one."""
     bank = _open_bank(config.bank) if config.bank is not None else None
+    if bank is not None and calibration.sides:
+        check_bank_table(bank, calibration.table, "the calibration has")
     search = _shared_search(bank, config.matching) if bank is not None else None
     period_s, baseline_frames = config.frame_period_s, config.baseline_frames
     if calibration.sides:

@@ -38,8 +38,8 @@ def fit_slices(
     """
     physics = physics or Physics()
     side = check_slices(recordings)
-    check_physics(slice_estimator_class(name), physics)
     table = recordings[0].table
+    check_physics(slice_estimator_class(name), physics, table)
     estimator = prepared(name, physics, table)
     with_bank = estimator.needs == "bank" and physics.bank is not None
     matcher = estimator.matcher(physics.bank) if with_bank and physics.bank is not None else None

@@ -3,10 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from shearloop.bank.channels import PAPER_TABLE
+from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.forward import ForwardModel
-from shearloop.estimation import Physics, TactileFrame
+from shearloop.estimation import TRUSTED, Physics, TactileFrame, fit
 from shearloop.estimation.bank_match import (
     NOT_TURNED,
     ElectrodeNumbering,
@@ -17,6 +17,8 @@ from shearloop.estimation.bank_match import (
 from shearloop.estimation.reconstruction import image_matrix
 from shearloop.studies.slices.fitting import fit_slices
 from shearloop.studies.slices.reader import SliceReader
+from shearloop.tools.calibrate import UsedBank
+from tests.estimation.conftest import twisting
 from tests.studies.slices.conftest import slices_of
 
 
@@ -92,6 +94,37 @@ def test_another_bank_is_refused(bank):
     calibration = fit_slices("bank", [series], "x", Physics(bank=bank))
     with pytest.raises(CalibrationError, match="name the bank it was made with"):
         SliceReader(calibration, dataclasses.replace(bank, geometry_hash="0" * 64))
+
+
+@pytest.mark.parametrize("name", ["paper", "bank"])
+def test_a_bank_of_another_kind_of_fingertip_is_named(bank, name):
+    other = dataclasses.replace(bank, table=ChannelTable(16, "adjacent"))
+    rng = np.random.default_rng(5)
+    series = slices_of(rng.normal(1, 0.1, (20, 896)), rng.uniform(0, 1, 20))
+    why = rf"{bank.path} is the bank of another kind of fingertip: it has 208 channels of 16 .* 896 channels of 32"
+    with pytest.raises(CalibrationError, match=why):
+        fit_slices(name, [series], "x", Physics(bank=other))
+    with pytest.raises(CalibrationError, match=why):
+        fit(name, [twisting(tips=(1,))], "rig", Physics(bank=other), timing=TRUSTED)
+
+
+def test_a_mesh_of_another_kind_of_fingertip_is_named(fingertip):
+    recording = twisting(tips=(1,))
+    few = dataclasses.replace(recording, table=ChannelTable(16, "adjacent"), channels=recording.channels[..., :208])
+    with pytest.raises(CalibrationError, match=r"the mesh is of another kind of fingertip: it has 32 electrodes"):
+        fit("reconstruction", [few], "rig", Physics(mesh=fingertip), timing=TRUSTED)
+
+
+def test_the_bank_of_a_calibration_is_told_by_its_geometry_and_its_voltages(bank):
+    with_voltages = dataclasses.replace(bank, homogeneous=np.abs(np.random.default_rng(1).normal(size=896)))
+    calibration = fit("motion_regression", [twisting(tips=(1,))], "rig", timing=TRUSTED)
+    used = UsedBank.of(calibration, with_voltages)
+    assert used.figures()["bank"]["geometry_hash"] == bank.geometry_hash
+    own = dataclasses.replace(bank, homogeneous=calibration.validators[0].idle)
+    assert used.likeness < 0.5 < UsedBank.of(calibration, own).likeness == pytest.approx(1.0)
+    (sentence,) = used.sentences()
+    assert bank.geometry_hash[:12] in sentence
+    assert f"correlate with the idle frames to {used.likeness:.2f}" in sentence
 
 
 def test_an_image_shows_where_and_which_way(fingertip):

@@ -9,11 +9,13 @@ import pytest
 from numpy.typing import NDArray
 from structlog.testing import capture_logs
 
+from shearloop.bank.bank_file import Bank, BankDefinition, write_bank
+from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import BankError
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
 from shearloop.daemon.sensing.sessions import open_combined, open_session, refuse_emulated_calibrations
-from shearloop.daemon.sensors import log_assumptions
+from shearloop.daemon.sensors import log_assumptions, open_sessions
 from shearloop.drivers.eit_kit import Frame
 from shearloop.errors import UserError
 from shearloop.estimation import Calibration, Estimate, FrameSeries, Session, fit
@@ -45,6 +47,30 @@ def files(recorded, calibration, tmp_path_factory) -> dict[str, Path]:
 
 def fingertip(**changes: object) -> FingertipConfig:
     return FingertipConfig.model_validate({"device": {"path": "eit"}, **changes})
+
+
+def bank_of_16_electrodes(tiny_bank: Path, path: Path) -> Path:
+    whole, table = Bank.open(tiny_bank), ChannelTable(16, "adjacent")
+    definition = BankDefinition(whole.geometry_hash, whole.model, whole.k_grid, whole.sigma_grid, table)
+    signals = np.ascontiguousarray(whole.signals[..., : table.n_channels])
+    homogeneous = np.ascontiguousarray(whole.homogeneous[: table.n_channels])
+    write_bank(path, definition, homogeneous, whole.min_conductivity, whole.valid, signals)
+    return path
+
+
+def test_a_bank_of_another_kind_of_fingertip_is_refused_beside_a_calibration(files, tiny_bank, tmp_path):
+    other = bank_of_16_electrodes(tiny_bank, tmp_path / "round.bank")
+    with pytest.raises(BankError, match=r"round\.bank is the bank of another kind of fingertip: it has 208 channels"):
+        open_session(fingertip(bank=other, calibration=files["right"]), "right")
+
+
+def test_the_geometry_of_a_bank_is_logged_at_the_start(tiny_bank):
+    config = DaemonConfig.model_validate({"fingertips": {"right": {"device": {"path": "eit"}, "bank": tiny_bank}}})
+    with capture_logs() as logs:
+        open_sessions(config)
+    (entry,) = [log for log in logs if log["event"] == "the bank of right"]
+    assert entry["geometry"] == Bank.open(tiny_bank).geometry_hash[:12]
+    assert entry["channels"].startswith("896 channels of 32 electrodes")
 
 
 def frame(

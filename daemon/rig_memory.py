@@ -148,6 +148,8 @@ class RigMemory:
     _judged: bool = False
     # Whether a program is starting: the controller may have zeroed its wrench under load.
     _wrench_changes: bool = False
+    # Whether the wrench had a known zero when the state was last written.
+    _wrench_had_zero: bool = False
     _writing: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
@@ -194,8 +196,9 @@ class RigMemory:
             if self._wrench_restored and not self._wrench_tared:
                 log.info(
                     "the wrench has no known zero with the present tool, and its torques may be off by any load",
-                    reason="none was taken before the grip, or the last daemon ended while the robot's program started",
-                    cure=CLAMPED_CURE if clamped else RELEASE_AND_TARE,
+                    reason="none was taken before the grip, the connection to the robot or its process was lost, or "
+                    "the last daemon ended while the robot's program started",
+                    cure=self._wrench_cure,
                 )
             return
         log.warning(
@@ -238,6 +241,7 @@ class RigMemory:
     async def save_present(self) -> str | None:
         """Write the present state, unless the file has it already; return why it cannot be written, or None."""
         self._watch_wrench()
+        self._note_lost_zero()
         state = Remembered.of(self.loop)
         state = replace(state, running=state.running or self.starting)
         if self.load_cell is not None and self.loop.tool.may_be_loaded() and self._knows_load_zero:
@@ -261,6 +265,21 @@ class RigMemory:
         if self._wrench_changes:
             return False
         return self.loop.has_zero(WRENCH) or (self._wrench_tared and not self._judged)
+
+    def _note_lost_zero(self) -> None:
+        """Log that the wrench has lost its zero under a tool, which a later experiment, or daemon, finds missing."""
+        has_zero = self.loop.has_zero(WRENCH)
+        if self._wrench_had_zero and not has_zero and self.loop.tool.may_be_loaded():
+            structlog.get_logger().warning(
+                "the zero of the wrench is lost with the connection to the robot, or with the process that drives it: "
+                "its torques on the present tool may be off by any load",
+                cure=self._wrench_cure,
+            )
+        self._wrench_had_zero = has_zero
+
+    @property
+    def _wrench_cure(self) -> str:
+        return RELEASE_AND_TARE if self.loop.tool.has_gripper else CLAMPED_CURE
 
     def _watch_wrench(self) -> None:
         """Note whether a program is starting: if the daemon is killed now, the earlier zero must not be used."""

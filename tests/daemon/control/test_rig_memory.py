@@ -483,6 +483,28 @@ async def test_a_restored_zero_that_was_lost_since_is_none(befalls):
     assert (read_memory(FILES.states[0]).load_zero == 8321.5) is (befalls == "nothing")
 
 
+async def test_a_zero_of_the_wrench_that_goes_with_the_robots_process_is_logged_once_and_named_after_a_restart(logged):
+    lost = "the zero of the wrench is lost with the connection to the robot, or with the process that drives it"
+    before = Rig(ControlLoop(CONFIG, {"right": EIT, "wrench": wrench_source(125.0)}, ("gripper", "right")))
+    before.control_loop.on_zero("wrench")
+    before.force_n = 60.0
+    before.run(0.6)
+    memory = RigMemory(FILES, before.control_loop, robot=UrRobot(SETTINGS))
+    await memory.save_present()
+    assert not [line for line in logged if lost in line["event"]]
+    before.control_loop.on_link("robot", "its process was killed", up=False)
+    before.control_loop.on_link("robot", "", up=True)
+    for _ in range(2):
+        await memory.save_present()
+    assert len([line for line in logged if lost in line["event"]]) == 1
+    after = Rig(ControlLoop(CONFIG, {"right": EIT, "wrench": wrench_source(125.0)}, ("gripper", "right")))
+    RigMemory(FILES, after.control_loop, robot=UrRobot(SETTINGS))
+    after.force_n = 60.0
+    after.run(0.6)
+    (unknown,) = (line for line in logged if "the wrench has no known zero" in line["event"])
+    assert "the connection to the robot or its process was lost" in unknown["reason"]
+
+
 async def test_only_a_wrench_that_somebody_tared_has_a_known_zero_after_a_restart():
     for tared in (False, True):
         before = Rig(ControlLoop(CONFIG, {"right": EIT, "wrench": wrench_source(125.0)}, ("gripper", "right")))

@@ -1,9 +1,16 @@
 """A whole twist over real ports, and the wrist that a lost sensor holds."""
 
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+import yaml
 
 from shearloop.daemon.control.faults import FaultCode
+from shearloop.estimation import Calibration
 from tests.fixtures.rigs import SLOW_TWIST, experiment, running_rig, started
 
 pytestmark = pytest.mark.real_time
@@ -42,3 +49,35 @@ async def test_a_board_that_is_unplugged_holds_the_wrist(rig_config, tiny_bank, 
         state = await watcher.until("loop.state", lambda state: FaultCode.SENSOR_LOST.text in state["faults"])
         assert state["phase"] in ("held", "stopped")
         assert state["speed_command_rad_per_s"] == 0.0
+
+
+def driven_by_right(folder: Path, name: str, tool_mm: float | None, *steps: Mapping[str, Any]) -> str:
+    """Write an experiment that states a tool, or none, and takes these steps."""
+    path, content = folder / f"{name}.yaml", {"name": name, "torque_source": "right", "steps": [*map(dict, steps)]}
+    path.write_text(yaml.safe_dump(content if tool_mm is None else {**content, "tool_mm": tool_mm}))
+    return str(path)
+
+
+async def test_another_tool_than_the_calibrated_one_does_not_start_and_an_unknown_one_is_said(
+    rig_config, tiny_bank, tmp_path
+):
+    calibration = tmp_path / "rig.cal"
+    replace(Calibration.load(calibration), tool_mm=20.0).save(calibration)
+    begin = {"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}
+    twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.3, "hold_s": 1.0}
+    unstated = driven_by_right(tmp_path, "unstated", None, *begin, twist)
+    stated, another = (driven_by_right(tmp_path, f"of-{mm}", mm, twist) for mm in (20, 40))
+    unknown = "the tool's diameter is not known, and the torque of right holds for a tool of 20 mm alone"
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
+        await started(watcher, command, unstated)
+        await watcher.until("loop.state", lambda state: unknown in state["torque_note"])
+        await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
+        for request in ({}, {"ask": True}):
+            reply = await command("start", experiment=another, **request)
+            assert "right has no torque on this tool: the tool has 40 mm" in reply["reason"]
+        assert unknown in str((await command("start", experiment=unstated, ask=True))["plan"])
+        seen = watcher.count("loop.state")
+        await started(watcher, command, stated)
+        state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"), seen + 1)
+    assert state["phase"] == "done", state["activity"]
+    assert state["torque_note"] == ""

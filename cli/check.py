@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Load everything that `run` loads, without opening a device."""
-    from shearloop.tools.check import OPEN_KEYS
+    from shearloop.tools.check import OF_REAL_DEVICES
     from shearloop.yaml_files import read_yaml
 
     content = read_yaml(args.config, UserError, "file")
@@ -38,21 +38,25 @@ def run(args: argparse.Namespace) -> int:
         )
     parts = _check_experiment(args.config, args.rig) if is_experiment else _check_configuration(args.config)
     plan_lines = [line for plan in parts.plans for line in plan.sentences()]
-    # An experiment is judged for a rehearsal too, which needs nothing that these keys say.
-    open_keys = parts.mistakes.pop(OPEN_KEYS, "") if args.rig is not None else ""
+    # A rehearsal runs all the same, so the rest is judged and shown beside them.
+    for_real = "\n".join(parts.mistakes.pop(part) for part in OF_REAL_DEVICES if part in parts.mistakes)
     if parts.mistakes:
         if is_experiment and plan_lines and not args.json:
             # A rehearsal shows where in the plan the refused steps are.
             print(*plan_lines, sep="\n", flush=True)
             if args.rig is not None and "experiment" not in parts.mistakes:
                 print(f"{args.config} is in order, and {args.rig} is not", flush=True)
-        raise UserError("\n".join(dict.fromkeys(filter(None, (*parts.mistakes.values(), open_keys)))))
+        raise UserError("\n".join(dict.fromkeys(filter(None, (*parts.mistakes.values(), for_real)))))
     sentences = [*(f"{name}: {text}" for name, text in parts.texts.items()), *plan_lines]
     plan = parts.plans[0].as_json() if parts.plans else None
-    result = {"config": str(args.config), "parts": parts.texts, "open": open_keys.splitlines(), "plan": plan}
+    result = {"config": str(args.config), "parts": parts.texts, "open": for_real.splitlines(), "plan": plan}
     verdict = f"{args.config} is in order"
-    if open_keys:
-        verdict = f"{open_keys}\n{verdict} for a rehearsal of {args.rig}; the real robot needs what is not filled in"
+    if for_real and args.rig is None:
+        if not args.json:
+            print(*sentences, f"{verdict} for a rehearsal (`shearloop run --emulate`)", sep="\n", flush=True)
+        raise UserError(for_real)
+    if for_real:
+        verdict = f"{for_real}\n{verdict} for a rehearsal of {args.rig}; the real devices need what is said above"
     return print_result(result, [*sentences, verdict], as_json=args.json)
 
 

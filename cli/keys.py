@@ -41,15 +41,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def _server(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.keys import make_key_pair, writing_keys
 
-    public, secret = make_key_pair(args.dir, "server")
-    clients = args.dir / "clients"
+    # A configuration reads paths from its own folder, and this shell may stand in another one.
+    folder = args.dir.absolute()
+    public, secret = make_key_pair(folder, "server")
+    clients = folder / "clients"
     with writing_keys():
         clients.mkdir(exist_ok=True)
         clients.chmod(0o755)
     sentences = [
         f"{secret}: the daemon's secret key; only the daemon may read it",
         f"{public}: give this file to every client, as ~/.config/shearloop/server.key",
-        f"next: `{_allow_command(args.dir)}` for each client's .key, then add to the configuration:",
+        f"next: `{_allow_command(folder)}` for each client's .key, then add to the configuration:",
         f"curve: {{server_key: {secret}, clients: {clients}}}",
     ]
     content = {"secret_file": str(secret), "public_file": str(public), "clients": str(clients)}
@@ -59,11 +61,13 @@ def _server(args: argparse.Namespace) -> int:
 def _client(args: argparse.Namespace) -> int:
     from shearloop.daemon.messaging.keys import make_key_pair
 
-    public, secret = make_key_pair(args.dir, "client")
+    folder = args.dir.absolute()
+    public, secret = make_key_pair(folder, "client")
     sentences = [
         f"{secret}: your secret key; it never leaves this machine",
-        f"{public}: copy this file to the daemon's machine and run `sudo shearloop keys allow FILE --name YOU` there",
-        f"copy the daemon's server.key back to {args.dir / 'server.key'}",
+        f"{public}: copy this file to the daemon's machine and run `sudo shearloop keys allow FILE --name YOU` there; "
+        f"if its keys are not in {SERVER_FOLDER}, add `--dir` with their folder",
+        f"copy the daemon's server.key back to {folder / 'server.key'}",
     ]
     return print_result({"secret_file": str(secret), "public_file": str(public)}, sentences, as_json=args.json)
 
@@ -105,7 +109,7 @@ def _list(args: argparse.Namespace) -> int:
     clients = {name: key.decode() for key, name in allowed.names.items()}
     sentences = [f"{server}  the daemon", *(f"{key}  {name}" for name, key in clients.items()), *allowed.unusable]
     if not clients:
-        sentences.append(f"no client may connect yet; allow one with `{_allow_command(args.dir)}`")
+        sentences.append(f"no client may connect yet; allow one with `{_allow_command(args.dir.absolute())}`")
     return print_result({"server": server, "clients": clients}, sentences, as_json=args.json)
 
 

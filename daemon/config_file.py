@@ -131,5 +131,5 @@ def load_yaml_model(path: str | Path, model: type[Model], values: Mapping[str, s
 
     `values` replace some of the content: YAML by its keys, such as `loop.kp`.
     """
-    document = Document.read(Path(path), UserError, model.what)
+    document = Document.read(Path(path), UserError, model.what, model=model)
     return (document.with_values(values) if values else document).model(model)

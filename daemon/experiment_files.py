@@ -71,7 +71,7 @@ def check_experiment(
 
 def read_document(path: Path) -> Document:
     """Return the content of an experiment's file; raises UserError."""
-    return Document.read(path, UserError, ExperimentFile.what, most_bytes=MAX_BYTES)
+    return Document.read(path, UserError, ExperimentFile.what, most_bytes=MAX_BYTES, model=ExperimentFile)
 
 
 def without_mistakes(document: Document, mistakes: Sequence[Mistake]) -> ExperimentFile:

@@ -33,8 +33,10 @@ CheckEmulators = Callable[[tuple["EmulatorConfig", ...], Path], object]
 _MEMORY_DEVICES = 1
 
 
-# The part with what the robot's settings leave open.
-OPEN_KEYS = "robot's settings"
+# The part with what the robot's settings leave open, and the one with calibrations on emulated devices.
+OPEN_KEYS, EMULATED_CALIBRATIONS = "robot's settings", "calibrations"
+# What only a run with the real devices is refused for: a rehearsal runs.
+OF_REAL_DEVICES = (OPEN_KEYS, EMULATED_CALIBRATIONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,7 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
     if config.curve is not None:
         with parts.of("keys"):
             parts.texts["keys"] = f"{_clients(config.curve)} may connect"
-    with parts.of("calibrations"):
+    with parts.of(EMULATED_CALIBRATIONS):
         refuse_emulated_calibrations(config)
     for name, fingertip in config.fingertips.items():
         with parts.of(name):

@@ -6,7 +6,7 @@ not a number; allowed: from 0 to 10`. With the nodes of a YAML file it begins wi
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
@@ -73,6 +73,12 @@ def as_model(content: object, model: type[Model], folder: Path | None = None) ->
 def first_key(model: type) -> str:
     """Return the first key of a model, as an example."""
     return next(iter(_schema_of(model)["properties"]), "key")
+
+
+def keys_of(model: type) -> Collection[str]:
+    """Return the keys of a model."""
+    found: Collection[str] = _schema_of(model)["properties"].keys()
+    return found
 
 
 @cache

@@ -16,9 +16,11 @@ import yaml
 from pydantic import ValidationError
 
 from shearloop.files import read_file, replace_file
-from shearloop.mistakes import Model, as_model, first_key, mistake_lines, place_of, shown
+from shearloop.mistakes import Model, as_model, first_key, keys_of, mistake_lines, place_of, shown
 
 _SUFFIXES = (".yaml", ".yml")
+# So many files with near names are looked into, to see which may be meant.
+_LOOKED_AT = 5
 # Of Linux.
 _LONGEST_NAME, _LONGEST_PATH = 255, 4096
 # Bounds on what a file may cost: its bytes, and its values with every alias written out.
@@ -106,14 +108,18 @@ class Document:
         cure: str = "",
         *,
         most_bytes: int = MAX_BYTES,
+        model: type[Any] | None = None,
     ) -> Self:
-        """Read a file that is neither missing nor empty; `cure` ends the message of a missing one."""
+        """Read a file that is neither missing nor empty; `cure` ends the message of a missing one.
+
+        That message may name another file, one with the keys of `model`.
+        """
         if "\0" in str(path) or len(path.name) > _LONGEST_NAME or len(str(path)) > _LONGEST_PATH:
             raise raises(f"{shown(str(path))}: no {what} has such a name")
         try:
             data = read_file(path, most_bytes)
         except OSError as error:
-            raise raises(f"{path}: the {what} cannot be read: {error.strerror}{_meant(path)}{cure}") from error
+            raise raises(f"{path}: the {what} cannot be read: {error.strerror}{_meant(path, model)}{cure}") from error
         return cls.parse(path, data, raises, what)
 
     @classmethod
@@ -217,7 +223,7 @@ class Document:
         return [text for _, text in sorted(found)]
 
 
-def _meant(path: Path) -> str:
+def _meant(path: Path, model: type[Any] | None) -> str:
     """Return which YAML file was probably meant by the path of a folder, or of no file; empty where none is near."""
     folder = path if path.is_dir() else path.parent
     try:
@@ -228,8 +234,22 @@ def _meant(path: Path) -> str:
         # A folder of `init` has its configuration under this name.
         near = ["rig.yaml"] if "rig.yaml" in names else names
     else:
-        near = get_close_matches(path.name, [name for name in names if name != path.name], 1)
+        near = get_close_matches(path.name, [name for name in names if name != path.name], _LOOKED_AT)
+    near = [name for name in near[:_LOOKED_AT] if model is None or _may_be(folder / name, model)]
     return f"; did you mean {folder / near[0]}?" if near else ""
+
+
+def _may_be(path: Path, model: type[Any]) -> bool:
+    """Return whether a file may be meant for a model: most of its keys are the model's, or nothing tells."""
+    try:
+        content = parse_yaml(read_file(path, MAX_BYTES))
+    except OSError:
+        return False
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return True
+    if content is None:
+        return True
+    return isinstance(content, dict) and 2 * sum(key in keys_of(model) for key in content) >= len(content)
 
 
 def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Any:
@@ -248,7 +268,7 @@ def load_model(
     path: Path, model: type[Model], raises: type[Exception], what: str = "configuration", cure: str = ""
 ) -> Model:
     """Return a YAML file's content as a pydantic model or dataclass; its validators get the file's `folder`."""
-    return Document.read(path, raises, what, cure).model(model)
+    return Document.read(path, raises, what, cure, model=model).model(model)
 
 
 def save_yaml(path: Path, content: Mapping[str, Any], raises: type[Exception]) -> None:

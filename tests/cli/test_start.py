@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,9 @@ from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.rig import open_settings
 from shearloop.drivers.hosts import is_loopback_host
+from shearloop.estimation import fit
 from shearloop.estimation.skin.calibration import load_calibration
+from tests.estimation.conftest import twisting
 from tests.fixtures.robots import write_filled_in
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -97,10 +100,17 @@ def untouched(tmp_path, ran, tiny_bank) -> Path:
 
 @pytest.mark.usefixtures("ur_rtde")
 @pytest.mark.parametrize("command", [("check",), ("run",), ("commission", "--out", "report.yaml")])
-def test_a_real_robot_does_not_run_before_its_workspace_and_its_tool_are_filled_in(command, untouched, mistake):
+def test_a_real_robot_does_not_run_before_its_workspace_and_its_tool_are_filled_in(command, untouched, ran):
     name, *options = command
     robot = untouched.with_name("ur.yaml")
-    workspace, tool = mistake(name, untouched, *options).removeprefix(f"shearloop {name}: ").splitlines()
+    said = ran(name, untouched, *options, status=2)
+    workspace, tool = said.err.removeprefix(f"shearloop {name}: ").splitlines()
+    if name == "check":
+        for part in ("\nload_cell: ", "\ngripper: 2F-140", "\ncommissioned: the robot is capped at 0.2 rad/s"):
+            assert part in said.out, "what is not filled in hides nothing"
+        assert said.out.endswith(f"{untouched} is in order for a rehearsal (`shearloop run --emulate`)\n")
+    else:
+        assert said.out == ""
     assert workspace.startswith(f"{robot}: limits.workspace is not filled in: measure the free space of your cell")
     assert tool.startswith(f"{robot}: tool (payload_kg, payload_cog_m, tcp_offset) is not filled in: enter ")
     assert workspace.endswith(stakes := "; a real robot does not run before, a rehearsal (`--emulate`) does")
@@ -125,6 +135,15 @@ def test_an_experiment_is_judged_for_a_rehearsal_before_the_robot_is_filled_in(u
     assert f"{path} is in order for a rehearsal of {untouched}" in said
     assert "limits.workspace is not filled in" in said
     assert len(result_of("check", path, "--config", untouched)["open"]) == 2
+    fit("motion_regression", [replace(twisting(tips=(1,)), emulated=True)], "rig").save(
+        untouched.with_name("right.cal")
+    )
+    text = untouched.read_text()
+    assert "    # calibration: right.cal\n" in text
+    untouched.write_text(text.replace("    # calibration: right.cal\n", "    calibration: right.cal\n"))
+    said = ran("check", path, "--config", untouched).out
+    assert "right.cal was made from recordings of emulated devices" in said
+    assert f"{path} is in order for a rehearsal of {untouched}" in said
     untouched.with_name("paper.bank").unlink()
     said = ran("check", path, "--config", untouched, status=2)
     assert f"{path} is in order, and {untouched} is not" in said.out

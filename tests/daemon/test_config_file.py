@@ -18,10 +18,11 @@ from pydantic import BaseModel, Field, ValidationError, create_model, model_vali
 from shearloop.bank.bank_file import BANK_MAGIC
 from shearloop.binary_files import FIRST_BYTES
 from shearloop.cli.config_schema import MODELS, schema_of
-from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.drivers.ur.settings import UrSettings
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
 from shearloop.estimation.archive import ARCHIVE_MAGIC
 from shearloop.yaml_files import load_model, read_yaml
@@ -250,6 +251,18 @@ def test_a_file_that_was_probably_meant_is_named(given, meant, tmp_path):
         (tmp_path / name).touch()
     with pytest.raises(UserError, match=rf"; did you mean {tmp_path / meant}\?$"):
         load_yaml_model(tmp_path / given, Outer)
+
+
+def test_a_file_of_another_kind_is_not_named(tmp_path):
+    (tmp_path / "mine.yaml").write_text("publish: tcp://127.0.0.1:1\nrobot: ur.yaml\n")
+    with pytest.raises(DriverError) as failed:
+        read_settings(tmp_path / "nothere.yaml")
+    assert "did you mean" not in str(failed.value)
+    (tmp_path / "nowhere.yaml").write_text("host: 192.0.2.1\n")
+    with pytest.raises(DriverError, match=r"did you mean .*/nowhere\.yaml\?$"):
+        read_settings(tmp_path / "nothere.yaml")
+    with pytest.raises(UserError, match=r"did you mean .*/mine\.yaml\?$"):
+        load_daemon_config(tmp_path / "nine.yaml")
 
 
 def test_the_configuration_of_a_folder_is_named_by_its_usual_name(tmp_path):

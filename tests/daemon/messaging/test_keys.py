@@ -204,6 +204,17 @@ def test_keys_are_made_listed_and_revoked(keys, ran, mistake, result_of):
     assert advice in ran("keys", "list", "--dir", folder).out
 
 
+def test_the_paths_of_keys_are_whole(ran, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "own/keys"
+    said = ran("keys", "server", "--dir", "own/keys").out
+    assert f"curve: {{server_key: {folder}/server.key_secret, clients: {folder}/clients}}" in said
+    assert f"`shearloop keys allow FILE --dir {folder}`" in said
+    said = ran("keys", "client", "--dir", "mine").out
+    assert "add `--dir` with their folder" in said
+    assert f"server.key back to {tmp_path}/mine/server.key" in said
+
+
 def test_a_damaged_key_is_an_error(keys):
     secret = keys / "keys/server.key_secret"
     other = KeyPair(*zmq.curve_keypair())

@@ -69,5 +69,6 @@ def client_keys(args: argparse.Namespace, address: str | None = None) -> "Client
         (server_key, "--server-key", "copy the daemon's server.key there"),
     ):
         if not path.exists():
-            raise MissingKeyError(f"{f'{why}, and ' if why else ''}there is no key {path}: {cure}, or give {option}")
+            needed = f"{why}, and " if why else ""
+            raise MissingKeyError(f"{needed}there is no key {path}: {cure}, or give {option}")
     return ClientKeys.load(key, server_key)

@@ -708,7 +708,7 @@ def test_a_command_that_was_held_up_is_not_sent_unless_it_lets_nothing_move(name
     monkeypatch.setattr("shearloop.cli.command.boot_ns", lambda: boot_ns() + 6_000_000_000)
     assert main(["command", name]) == (0 if sent else 2)
     assert asked == ["status", name][: 1 + sent]
-    assert ("asked for 6.0 s ago, and nothing begins later than 5 s after that" in capsys.readouterr().err) is not sent
+    assert ("and nothing begins later than 5 s after that" in capsys.readouterr().err) is not sent
 
 
 def test_a_command_is_as_old_as_its_program():

@@ -73,7 +73,8 @@ def evaluate_recordings(
         draw_stream,
         no_better_than_clock,
         known_data(calibration.learned, tracks, [path for path, _ in named])
-        + [f"{name}: {warning}" for name, warning in warned if warning],
+        + [f"{name}: {warning}" for name, warning in warned if warning]
+        + unknown_tools(calibration, [(path.name, part) for (path, _), part in zip(named, parts, strict=True)]),
         [
             f"{path.name}: {'; '.join(part.left_out)}"
             for (path, _), part in zip(named, parts, strict=True)
@@ -81,6 +82,14 @@ def evaluate_recordings(
         ],
         list(dict.fromkeys(path.name for (path, _), part in zip(named, parts, strict=True) if part.emulated)),
     )
+
+
+def unknown_tools(calibration: Calibration, named: Sequence[tuple[str, FrameSeries]]) -> list[str]:
+    """Return a sentence for each named recording whose tool is not known, if the calibration holds for one alone."""
+    if calibration.torque is None or calibration.tools is not None or math.isnan(calibration.tool_mm):
+        return []
+    only = f"the calibration holds for a tool of {calibration.tool_mm:g} mm alone: name it with --tool-mm"
+    return [f"{name}: the tool's diameter is not known, and {only}" for name, part in named if part.tool_mm is None]
 
 
 def known_data(learned: LearnedFrames, tracks: Sequence[EstimateTrack], paths: Sequence[Path]) -> list[str]:

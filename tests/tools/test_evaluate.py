@@ -147,3 +147,14 @@ def test_recordings_of_emulated_devices_are_named():
     assert evaluate_recordings(calibration, named, None, (0.0, 1.0), SerialExecutor()).emulated == ["emulated.mcap"]
     assert not calibration.emulated
     assert fit("motion_regression", [emulated], "twists", timing=TRUSTED).emulated
+
+
+@pytest.mark.parametrize(("calibrated_mm", "named"), [(20.0, ["unnamed.mcap"]), (math.nan, [])])
+def test_a_recording_whose_tool_is_not_known_is_named_where_the_calibration_holds_for_one(calibrated_mm, named):
+    fitted = fit("motion_regression", [twisting(cycles=1)], "twists", timing=TRUSTED)
+    unnamed, judged = twisting(cycles=1, seed=2), twisting(cycles=1, seed=3)
+    judged = replace(judged, diameter_mm=np.full(len(judged.t_s), 20.0))
+    recordings = [(Path("unnamed.mcap"), unnamed), (Path("named.mcap"), judged)]
+    calibration = replace(fitted, tool_mm=calibrated_mm)
+    doubts = evaluate_recordings(calibration, recordings, None, (0.0, 1.0), SerialExecutor()).doubts
+    assert [doubt.split(":")[0] for doubt in doubts if "the tool's diameter is not known" in doubt] == named

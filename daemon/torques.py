@@ -94,7 +94,12 @@ class TorqueSource:
         A torque is half its acquisition old at its end. The rest of its age is transport: a board or an estimator that
         falls behind sends on time, but old torques.
         """
-        return self.fresh_s(config) + 0.5 * max(self.window_s, self.period_s)
+        return self.fresh_s(config) + self.acquired_s
+
+    @property
+    def acquired_s(self) -> float:
+        """The age of a torque at the end of its acquisition."""
+        return 0.5 * max(self.window_s, self.period_s)
 
     def as_read_nm(self, torque_nm: float) -> float:
         """Return what the source reads of another one's torque: 0 where it has the sign that it does not measure."""

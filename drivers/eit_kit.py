@@ -14,7 +14,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.connection import Diagnostics, Link, Port
+from shearloop.drivers.connection import AWAY_NS, Diagnostics, Link, Port
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.frame_clock import LONGEST_GAP, FrameClock
 from shearloop.drivers.refused_lines import refusal_sentence
@@ -27,6 +27,7 @@ EXCERPT_BYTES = 60
 
 # The board's period until the clock has learned the real one.
 NOMINAL_PERIOD_NS = round(1e9 * FRAME_PERIOD_S)
+NEVER_NS = -(2**63)
 # A line of 8 kB over the high-speed USB of a Teensy 4.
 TRANSFER_NS = 1_000_000
 ADC_REFERENCE_V = 2.2
@@ -39,6 +40,9 @@ DEAD_AFTER_FRAMES = 200
 START = b"y"
 # A board that sends no frame for this many periods is opened and started again.
 SILENT_FRAMES = 4
+# A frame sooner after the one before, in periods, waited on its way. Arrivals cannot tell it of a board whose period is
+# shorter than what a reader may be late without a notice.
+SOONEST_FRAME = 0.5
 # At fast frame rates a shorter silence may come from a busy computer.
 MIN_SILENCE_S = 0.5
 
@@ -58,6 +62,7 @@ class FrameErrorKind(Enum):
     NAN = "a value that is NaN: the board divided by zero, restart it so that it calibrates again"
     OUT_OF_RANGE = f"a value above the ADC's {ADC_REFERENCE_V} V: bytes were changed"
     NONZERO_SLOT = "a value where the pair touches a driven electrode and 0 belongs: a different injection pattern"
+    TOO_SOON = "a frame less than half a period after the one before: it waited on its way, and its time is unknown"
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,9 +153,10 @@ class Frame:
 class FrameParser(Parser[Frame]):
     """Turns chunks of bytes into frames. No I/O.
 
-    `zero_slots` (v,) is true where the injection pattern makes the value 0. A cut line at the opening of the
-    port is not an error. `patience` is the factor on the pause after which the board counts as stopped. It is above 1
-    only on an emulated rig, because a busy computer delays the emulated boards.
+    `zero_slots` (v,) is true where the injection pattern makes the value 0. A cut line at the opening of the port is
+    not an error. Lines that may have waited before the opening are dropped: their time is unknown. `patience` is the
+    factor on the pause after which the board counts as stopped. It is above 1 only on an emulated rig, because a busy
+    computer delays the emulated boards.
     """
 
     def __init__(
@@ -165,7 +171,8 @@ class FrameParser(Parser[Frame]):
         self._rejected_since_frame: int | None = 0
         # Since when the next bytes may have waited for their reader; None if it was not away.
         self._waited_since_ns: int | None = None
-        self._last_mid_ns = -(2**63)
+        # When the last frame of this connection was sent.
+        self._sent_ns = self._last_mid_ns = NEVER_NS
         self._last_channels = np.full(np.count_nonzero(~zero_slots), np.nan)
         self._equal_readings = np.zeros(len(self._last_channels), np.int64)
 
@@ -173,7 +180,8 @@ class FrameParser(Parser[Frame]):
         """Process a live or recorded event; return the frames that it completes."""
         match event.kind:
             case InputKind.OPENED:
-                self._lines.restart()
+                self._open(event.t_ns)
+                self._sent_ns = NEVER_NS
                 self._first_line, self._rejected_since_frame, self._waited_since_ns = True, 0, None
                 self.clock.restart()
             case InputKind.WAITED:
@@ -187,7 +195,8 @@ class FrameParser(Parser[Frame]):
     def feed(self, data: bytes, t_arrival_ns: int) -> list[Frame]:
         """Return the frames that `data` completes, in order; all of it had arrived at `t_arrival_ns`."""
         complete = []
-        for line in self._lines.feed(data):
+        earliest_ns = t_arrival_ns if self._waited_since_ns is None else self._waited_since_ns
+        for line in self._split(data, earliest_ns, self.clock.period_ns):
             values = self._read(line)
             self._first_line = False
             if values is not None:
@@ -195,11 +204,20 @@ class FrameParser(Parser[Frame]):
                 self._rejected_since_frame = self._refused_in_a_row = 0
         frames = []
         for number, (values, rejected) in enumerate(complete, 1):
-            # Frames that waited together were sent one period apart, the last one by now.
-            waited_ns = (len(complete) - number) * self.clock.period_ns if self.clock.learned else 0
-            sent_ns = self.clock.arrived(t_arrival_ns - waited_ns, rejected, self._waited_since_ns)
-            frames.append(self._frame(values, sent_ns, t_arrival_ns))
+            sent_ns = self.clock.arrived(t_arrival_ns, rejected, self._waited_since_ns, len(complete) - number)
+            after_ns = sent_ns - self._sent_ns
+            self._sent_ns = max(sent_ns, self._sent_ns)
+            if self.clock.period_ns >= AWAY_NS and after_ns < SOONEST_FRAME * self.clock.period_ns:
+                self._refuse_soon(after_ns)
+            else:
+                frames.append(self._frame(values, sent_ns, t_arrival_ns))
         return frames
+
+    def _refuse_soon(self, after_ns: int) -> None:
+        """Refuse a whole frame, which the clock has counted."""
+        self.errors[FrameErrorKind.TOO_SOON] += 1
+        every = f"after {max(after_ns, 0) / 1e9:.3f} s, where one comes every {self.clock.period_ns / 1e9:.2g} s"
+        self.refusal = f"refused {FrameErrorKind.TOO_SOON.value} ({every})"
 
     def _read(self, line: bytes | None) -> NDArray[np.float64] | None:
         if line is None:

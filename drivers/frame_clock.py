@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from itertools import islice, pairwise
 from statistics import median
 
+from shearloop.drivers.connection import AWAY_NS
+
 # Frames behind the period: 35 s at 0.54 s, while a crystal drifts by microseconds.
 PERIOD_WINDOW = 64
 # Frames behind the phase: a board that paused is followed within 6 s.
@@ -14,7 +16,7 @@ LEARN_FROM = 16
 SPACING_FRAMES = 4
 # A longer pause, in periods, means that the board stopped and has a new phase.
 LONGEST_GAP = 2.5
-# A period further from the usual spacing is a burst of late frames.
+# A period further from the usual spacing is a burst of late frames. So are spacings whose middle half differs by more.
 PLAUSIBLE = 0.05
 
 
@@ -26,8 +28,9 @@ class FrameClock:
     edge of their lower convex hull that spans the middle (Moon, Skelly and Towsley 1999, "Estimation and removal of
     clock skew from network delay measurements"). Its slope is the period; its height over the last few frames is the
     phase. All times are integer nanoseconds of one monotonic clock. The nominal period applies until the real one is
-    `learned`. After a pause of more than `longest_gap` periods the board counts as stopped; before, a frame is late. A
-    frame that may have waited for its reader says nothing of a pause: it came in time if it can have.
+    `learned`. After a pause of more than `longest_gap` periods the board counts as stopped; before, a frame is late. So
+    it is within AWAY_NS, for which a reader may be late without a notice. A frame that may have waited for its reader
+    says nothing of a pause: it came in time if it can have.
     """
 
     def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:
@@ -43,28 +46,34 @@ class FrameClock:
         self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
         # (frame number, arrival) of the frames that did not wait, since the last restart.
         self._seen: deque[tuple[int, int]] = deque(maxlen=PERIOD_WINDOW)
-        # When the last frame may have arrived at the earliest, and when it would have at a reader that is never late.
-        self._earliest_ns = 0
+        # When the last frame was read, or may have arrived at the earliest if it waited, and when it would have at a
+        # reader that is never late.
+        self._found_ns = 0
         self._straight_ns = 0
 
     def restart(self) -> None:
         """Forget the phase and keep the period: the board was restarted."""
         self._seen.clear()
 
-    def arrived(self, arrival_ns: int, rejected: int | None = 0, waited_since_ns: int | None = None) -> int:
+    def arrived(
+        self, read_ns: int, rejected: int | None = 0, waited_since_ns: int | None = None, behind: int = 0
+    ) -> int:
         """Return when the next frame would have arrived at a reader that is never late.
 
         `rejected` lines came before it, None if bytes were lost and it is not known how many. Then the number of
         periods follows from the time; otherwise a late frame is the next one. `waited_since_ns`: its reader was away,
-        and it may have arrived since then.
+        and it may have arrived since then. `behind`: so many frames were read together with it, and came after it.
         """
+        # Frames that waited together were sent one period apart, the last one by now.
+        arrival_ns = read_ns - behind * self.period_ns
         earliest_ns = arrival_ns if waited_since_ns is None else min(waited_since_ns, arrival_ns)
         self._waited_in_a_row = self._waited_in_a_row + 1 if earliest_ns < arrival_ns else 0
+        found_ns = earliest_ns if earliest_ns < arrival_ns else read_ns
         if self._seen:
-            self._count(arrival_ns, earliest_ns, rejected)
+            self._count(arrival_ns, earliest_ns, found_ns, rejected)
         else:
             self._number += 1
-        self._earliest_ns = earliest_ns
+        self._found_ns = found_ns
         # A frame that waited does not show the board's period, unless all frames wait.
         if not self._seen or not 0 < self._waited_in_a_row <= PERIOD_WINDOW:
             self._seen.append((self._number, arrival_ns))
@@ -79,10 +88,10 @@ class FrameClock:
         self._straight_ns = round(straight_ns)
         return self._straight_ns
 
-    def _count(self, arrival_ns: int, earliest_ns: int, rejected: int | None) -> None:
+    def _count(self, arrival_ns: int, earliest_ns: int, found_ns: int, rejected: int | None) -> None:
         """Count the periods until a frame that arrived between two times; restart where the board has paused."""
-        elapsed, elapsed_at_least = (
-            (t_ns - self._straight_ns) / self._exact_period_ns for t_ns in (arrival_ns, earliest_ns)
+        elapsed, elapsed_at_least, elapsed_found = (
+            (t_ns - self._straight_ns) / self._exact_period_ns for t_ns in (arrival_ns, earliest_ns, found_ns)
         )
         waited, steps = earliest_ns < arrival_ns, 1
         if rejected != 0 and self.learned:
@@ -91,14 +100,16 @@ class FrameClock:
                 # The time is only an upper bound for the number of frames that waited.
                 steps = min(steps, 1 + rejected)
         self._number += steps
-        late = elapsed_at_least - steps
-        late_before = (self._earliest_ns - self._straight_ns) / self._exact_period_ns
+        late = elapsed_found - steps
+        late_before = (self._found_ns - self._straight_ns) / self._exact_period_ns
         # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
         # board. Half a period early means that the last one was counted as two.
-        paused = min(late, late_before) > 0.5 and late > late_before - 0.5
+        unnoticed = AWAY_NS / self._exact_period_ns
+        paused = min(late, late_before) > max(0.5, unnoticed) and late > late_before - 0.5
         # A buffer that is not read for long loses its newest bytes: this frame came after the reader was back.
         lost = waited and rejected is None
-        if elapsed_at_least > self._longest_gap or elapsed - steps < -0.5 or paused or lost:
+        stopped = elapsed_at_least > max(self._longest_gap, unnoticed)
+        if stopped or elapsed - steps < -0.5 or paused or lost:
             self.restart()
 
     def _learn(self) -> None:
@@ -107,7 +118,10 @@ class FrameClock:
         spacing = median(self._spacings)
         if spacing <= 0:
             return
-        if abs(self._exact_period_ns - spacing) > PLAUSIBLE * spacing:
+        # A burst of late frames has other spacings before and after it.
+        middle = sorted(self._spacings)[LEARN_FROM // 4 : -LEARN_FROM // 4]
+        steady = max(abs(one - spacing) for one in middle) <= PLAUSIBLE * spacing
+        if steady and abs(self._exact_period_ns - spacing) > PLAUSIBLE * spacing:
             self._exact_period_ns, self.learned = spacing, True
         if len(self._seen) >= LEARN_FROM:
             slope = slope_below(self._seen)

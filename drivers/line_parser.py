@@ -51,6 +51,7 @@ class LineParser(Parser[ValueT]):
         """Process a live or recorded event; return the values that it completes."""
         match event.kind:
             case InputKind.OPENED:
+                self._open(event.t_ns)
                 self.restart()
             case InputKind.DATA:
                 return self.feed(event.data, event.t_ns)
@@ -65,7 +66,7 @@ class LineParser(Parser[ValueT]):
     def feed(self, data: bytes, t_arrival_ns: int) -> list[ValueT]:
         """Return the values that `data` completes; of several lines each is a period older than the next."""
         values = []
-        lines = self._lines.feed(data)
+        lines = self._split(data, t_arrival_ns, self._clock.period_ns)
         for waiting, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
             partial, self._first = self._first, False
             if line is None:

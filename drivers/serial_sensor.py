@@ -123,6 +123,9 @@ class Parser(ABC, Generic[ValueT]):
         self._lines = LineSplitter(max_bytes)
         # Without a value in between.
         self._refused_in_a_row = 0
+        # When the port was opened, until all that waited before has come; and when the last line came since.
+        self._opened_ns: int | None = None
+        self._before_ns = 0
 
     @property
     def refused(self) -> int:
@@ -137,6 +140,27 @@ class Parser(ABC, Generic[ValueT]):
     @abstractmethod
     def handle(self, event: RawEvent) -> Sequence[ValueT]:
         """Process a live or recorded event; return the values that it completes."""
+
+    def _open(self, t_ns: int) -> None:
+        """Begin with a port that was opened then."""
+        self._lines.restart()
+        self._opened_ns = self._before_ns = t_ns
+
+    def _split(self, data: bytes, arrival_ns: int, period_ns: int) -> list[bytes | None]:
+        """Return the lines that `data` completes; it arrived then at the earliest.
+
+        Lines that may have waited before the opening have no known time and are dropped. They come at once. What comes
+        half a period after the opening or the line before is new, and so is everything a period after the opening.
+        """
+        lines = self._lines.feed(data)
+        if self._opened_ns is None or not lines:
+            return lines
+        first_ns = arrival_ns - (len(lines) - 1) * period_ns
+        if first_ns - self._before_ns >= period_ns / 2 or first_ns - self._opened_ns >= period_ns:
+            self._opened_ns = None
+            return lines
+        self._before_ns = arrival_ns
+        return []
 
     def _count_refused(self, kind: Hashable) -> int:
         """Count a refused line; return how many were refused in a row."""

@@ -17,7 +17,8 @@ from shearloop.emulators.numbers import number_between
 from shearloop.emulators.ports import PtyPort
 
 # Lateness that is made up for, in periods, and at least: a real board does not wait for a busy computer, and fast rates
-# are kept on average. Lines that are late hold what is measured as they are sent.
+# are kept on average. Lines that are late hold what is measured as they are sent. After a longer standstill, or a wait
+# for a reader, the lines in between are left out: a board measures on meanwhile, and sends no old lines in a row.
 CATCH_UP_PERIODS, CATCH_UP_S = 9, 0.05
 # The mean over 4882 lines of the paper's rig.
 LOAD_PERIOD_S = 1 / 10.9
@@ -79,7 +80,9 @@ class EmulatedBoard:
             await self._wait_for_start()
             due_s = loop.time()
             while True:
-                due_s = max(due_s, loop.time() - catch_up_s) + self._period_s
+                if loop.time() - due_s > catch_up_s:
+                    due_s = loop.time()
+                due_s += self._period_s
                 await asyncio.sleep(due_s - loop.time())
                 if loop.time() >= self._lasts_until_s:
                     self._end_lasting()
@@ -90,8 +93,11 @@ class EmulatedBoard:
                     line = self.next_line(loop.time())
                 except StopIteration:
                     break
+                written_s = loop.time()
                 with contextlib.suppress(ConnectionError):  # unplugged while the line waited for a reader
                     await self.port.write(line)
+                if loop.time() - written_s > self._period_s:
+                    due_s = loop.time()
             await loop.create_future()
 
     def command(self, text: str) -> None:
@@ -179,13 +185,17 @@ class EitKitBoard(EmulatedBoard):
         return b", ".join([*values[:first], b"0.0000", *values[first + 1 :]])
 
     async def _wait_for_start(self) -> bool:
-        """Wait for the first `y`; without power, when it was unplugged, the board has forgotten it."""
+        """Wait for the first `y`; without power, when it was unplugged, the board has forgotten it.
+
+        The frame after a `y` that ended a silence takes a whole period too.
+        """
         started_before = self._started
         while not self._started or not self.port.received.empty():
             if b"y" in await self.port.received.get():
                 self._started = True
                 if self._lasting == "silence" and self._lasts_until_s == math.inf:
                     self._end_lasting()
+                    started_before = False
         return not started_before
 
     def _end_lasting(self) -> None:

@@ -162,14 +162,17 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, config: LoopConfig, t_
     what = "torque" if source.measures_torque else "frame"
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
     allowed_s, oldest_s = source.fresh_s(config), source.oldest_s(config)
+    late = (
+        f"the last {what} of {source.name} was measured {measured_s:.1f} s ago, {oldest_s:.1f} s are allowed; "
+        f"it took {measured_s - came_s:.1f} s to come"
+    )
+    transport_s = measured_s - came_s - source.acquired_s
+    if measured_s > oldest_s and transport_s > came_s:
+        return Fault(FaultCode.ESTIMATE_LATE, late, t_ns=latest.t_mid_ns)
     if came_s > allowed_s:
         silent = f"the last {what} of {source.name} came {came_s:.1f} s ago, {allowed_s:.1f} s are allowed"
         return Fault(FaultCode.ESTIMATE_STALE, silent, t_ns=latest.t_ns)
     if measured_s > oldest_s:
-        late = (
-            f"the last {what} of {source.name} was measured {measured_s:.1f} s ago, {oldest_s:.1f} s are allowed; "
-            f"it took {measured_s - came_s:.1f} s to come"
-        )
         return Fault(FaultCode.ESTIMATE_STALE, late, t_ns=latest.t_mid_ns)
     if latest.torque_nm is None and source.measures_torque:
         said = f"{source.name} says: {latest.reason}" if latest.reason else f"{source.name} gives no torque"

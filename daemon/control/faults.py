@@ -83,6 +83,16 @@ class FaultCode(Enum):
         "It resumes with the next valid torque; if it stopped, clear the cause, then send `shearloop command unlock`.",
         hold_at_most_s=5.0,
     )
+    ESTIMATE_LATE = Rule(
+        _HOLD,
+        "the computer or its matching is too slow: {detail}.",
+        "`latency_s` of `shearloop listen eit.estimate` is the time that a fingertip's matching takes, with its wait. "
+        "End other programs on this computer, or build a bank with fewer cells. If the wrist stopped, send "
+        "`shearloop command unlock`.",
+        hold_at_most_s=5.0,
+        timer="torque source",
+        by_busy_computer=True,
+    )
     ESTIMATE_JUMPED = Rule(
         _HOLD,
         "the torque jumped without a motion of the wrist: {detail}.",

@@ -40,7 +40,7 @@ async def test_a_recording_at_three_hundred_times_its_pace_arrives_whole_and_in_
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
     expected = loadmat(folder / "device1.mat")["Right_Data"][:, 1:]
     async with emulator("--recording", str(folder / "device1.mat"), "--speed", "300", "--once") as (_, path):
-        kit = EitKit(SerialLink(path=path), PAPER_TABLE.zero_slots)
+        kit = EitKit(SerialLink(path=path), PAPER_TABLE.zero_slots, PERIOD_S / 300)
         frames = await take(kit.readings(), 832)
     assert [frame.seq for frame in frames] == list(range(832))
     np.testing.assert_array_equal([frame.raw for frame in frames], expected)
@@ -57,7 +57,7 @@ async def test_a_recording_is_played_again_and_again_under_the_name_given(tmp_pa
     link = tmp_path / "eit"
     async with emulator("--recording", str(path), "--speed", "500", "--link", str(link)) as (process, port):
         assert port == str(link)
-        frames = await take(EitKit(SerialLink(path=port), PAPER_TABLE.zero_slots).readings(), 7)
+        frames = await take(EitKit(SerialLink(path=port), PAPER_TABLE.zero_slots, PERIOD_S / 500).readings(), 7)
         process.send_signal(signal.SIGINT)
         assert await process.wait() == 0
     np.testing.assert_array_equal([frame.raw for frame in frames], [lines[n % 3] for n in range(7)])
@@ -69,7 +69,7 @@ async def test_faults_are_switched_on_by_standard_input(tmp_path):
     arguments = ("--recording", str(path), "--speed", "20", "--link", str(tmp_path / "eit"), "--once")
     async with emulator(*arguments) as (process, port):
         process.stdin.write(b"nan\nwhat\ncut-line\n")
-        kit = EitKit(SerialLink(path=port), PAPER_TABLE.zero_slots)
+        kit = EitKit(SerialLink(path=port), PAPER_TABLE.zero_slots, PERIOD_S / 20)
         frames: list[Frame] = []
         async with aclosing(kit.readings()) as arriving:
             async for frame in arriving:
@@ -109,7 +109,7 @@ async def test_twists_are_synthesised_from_a_bank(tmp_path):
     path = tmp_path / "bank.shb"
     write_bank(path, definition, homogeneous, np.full((2, 2), 0.5), np.ones((2, 2), bool), signals)
     async with emulator("--bank", str(path), "--speed", "200") as (_, port):
-        frames = await take(EitKit(SerialLink(path=port), PAPER_TABLE.zero_slots).readings(), 50)
+        frames = await take(EitKit(SerialLink(path=port), PAPER_TABLE.zero_slots, PERIOD_S / 200).readings(), 50)
     channels = np.array([frame.channels for frame in frames])
     # The programme begins with 15 s of nothing, then grips within 3 s: 28 and 34 frames.
     idle, gripped = channels[:25].mean(axis=0), channels[36:].mean(axis=0)

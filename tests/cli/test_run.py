@@ -32,6 +32,7 @@ from tests.fixtures.daemons import (
     deadline,
     emulated_kit,
     of_now,
+    played_at,
     recording,
     robot_at,
     running_daemon,
@@ -46,7 +47,7 @@ def next_message(socket: "zmq.Socket[bytes]") -> dict[str, Any]:
 
 async def test_every_frame_at_100_times_speed_becomes_an_estimate_in_order(shared, config, tmp_path, subscriber):
     play = shared / "recordings" / "streams" / "2024-12-03_16-09" / "device1.mat"
-    async with shearloop("run", str(config())) as daemon:
+    async with shearloop("run", str(config(right=played_at(100)))) as daemon:
         estimates = subscriber(f"ipc://{tmp_path}/publish", "eit.estimate")
         health = subscriber(f"ipc://{tmp_path}/publish", "health")
         assert await asyncio.to_thread(next_message, health), "the subscription has arrived"
@@ -92,7 +93,7 @@ async def test_the_daemon_and_its_emulators_stop_cleanly_and_say_so(config, tmp_
 
 
 async def test_tare_status_and_stop_commands(config, tmp_path):
-    async with running_daemon(config()) as daemon:
+    async with running_daemon(config(right=played_at(20))) as daemon:
         estimates = collector(daemon, "eit.estimate")
         async with emulated_kit(tmp_path, 60):
             while not (await estimates.get())["valid"]:
@@ -111,7 +112,7 @@ async def test_tare_status_and_stop_commands(config, tmp_path):
 
 
 async def test_a_heatmap_is_computed_only_with_a_subscriber(config, tmp_path, subscriber):
-    async with running_daemon(config()) as daemon:
+    async with running_daemon(config(right=played_at(20))) as daemon:
         estimates, heatmaps = collector(daemon, "eit.estimate"), collector(daemon, "eit.heatmap")
         async with emulated_kit(tmp_path, 60):
             while not (await estimates.get())["valid"]:
@@ -162,7 +163,7 @@ async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, mo
         return estimate(self, frame)
 
     monkeypatch.setattr(Session, "estimate", fragile)
-    async with running_daemon(config()) as daemon:
+    async with running_daemon(config(right=played_at(4))) as daemon:
         estimates = collector(daemon, "eit.estimate")
         # The task starts again within the time of a frame at this pace.
         async with emulated_kit(tmp_path, 40, "--speed", "4"):
@@ -188,7 +189,7 @@ async def test_the_daemon_survives_a_closed_log(config, tmp_path):
 
 async def test_a_stopped_terminal_delays_no_estimate(config, tmp_path, subscriber):
     terminal, its_end = pty.openpty()
-    async with shearloop("run", str(config()), "--show", stdout=its_end, stderr=its_end) as daemon:
+    async with shearloop("run", str(config(right=played_at(100))), "--show", stdout=its_end, stderr=its_end) as daemon:
         frames = subscriber(f"ipc://{tmp_path}/publish", "eit.estimate")
         health = subscriber(f"ipc://{tmp_path}/publish", "health")
         assert await asyncio.to_thread(next_message, health), "the subscription has arrived"

@@ -120,8 +120,9 @@ async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path):
 async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next_line(tmp_path):
     lines = some_lines(30)
     async with running(EitKitBoard(map(format_line, lines), period_s=PERIOD_S, link=tmp_path / "eit").run()):
-        first = await take(EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots).readings(), 10)
-        kit = EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots)
+        kit = EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots, PERIOD_S)
+        first = await take(kit.readings(), 10)
+        kit = EitKit(SerialLink(path=tmp_path / "eit"), PAPER_TABLE.zero_slots, PERIOD_S)
         second = await take(kit.readings(), 10)
     assert_same(first, lines[:10])
     sent = [line.tolist() for line in lines]
@@ -133,7 +134,7 @@ async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next
 
 async def test_a_missing_board_is_awaited_and_reported_as_new_only_once(tmp_path):
     links = LinkEvents()
-    kit = EitKit(SerialLink(path=tmp_path / "eit", monitor=LinkMonitor(links)), PAPER_TABLE.zero_slots)
+    kit = EitKit(SerialLink(path=tmp_path / "eit", monitor=LinkMonitor(links)), PAPER_TABLE.zero_slots, PERIOD_S)
     taking = asyncio.create_task(take(kit.readings(), 1))
     await links.down(2)
     async with running(EitKitBoard(map(format_line, some_lines(1)), period_s=PERIOD_S, link=tmp_path / "eit").run()):

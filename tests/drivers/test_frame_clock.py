@@ -182,6 +182,29 @@ def test_frames_queued_before_the_first_read_do_not_spoil_the_period():
     assert abs(error[30:]).max() < 4_000_000
 
 
+def test_bursts_teach_no_period():
+    """A board that is plugged in again and again, with a queue of nine frames each time."""
+    clock, t_ns = FrameClock(PERIOD_NS), 0
+    for _ in range(8):
+        clock.restart()
+        for _ in range(9):
+            clock.arrived(t_ns := t_ns + 30_000_000)
+            assert clock.period_ns == pytest.approx(PERIOD_NS, rel=0.06)
+        for _ in range(2):
+            clock.arrived(t_ns := t_ns + PERIOD_NS)
+            assert clock.period_ns == pytest.approx(PERIOD_NS, rel=0.06)
+
+
+def test_late_frames_that_are_read_together_are_late_and_the_board_has_not_paused():
+    truth = sent(80)
+    clock = FrameClock(PERIOD_NS, longest_gap=25.0)
+    straightened(truth[:40], clock)
+    # The emulated board was kept waiting for five periods; then two frames are read at a time.
+    times = [clock.arrived(int(truth[45]) - 1_000_000, behind=1 - n % 2) for n in range(40, 46)]
+    times += straightened(truth[46:], clock).tolist()
+    assert np.abs(np.array(times) - truth[40:]).max() < 2_000_000
+
+
 def test_another_speed_after_a_restart_is_learned():
     clock = FrameClock(PERIOD_NS)
     straightened(sent(50), clock)

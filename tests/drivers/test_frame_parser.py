@@ -64,8 +64,9 @@ def test_a_line_is_read_to_the_last_digit():
     assert frame.raw.tolist() == expected, "the same doubles that float() reads"
     np.testing.assert_array_equal(frame.channels, PAPER_TABLE.channels_of_line(frame.raw))
     assert (frame.seq, other.seq) == (0, 1)
-    assert frame.t_arrival_ns == 5_000_000_000
-    assert frame.t_mid_ns == 5_000_000_000 - eit_kit.TRANSFER_NS - PERIOD_NS // 2
+    assert frame.t_arrival_ns == other.t_arrival_ns == 5_000_000_000
+    assert other.t_mid_ns == 5_000_000_000 - eit_kit.TRANSFER_NS - PERIOD_NS // 2
+    assert frame.t_mid_ns == other.t_mid_ns - PERIOD_NS
     assert not frame.saturated.any()
     assert not frame.dead.any()
     with pytest.raises(ValueError, match="read-only"):
@@ -78,7 +79,8 @@ def test_carriage_returns_are_taken_as_part_of_the_line_end():
 
 
 def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffected():
-    assert {kind for kind, _ in BROKEN} == set(FrameErrorKind)
+    # A whole frame that comes too soon has a test of its own.
+    assert {kind for kind, _ in BROKEN} == {*FrameErrorKind} - {FrameErrorKind.TOO_SOON}
     for kind, broken in BROKEN:
         parser = FrameParser(PAPER_TABLE.zero_slots)
         frames = parser.feed(GOOD + broken + LINES[1], 0)
@@ -126,7 +128,8 @@ def test_every_good_line_among_broken_ones_arrives_and_every_broken_one_is_count
     stream = GOOD + b"".join(lines)
     cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=10))
     parser = FrameParser(PAPER_TABLE.zero_slots)
-    frames = [frame for n, part in enumerate(slices(stream, cuts)) for frame in parser.feed(part, n)]
+    # Each part is read when all of its frames can have been sent.
+    frames = [frame for n, part in enumerate(slices(stream, cuts)) for frame in parser.feed(part, 20 * n * PERIOD_NS)]
     assert [format_line(frame.raw) for frame in frames] == [GOOD, *[line for line in lines if line in LINES]]
     assert parser.errors.total() == len(lines) + 1 - len(frames)
 
@@ -157,8 +160,8 @@ def test_a_whole_line_that_is_broken_is_refused_even_as_the_first():
 def test_another_port_drops_the_line_that_was_cut_off():
     parser = FrameParser(PAPER_TABLE.zero_slots)
     parser.feed(GOOD + LINES[1][:3000], 0)
-    parser.handle(RawEvent(InputKind.OPENED, 0))
-    frames = parser.feed(LINES[2], 0)
+    parser.handle(RawEvent(InputKind.OPENED, PERIOD_NS))
+    frames = parser.feed(LINES[2], 2 * PERIOD_NS)
     assert [(format_line(frame.raw), frame.seq) for frame in frames] == [(LINES[2], 1)]
     assert not parser.errors
 
@@ -189,6 +192,71 @@ def test_frames_that_waited_and_are_read_one_by_one_are_stamped_a_period_apart()
     assert middles == pytest.approx(np.arange(29.5, 39.5), abs=0.01)
 
 
+def opened_at(t_ns: int) -> FrameParser:
+    parser = FrameParser(PAPER_TABLE.zero_slots)
+    parser.handle(RawEvent(InputKind.OPENED, t_ns))
+    return parser
+
+
+@pytest.mark.parametrize("apart_ns", [0, 1_000_000, 34_000_000])
+def test_frames_that_waited_before_the_port_was_opened_are_dropped(apart_ns):
+    """Nine frames of a sender's full queue came within 0.3 s. Each had the age of a new one, and they made a period."""
+    opened_ns = 1_000 * PERIOD_NS
+    parser = opened_at(opened_ns)
+    frames = parser.feed(GOOD[5000:], opened_ns + 500_000)
+    for number in range(9):
+        frames += parser.feed(LINES[number % 4], opened_ns + 1_000_000 + number * apart_ns)
+    assert frames == []
+    assert not parser.errors, "as a cut line at the opening is none"
+    # The first one that is sent now comes at most a period after the last one that waited.
+    first_ns = opened_ns + round(0.9 * PERIOD_NS)
+    for number in range(60):
+        frames += parser.feed(LINES[number % 4], first_ns + number * PERIOD_NS)
+    assert np.diff([frame.t_mid_ns for frame in frames]) == pytest.approx(PERIOD_NS, abs=100)
+    assert frames[0].t_arrival_ns <= first_ns + PERIOD_NS
+    assert parser.clock.period_ns == pytest.approx(PERIOD_NS, rel=1e-6)
+
+
+def test_what_waited_before_the_opening_is_dropped_when_it_is_read_late_and_at_once():
+    opened_ns = 1_000 * PERIOD_NS
+    parser, read_ns = opened_at(opened_ns), opened_ns + round(0.7 * PERIOD_NS)
+    parser.handle(RawEvent(InputKind.WAITED, read_ns, str(opened_ns).encode()))
+    assert parser.handle(RawEvent(InputKind.DATA, read_ns, GOOD + LINES[1])) == []
+    parser = opened_at(opened_ns)
+    assert parser.feed(b"".join(LINES), opened_ns + 3 * PERIOD_NS) == [], "four frames take four periods"
+
+
+def test_the_first_frame_of_a_board_that_was_just_started_counts():
+    parser = opened_at(0)
+    assert len(parser.feed(GOOD, PERIOD_NS)) == 1
+
+
+def test_a_board_that_is_much_faster_than_configured_is_read_once_its_period_is_learned():
+    parser, fast_ns = opened_at(0), PERIOD_NS // 20
+    frames = [frame for n in range(1, 200) for frame in parser.feed(LINES[n % 4], n * fast_ns)]
+    assert parser.clock.period_ns == pytest.approx(fast_ns, rel=1e-3)
+    assert np.diff([frame.t_mid_ns for frame in frames[1:]]).max() < 1.01 * fast_ns
+    assert len(frames) > 140
+
+
+def test_frames_of_one_board_are_never_closer_than_half_a_period():
+    """A burst of frames after a standstill of their sender: four had one time, and the next was 0.03 s later."""
+    parser, frames = FrameParser(PAPER_TABLE.zero_slots), []
+    for number in range(30):
+        frames += parser.feed(LINES[number % 2], number * PERIOD_NS)
+    back_ns = 60 * PERIOD_NS
+    for number in range(5):
+        frames += parser.feed(LINES[number % 4], back_ns + number * 1_000_000)
+    for number in range(30):
+        frames += parser.feed(LINES[number % 2], back_ns + 31_000_000 + number * PERIOD_NS)
+    assert np.diff([frame.t_mid_ns for frame in frames]).min() > 0.5 * PERIOD_NS
+    assert parser.errors == {FrameErrorKind.TOO_SOON: 5}
+    assert "refused a frame less than half a period after the one before" in parser.refusal
+    assert f"where one comes every {PERIOD_NS / 1e9:.2g} s" in parser.refusal
+    assert [frame.seq for frame in frames] == list(range(len(frames)))
+    assert parser.clock.period_ns == pytest.approx(PERIOD_NS, rel=1e-6)
+
+
 @given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3 * PERIOD_NS)), max_size=25))
 def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts):
     parser, now_ns, middles = FrameParser(PAPER_TABLE.zero_slots), 0, []
@@ -197,7 +265,7 @@ def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts):
         frames = parser.feed(GOOD * number, now_ns)
         assert all(frame.t_mid_ns < frame.t_arrival_ns for frame in frames)
         middles += [frame.t_mid_ns for frame in frames]
-    assert all(a < b for a, b in pairwise(middles))
+    assert all(b - a >= 0.5 * PERIOD_NS - 2 for a, b in pairwise(middles))
 
 
 def flagged(lines: list[NDArray[np.float64]]) -> list[Frame]:

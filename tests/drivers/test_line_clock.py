@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from shearloop.drivers.line_clock import LATE_ARRIVALS, LEARN_FROM, PHASE_ARRIVALS, LineClock
 from shearloop.drivers.load_cell import LoadCalibration, LoadParser
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.drivers.shear_skin.instruments import PairParser
 
 PERIOD_NS = 100_000_000
@@ -138,3 +139,21 @@ def test_a_late_line_of_a_load_cell_has_the_time_of_its_measurement():
     parser = LoadParser(calibration, 1e9 / PERIOD_NS)
     samples = [one for n, t_ns in enumerate(read_ns) for one in parser.feed(f"0.0{10 + n % 7}\n".encode(), t_ns)]
     assert np.ptp(np.array([one.t_mid_ns for one in samples]) - truth) < 1_000
+
+
+def test_lines_that_waited_before_the_port_was_opened_are_dropped():
+    """The queue of their sender comes at once. Its lines had the time of the opening."""
+    parser = LoadParser(LoadCalibration.of_torque_lines(), 1e9 / PERIOD_NS)
+    opened_ns = 5 * PERIOD_NS
+    parser.handle(RawEvent(InputKind.OPENED, opened_ns))
+    for n in range(9):
+        assert parser.feed(b"0.5%d\n" % n, opened_ns + 1_000_000 + n * 5_000_000) == []
+    # Four lines take four periods.
+    assert parser.feed(b"0.60\n0.61\n0.62\n0.63\n", opened_ns + 2 * PERIOD_NS) == []
+    live = [one for n in range(1, 10) for one in parser.feed(b"0.0%d\n" % n, opened_ns + (n + 2) * PERIOD_NS)]
+    assert [sample.raw for sample in live] == [n / 100 for n in range(1, 10)]
+    assert set(np.diff([sample.t_mid_ns for sample in live])) == {PERIOD_NS}
+    assert parser.errors == {}
+    # So it is when the board was unplugged and is there again.
+    parser.handle(RawEvent(InputKind.OPENED, opened_ns + 20 * PERIOD_NS))
+    assert parser.feed(b"0.5\n", opened_ns + 20 * PERIOD_NS + 1_000_000) == []

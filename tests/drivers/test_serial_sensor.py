@@ -150,7 +150,7 @@ async def test_a_torn_line_accuses_no_other_board_and_is_no_error_any_more_after
     torn = b"0.0.01\n" if board == "load cell" else good[len(good) // 2 :]
 
     async def refusal_after(n_good: int) -> str:
-        link = PlayedLink(reads=[(0.1, good), (0.2, torn), *((0.3, good) for _ in range(n_good))])
+        link = PlayedLink(reads=[(0.6 * n, torn if n == 2 else good) for n in range(1, n_good + 3)])
         device = make(link)
         await played(device, link, losses=1)
         assert sum(device.diagnostics()["errors"].values()) == 1

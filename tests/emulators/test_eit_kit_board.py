@@ -1,3 +1,4 @@
+import asyncio
 import itertools
 import time
 from collections.abc import Iterator
@@ -8,8 +9,8 @@ import pytest
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers.connection import SerialLink, SerialPort
 from shearloop.drivers.eit_kit import EitKit
-from shearloop.emulators.boards import EitKitBoard, format_line, parse_fault
-from tests.running import read_exactly, running, take
+from shearloop.emulators.boards import EitKitBoard, EmulatedBoard, format_line, parse_fault
+from tests.running import DEADLINE_S, read_exactly, running, take
 
 
 def test_a_line_is_what_the_board_sends_byte_for_byte():
@@ -71,3 +72,33 @@ async def test_a_busy_computer_that_keeps_the_emulator_waiting_leaves_no_gap_bet
     # Two frames of such a distance have a gap between them, after which an estimator begins anew.
     assert np.diff(t_s).max() < 3 * period_s
     assert t_s[-1] - t_s[0] < 22 * period_s, "what was late is made up for"
+
+
+@pytest.mark.parametrize("where", ["the emulator stands still", "nobody reads"])
+async def test_lines_that_were_not_sent_for_long_are_left_out(where, monkeypatch):
+    """A board sends no old lines in a row: nine of them came within 0.3 s, each as if it was new."""
+    period_s, away_s, loop = 0.02, 5.0, asyncio.get_running_loop()
+    real_time, ahead_s, written_s, enough = loop.time, [0.0], [], asyncio.Event()
+    monkeypatch.setattr(loop, "time", lambda: real_time() + ahead_s[0])
+
+    def lines() -> Iterator[bytes]:
+        for number in itertools.count():
+            if number == 3 and where == "the emulator stands still":
+                ahead_s[0] = away_s
+            yield b"line\n"
+
+    async def write(_data: bytes) -> None:
+        if len(written_s) == 3 and where == "nobody reads":
+            ahead_s[0] = away_s
+        written_s.append(loop.time())
+        if len(written_s) == 9:
+            enough.set()
+
+    board = EmulatedBoard(lines(), period_s=period_s)
+    monkeypatch.setattr(board.port, "write", write)
+    async with running(board.run()):
+        async with asyncio.timeout(away_s + DEADLINE_S):
+            await enough.wait()
+    steps_s = np.diff(written_s)
+    assert steps_s[2] > away_s
+    assert np.delete(steps_s, 2).min() > 0.5 * period_s

@@ -129,14 +129,29 @@ def test_the_wrench_is_watched_with_the_state_that_it_comes_with():
 
 
 @pytest.mark.parametrize("source", [EIT, LOAD])
-def test_a_torque_that_comes_in_time_but_is_of_long_ago_is_stale(source):
+def test_a_torque_that_comes_in_time_but_is_of_long_ago_is_late_by_the_computer(source):
     """As from an estimator that has fallen behind: eight frames wait for it, and one comes in each period."""
     fresh = {one.name: torque(one, 0.1) for one in (EIT, LOAD)}
     late = torque(source, 0.1, way_s=8 * source.period_s)
     events = found(*{**fresh, source.name: late}.values())
+    assert events.keys() == {FaultCode.ESTIMATE_LATE}
+    sentence = events[FaultCode.ESTIMATE_LATE]
+    assert f"the last torque of {source.name} was measured" in sentence
+    assert f"it took {8.5 * source.period_s:.1f} s to come" in sentence
+    assert "cable" not in sentence
+    assert "the computer or its matching is too slow" in sentence
+
+
+@pytest.mark.parametrize("came_s", [1.9, 2.0])
+def test_a_torque_that_came_on_time_before_its_sensor_fell_silent_is_no_fault_of_the_computer(came_s):
+    """From 1.9 s on it is too old by its measurement, and then by its arrival."""
+    events = found(torque(EIT, 0.1, came_s=came_s, way_s=0.3), torque(LOAD, 0.1))
     assert events.keys() == {FaultCode.ESTIMATE_STALE}
-    assert f"the last torque of {source.name} was measured" in events[FaultCode.ESTIMATE_STALE]
-    assert f"it took {8.5 * source.period_s:.1f} s to come" in events[FaultCode.ESTIMATE_STALE]
+
+
+def test_an_estimator_whose_next_torque_is_not_there_yet_is_late_and_its_sensor_not_silent():
+    events = found(torque(EIT, 0.1, came_s=2.0, way_s=4.0), torque(LOAD, 0.1))
+    assert events.keys() == {FaultCode.ESTIMATE_LATE}
 
 
 @pytest.mark.parametrize("source", [EIT, LOAD, replace(EIT, window_s=5 * EIT.period_s)])

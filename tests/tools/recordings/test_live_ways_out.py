@@ -4,7 +4,7 @@ import asyncio
 from pathlib import Path
 
 from shearloop.daemon.web.message_store import CHARTED
-from tests.fixtures.daemons import emulated_kit, running_daemon, shearloop
+from tests.fixtures.daemons import emulated_kit, played_at, running_daemon, shearloop
 from tests.tools.recordings.every_message import Published, Recorded, latest_recording
 from tests.tools.recordings.watching import Watched, watching
 
@@ -36,7 +36,11 @@ async def run_watched(config: Path, folder: Path) -> tuple[Published, Watched]:
 
 
 def test_listen_and_the_page_give_what_was_recorded(config, tmp_path):
-    path = config(load_cell={"device": {"path": "load-cell"}}, recording={"folder": str(tmp_path / "recordings")})
+    path = config(
+        right=played_at(20),
+        load_cell={"device": {"path": "load-cell"}},
+        recording={"folder": str(tmp_path / "recordings")},
+    )
     sent, watched = asyncio.run(run_watched(path, tmp_path))
     watched.check(Recorded(latest_recording(tmp_path / "recordings"), sent), LISTENED, NOT_PAGED)
     assert watched.listened.numbers()["eit.estimate", "right"] == [*range(LAST_FRAME + 1)]

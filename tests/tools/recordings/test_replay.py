@@ -32,13 +32,14 @@ from shearloop.estimation.session import FINGERS_MOVED
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.message_content import read_content
 from shearloop.tools.recordings.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
-from tests.fixtures.daemons import ask, emulated_kit, running_daemon
+from tests.fixtures.daemons import ask, emulated_kit, played_at, running_daemon
 from tests.sample_messages import sample
 
 Messages = list[tuple[str, dict[str, Any]]]
 # Of the real recording's estimates with the tests' bank: what they were when it was last looked at with care.
 REFERENCE = Path(__file__).parents[2] / "data" / "replayed_stream.json"
 RELATIVE = 1e-9
+PLAYED = played_at(20)
 
 
 class Gripper:
@@ -112,7 +113,7 @@ async def record(config: Path) -> Messages:
 
 
 def test_a_replay_equals_the_recording_at_any_speed(config, tmp_path, tiny_calibration, ran):
-    live = asyncio.run(record(config(recording={"folder": "recordings"})))
+    live = asyncio.run(record(config(recording={"folder": "recordings"}, right=PLAYED)))
     (path,) = (tmp_path / "recordings").iterdir()
     # The recording holds the calibration that was used, whatever becomes of it.
     kept = tiny_calibration.rename(tmp_path / "kept.yaml")
@@ -279,7 +280,7 @@ async def record_experiments(config: Path) -> list[dict[str, Any]]:
 
 
 def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, monkeypatch):
-    live = asyncio.run(record_experiments(config(recording={"folder": "recordings"})))
+    live = asyncio.run(record_experiments(config(recording={"folder": "recordings"}, right=PLAYED)))
     (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
     before = RecordedRun(later).replay_events().before_frames["right"]
     zeroed = next(number for number in range(ZEROED, 10 * ENOUGH) if before.of(number, number - 1).begins_tare)
@@ -318,7 +319,9 @@ async def record_stated_tool(config: Path) -> list[dict[str, Any]]:
 def test_a_stated_tool_leaves_no_torque_live_and_the_replay_is_the_same(config, tmp_path, tiny_calibration):
     of_twenty = tmp_path / "twenty.cal"
     replace(Calibration.load(tiny_calibration), tool_mm=20.0).save(of_twenty)
-    path = config(right={"calibration": str(of_twenty), "average_frames": 1}, recording={"folder": "recordings"})
+    path = config(
+        right={**PLAYED, "calibration": str(of_twenty), "average_frames": 1}, recording={"folder": "recordings"}
+    )
     live = asyncio.run(record_stated_tool(path))
     assert any(one["valid"] for one in live), Counter(one["reason"] for one in live)
     refused = "the tool has 40 mm, and the calibration was made with a tool of 20 mm"
@@ -343,7 +346,7 @@ async def record_motion(config: Path) -> list[dict[str, Any]]:
 
 
 def test_frames_of_moving_fingers_are_replayed_as_such(config, tmp_path):
-    live = asyncio.run(record_motion(config(recording={"folder": "recordings"})))
+    live = asyncio.run(record_motion(config(recording={"folder": "recordings"}, right=PLAYED)))
     moved = [FINGERS_MOVED in one["reason"] for one in live]
     assert sum(moved) == 6
     assert not any(one["valid"] for one, was_moved in zip(live, moved, strict=True) if was_moved)
@@ -377,7 +380,7 @@ async def record_run(config: Path, per_experiment: int) -> None:
 
 
 def test_each_of_a_daemons_recordings_replays_bit_for_bit(config, tmp_path, ran):
-    asyncio.run(record_run(config(recording={"folder": "recordings"}), 18))
+    asyncio.run(record_run(config(recording={"folder": "recordings"}, right=PLAYED), 18))
     paths = list((tmp_path / "recordings").iterdir())
     assert {path.stem.rpartition("_")[2] for path in paths} == {"run-0", "run-1", "run-2"}
     for path in paths:
@@ -414,7 +417,7 @@ def without_states(path: Path) -> Path:
 
 def test_a_check_fails_for_a_source_whose_state_is_missing(config, tmp_path, ran):
     """A daemon that was killed too soon leaves such a file."""
-    asyncio.run(record_experiments(config(recording={"folder": "recordings"})))
+    asyncio.run(record_experiments(config(recording={"folder": "recordings"}, right=PLAYED)))
     (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
     publish = ("--publish", f"ipc://{tmp_path}/replay")
     out, said = ran("replay", without_states(later), "--speed", "max", *publish, "--check", "--json", status=1)

@@ -58,16 +58,23 @@ def twists(tmp_path_factory) -> Twists:
 
 
 class Board:
-    """An open port that brings a line each time that both boards are read, at times that no busy computer can delay."""
+    """An open port that brings a line each time that both boards are read, at times that no busy computer can delay.
 
-    def __init__(self, path: Path, lines: list[bytes], began_ns: int, both_read: asyncio.Barrier) -> None:
+    `began_ns` is the time at which both are open, for both of them.
+    """
+
+    def __init__(self, path: Path, lines: list[bytes], began_ns: list[int], both_read: asyncio.Barrier) -> None:
         self.path, self._both_read = path, both_read
-        arrivals_ns = (began_ns + round(number * PERIOD_S / PLAYED * 1e9) for number in range(1, N_FRAMES + 1))
-        self._received = iter(list(map(Received, lines, arrivals_ns)))
+        self._began_ns, self._lines = began_ns, enumerate(lines, 1)
 
     async def read(self, _timeout_s: float) -> Received:
         await self._both_read.wait()
-        return next(self._received, None) or await asyncio.get_running_loop().create_future()
+        if not self._began_ns:
+            self._began_ns.append(time.monotonic_ns())
+        number, line = next(self._lines, (0, b""))
+        if not line:
+            return await asyncio.get_running_loop().create_future()
+        return Received(line, self._began_ns[0] + round(number * PERIOD_S / PLAYED * 1e9))
 
     async def write(self, data: bytes) -> None:
         assert data == START
@@ -80,7 +87,8 @@ async def record(config: Path, lines: dict[str, list[bytes]], monkeypatch: pytes
     """Run a daemon on two boards until all their frames and pairs are estimated, and return what it published."""
     published: Messages = []
     estimates, all_done = Counter[str](), asyncio.Event()
-    began_ns, both_read = time.monotonic_ns(), asyncio.Barrier(len(SIDES))
+    began_ns: list[int] = []
+    both_read = asyncio.Barrier(len(SIDES))
 
     async def connect(link: SerialLink) -> Board:
         path = Path(link.path)

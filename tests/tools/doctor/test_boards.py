@@ -273,7 +273,7 @@ def test_a_running_daemon_is_judged_by_its_frames(config):
     """The daemon opens a board again that it takes for silent; the pauses are no periods."""
     parser = FrameParser(PAPER_TABLE.zero_slots)
     lines = frames(silent=ELECTRODE)
-    told = [parser.feed(next(lines), 0)[0] for _ in range(20)]
+    told = [parser.feed(next(lines), 540_000_000 * n)[0] for n in range(20)]
     received = [
         {"t_mono_ns": 540_000_000 * (n + 9 * (n // 5)), "channels": one.channels.astype(np.float32), "saturated": 0}
         for n, one in enumerate(told)

@@ -16,8 +16,6 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
 
 MIN_IN_STRATUM = 20
-# Fewer residuals have a Gaussian quantile, because their largest says too little.
-MIN_FOR_QUANTILE = 2 * MIN_IN_STRATUM
 _MIN_RESIDUALS = 5
 # Narrowest interval as a fraction of the calibrated range: load cells are noisy too.
 MIN_HALF_WIDTH = 1e-3
@@ -74,9 +72,9 @@ def student_inflation(n: int) -> float:
 
 
 def _conformal_quantile(absolute: FloatArray) -> float:
-    """Return the conformal quantile; of few residuals the Gaussian one."""
+    """Return the conformal quantile; of few residuals the Gaussian one, because their largest says too little."""
     n = len(absolute)
-    if n < MIN_FOR_QUANTILE:
+    if n < 2 * MIN_IN_STRATUM:
         return TWO_SIDED_95 * float(np.sqrt((absolute**2).mean()))
     return float(np.quantile(absolute, min(LEVEL * (n + 1) / n, 1.0), method="higher"))
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.estimation.interval_fit import INFLATION, best_strength, check_values
-from shearloop.estimation.intervals import MIN_FOR_QUANTILE, MIN_HALF_WIDTH, Intervals, student_inflation
+from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals, student_inflation
 from shearloop.estimation.left_out import LeftOut, left_out_blocks
 from shearloop.estimation.values import INLINE
 from shearloop.studies.slices.curve import CurveMean
@@ -104,10 +104,7 @@ def fit_slice_regressor(
 
 
 def _inflation(point: SlicePoint, rows: IntArray, left_out: LeftOut) -> float:
-    """Return the factor that widens the residuals of the left-out rows.
-
-    The conformal quantile allows for a finite sample itself. The Gaussian one of few residuals needs Student's factor.
-    """
+    """Return the factor that widens the residuals of the left-out rows."""
     if left_out:
-        return student_inflation(len(np.unique(rows))) if len(rows) < MIN_FOR_QUANTILE else 1.0
+        return student_inflation(len(np.unique(rows)))
     return 1.0 if isinstance(point, CurveMean) else INFLATION

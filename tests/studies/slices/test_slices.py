@@ -7,10 +7,8 @@ import pytest
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import Calibration
-from shearloop.estimation.ridge import Ridge
 from shearloop.studies.slices.calibration import SliceCalibration
 from shearloop.studies.slices.fitting import fit_slices
-from shearloop.studies.slices.regressor import fit_slice_regressor
 from shearloop.studies.slices.series import SliceSeries
 from tests.estimation.conftest import judged
 from tests.studies.slices.conftest import read, sliced
@@ -24,27 +22,6 @@ def test_later_slices_are_read_through_the_drift(name):
     assert found.n == 20
     assert found.rmse < 0.008
     assert found.coverage >= 0.85
-
-
-@pytest.mark.parametrize(
-    ("n_left_out", "half_width"),
-    [
-        # The conformal quantile of 60 errors is the 58th smallest of them: 95 % of 61.
-        (60, 58.0),
-        # The Gaussian one is 1.96 times their root mean square, and Student's is 2.045 times it, of 30.
-        (30, 2.045 * np.sqrt(31 * 61 / 6)),
-    ],
-)
-def test_many_errors_have_a_conformal_quantile_and_few_have_students(n_left_out, half_width):
-    """The conformal quantile allows for a finite sample itself, so Student's factor would widen it a second time."""
-    errors = 1e-3 * np.concatenate([np.zeros(20), np.arange(1.0, n_left_out + 1)])
-    values = np.linspace(0.01, 0.14, len(errors))
-    fitted, left_out = np.split(np.arange(len(errors)), [20])
-    as_it_comes = Ridge(np.zeros(1), np.ones(1), 0.0, 0.0)
-    found = fit_slice_regressor(
-        (values + errors)[:, None], values, lambda *_: as_it_comes, strengths=(0.0,), left_out=[(fitted, left_out)]
-    )
-    assert found.intervals.half_width(0.0) == pytest.approx(1e-3 * half_width, rel=1e-3)
 
 
 def test_what_is_not_familiar_is_not_valid(sliced_calibration):

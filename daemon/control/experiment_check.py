@@ -242,7 +242,10 @@ def _wrong_tools(file: ExperimentFile, sources: Mapping[str, TorqueSource], *, m
             if name == file.torque_source:
                 yield f"{name} has no torque on this tool: {error}, or correct `tool_mm`"
             elif turns:
-                yield f"{name}, which supervises, has no torque on this tool: {error}, or run without {name}"
+                yield (
+                    f"{name}, which supervises, has no torque on this tool: {error}, or leave out its `calibration`; "
+                    "its frames are recorded without one too"
+                )
 
 
 def tool_note(

@@ -123,6 +123,8 @@ class Parser(ABC, Generic[ValueT]):
         self._lines = LineSplitter(max_bytes)
         # Without a value in between.
         self._refused_in_a_row = 0
+        # Lines that came at once after an opening, since the beginning: they may have waited before it.
+        self.dropped_at_opening = 0
         # When the port was opened, until all that waited before has come; and when the last line came since.
         self._opened_ns: int | None = None
         self._before_ns = 0
@@ -160,6 +162,7 @@ class Parser(ABC, Generic[ValueT]):
             self._opened_ns = None
             return lines
         self._before_ns = arrival_ns
+        self.dropped_at_opening += len(lines)
         return []
 
     def _count_refused(self, kind: Hashable) -> int:
@@ -277,7 +280,11 @@ class SerialSensor(Generic[ValueT]):
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
         recent = self._values_since_refusal < FORGET_REFUSAL_VALUES
-        return {**self._link.diagnostics(), "last_refusal": self._parser.refusal if recent else ""}
+        return {
+            **self._link.diagnostics(),
+            "dropped_at_opening": self._parser.dropped_at_opening,
+            "last_refusal": self._parser.refusal if recent else "",
+        }
 
     def _check_use(self, port: Port, now_ns: int, *, useful: bool) -> None:
         """Raise DeviceLostError if no value has come for long although bytes come."""

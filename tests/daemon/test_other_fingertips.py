@@ -59,13 +59,17 @@ async def test_a_fingertip_of_another_kind_gives_its_torque(estimator, bank, twi
     right = {"bank": str(bank), "calibration": str(calibration), "frame_period_s": FRAME_PERIOD_S / SPEED}
     path = config(right=right, emulated=True)
     board = EitKitBoard(map(format_line, cycle(lines)), period_s=FRAME_PERIOD_S / SPEED, link=tmp_path / "eit-right")
-    truth_nm, errors_nm = series.torque_at_frames(), []
+    truth_nm, errors_nm, places = series.torque_at_frames(), [], []
     async with running(board.run()), running_daemon(path) as daemon:
         estimates = collector(daemon, "eit.estimate")
         for _ in range(len(lines)):
             estimate = await estimates.get()
+            # On a busy computer, a frame that waited behind newer ones is not looked up in the bank.
+            if estimate["k"] is not None:
+                places.append(estimate["k"])
             if estimate["torque_nm"] is not None:
-                assert 2.9 <= estimate["k"] <= 4.1
                 errors_nm.append(estimate["torque_nm"] - truth_nm[estimate["seq"] % len(lines)])
     assert len(errors_nm) > 100
+    assert places
+    assert all(2.9 <= place <= 4.1 for place in places)
     assert np.std(errors_nm) < 0.3 * np.nanstd(truth_nm)

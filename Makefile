@@ -53,7 +53,7 @@ demo: demo-python $(VENV)/.installed
 #   Tests that only compute run beside the rest, at a low priority: they take the time that it leaves of the cores, and
 #   disturb it less than a fourth worker would. On a busy computer they get little time, so that their timeout is long.
 # Status 5: no test was selected.
-# `make test` takes four minutes. `make test-long` runs what takes as long again: endurance, a newcomer's first hour, and
+# `make test` takes four to six minutes. `make test-long` runs what takes half as long again: endurance, a newcomer's first hour, and
 # figures (LONG in tests/conftest.py). `.ci/run` calls both.
 PYTEST := $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 LENGTH := not long

@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         )
     parts = _check_experiment(args.config, args.rig) if is_experiment else _check_configuration(args.config)
     plan_lines = [line for plan in parts.plans for line in plan.sentences()]
-    # A rehearsal runs all the same, so the rest is judged and shown beside them.
+    # A rehearsal runs all the same, so the other parts are judged and shown as well.
     for_real = "\n".join(parts.mistakes.pop(part) for part in OF_REAL_DEVICES if part in parts.mistakes)
     if parts.mistakes:
         if is_experiment and plan_lines and not args.json:
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
             print(*sentences, f"{verdict} for a rehearsal (`shearloop run --emulate`)", sep="\n", flush=True)
         raise UserError(for_real)
     if for_real:
-        verdict = f"{for_real}\n{verdict} for a rehearsal of {args.rig}; the real devices need what is said above"
+        verdict = f"{for_real}\n{verdict} for a rehearsal of {args.rig}; the real devices need the changes above"
     return print_result(result, [*sentences, verdict], as_json=args.json)
 
 

@@ -133,7 +133,7 @@ class Commands:
     def _why_expired(self, request: Request, since_ns: int = 0, delay: str = "", cure: str = "") -> str | None:
         """Return why it is too late to begin what a request asks for, or None; one without `until_ns` never expires.
 
-        `delay` is what was waited for since the request came in time at `since_ns`, and `cure` is against that.
+        `delay` names the wait since the request came in time at `since_ns`, and `cure` says how to avoid it.
         """
         now_ns = self.now_ns()
         late_s = (now_ns - request.get("until_ns", now_ns)) / 1e9
@@ -308,7 +308,7 @@ class Commands:
     def _may_end_daemon(self, request: Request) -> bool:
         """Return whether a stop where nothing moves may end the daemon: it is known to be of now, and for this one.
 
-        Another one may have waited on its way, and somebody may work with the daemon since.
+        An older one may have waited on its way, and the daemon may be in use again.
         """
         for_this_one = request.get("instance", self.instance) == self.instance
         return for_this_one and type(request.get("until_ns")) is int and self._why_expired(request) is None

@@ -87,7 +87,7 @@ def fit(
 
 
 def check_physics(kind: type[Estimator], physics: Physics, table: ChannelTable) -> None:
-    """Raise CalibrationError for an estimator without its bank or mesh, or with that of another kind of fingertip."""
+    """Raise CalibrationError for an estimator without its bank or mesh, or with one of another kind of fingertip."""
     if kind.needs and getattr(physics, kind.needs) is None:
         raise CalibrationError(f"the estimator {kind.name} needs a {kind.needs}: --{kind.needs}, in Python `Physics`")
     if kind.needs == "bank" and physics.bank is not None:

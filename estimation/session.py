@@ -192,7 +192,7 @@ class Session:
         return None if self.search is None or difference is None else self.search.heatmap(difference)
 
     def is_old(self, frame: TactileFrame) -> bool:
-        """Return whether a newer frame waits behind this one: nobody needs its position, which takes longest to find.
+        """Return whether a newer frame waits behind this one: then its position, which is slow to find, is not needed.
 
         Its torque belongs to the history of the newer ones.
         """

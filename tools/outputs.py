@@ -121,7 +121,7 @@ class LentFile(io.RawIOBase):
         self._written = 0
 
     def take_back(self) -> None:
-        """Let what is still written have no effect."""
+        """Ignore further writes."""
         self._file = None
 
     def writable(self) -> bool:

@@ -77,7 +77,7 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
     def wait(self, timeout_s: float | None) -> bool:
         """Return whether a message arrives within these seconds; None waits without end.
 
-        Raises UserError for seconds that nobody can wait.
+        Raises UserError for seconds out of range.
         """
         return bool(self._blocking.poll(_milliseconds(timeout_s)))
 
@@ -128,7 +128,7 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         if found is _Found.OTHER:
             return UnreachedError(
                 f"{nothing}: the program there does not publish to this client; give the address of the daemon's "
-                f"`publish` key, which is not that of its `commands`{_keys_hint(self._keys)}"
+                f"`publish` key, not of its `commands`{_keys_hint(self._keys)}"
             )
         if others := other_listeners(self._address):
             listens = f"a program of this computer listens at {others[0]}: if it is the daemon, give that address"
@@ -178,7 +178,7 @@ class _Found(enum.Enum):
 
 
 class _Probe(AbstractContextManager["_Probe", None]):
-    """A new connection to an address, which shows what is there; `events` and `blocking` tell when it is known."""
+    """A new connection that finds out which program is at an address; it takes the monitor's events."""
 
     def __init__(self, address: str, keys: ClientKeys | None) -> None:
         self._context = zmq.asyncio.Context()
@@ -191,7 +191,7 @@ class _Probe(AbstractContextManager["_Probe", None]):
         connect(self._socket, address, keys)
 
     def found(self, *, came: bool) -> _Found:
-        """Return what is there; `came`: an event is to be read."""
+        """Return which program is there; `came` says that an event can be read."""
         if not came:
             return _Found.NOTHING
         event = parse_monitor_message(self.blocking.recv_multipart())
@@ -274,7 +274,7 @@ async def ask(
 
 
 def _cure(address: str, keys: ClientKeys | None) -> str:
-    """Return what to do about a command that nobody answers, by what listens on this computer."""
+    """Return the cure of a command without a reply, from the programs that listen on this computer."""
     options = "--key and --server-key"
     if is_open_to_network(address):
         if keys is None:
@@ -294,7 +294,7 @@ def _cure(address: str, keys: ClientKeys | None) -> str:
 
 
 def _end_sentence(stop: Mapping[str, Any]) -> str:
-    """Return whether a stop that nobody answered can still end a daemon in which nothing runs."""
+    """Return whether a stop without a reply can still end a daemon in which nothing runs."""
     if "until_ns" in stop:
         return f"a daemon in which nothing runs ends only if it arrives within {TYPED_WITHIN_S:g} s of the command"
     return "it ends no daemon"

@@ -51,8 +51,10 @@ def other_listeners(address: str) -> list[str]:
     """
     if not is_local(address) or _reached_listeners(address):
         return []
-    found = sorted({str(ip) for ip, _ in _port_listeners(address) if not ip.is_loopback})
-    return [f"tcp://{f'[{ip}]' if ':' in ip else ip}:{address.rpartition(':')[2]}" for ip in found]
+    port = address.rpartition(":")[2]
+    others = {ip for ip, _ in _port_listeners(address) if not ip.is_loopback}
+    hosts = (f"[{ip}]" if ip.version == 6 else str(ip) for ip in others)
+    return sorted(f"tcp://{host}:{port}" for host in hosts)
 
 
 def _port_listeners(address: str) -> list[tuple[_IpAddress, int]]:

@@ -193,7 +193,7 @@ class FingertipTask:
         return refused
 
     def _changed_tool(self, now_ns: int) -> HeldTool | None:
-        """Return what is known of the tool's diameter, None if it is what it was before the last frame."""
+        """Return the known diameter of the tool, None if it has not changed since the last frame."""
         before = self._held
         measured = self.gripper.held_tool(now_ns) if self.gripper is not None else None
         self._held = HeldTool(measured, self.loop.stated_tool_mm if self.loop is not None else None)

@@ -19,7 +19,7 @@ MEMORY_S = 7200.0
 
 @dataclass(slots=True)
 class _Zero:
-    """A zero: its time, ln(R₁/R₂), what noise explains of it, and the value that the zeros beside it allow."""
+    """A zero: its time, ln(R₁/R₂), the noise in it, and its value as the zeros before and after it allow."""
 
     time_s: float
     response: float
@@ -59,7 +59,7 @@ class DriftLearner:
         self._per_s = max([self._configured_per_s, *(self._rate(*pair) for pair in pairs)])
 
     def _settle(self, before: _Zero, zero: _Zero, after: _Zero) -> None:
-        """Correct a zero that both zeros beside it contradict: something touched the skin while it was taken."""
+        """Correct a zero that both its neighbours contradict: something touched the skin while it was taken."""
         zero.settled = median((before.response, zero.response, after.response))
         if before is self._zeros[0] and self._beyond(before, zero) > 0 >= self._beyond(zero, after):
             before.settled = zero.settled
@@ -69,7 +69,7 @@ class DriftLearner:
         return abs(after.settled - before.settled) - self._explained - before.noise - after.noise
 
     def _rate(self, before: _Zero, after: _Zero) -> float:
-        """Return the drift between two zeros, 1/s: at most twice what is proved."""
+        """Return the drift between two zeros, 1/s: at most twice the rate that is proved."""
         elapsed_s = after.time_s - before.time_s
         beyond = self._beyond(before, after)
         if elapsed_s < SHORTEST_S or beyond <= 0:

@@ -148,7 +148,7 @@ class SkinTask:
             zero.collect()
 
     def _warn_of_drift(self) -> None:
-        """Say in the log when the latest zero changed what is known of the drift."""
+        """Log when the latest zero changes the known drift."""
         before, self._drift_warning = self._drift_warning, self._estimator.drift_warning
         if self._drift_warning != before:
             structlog.get_logger().warning(self._drift_warning or "the skin's zeros show no drift any more")
@@ -182,7 +182,7 @@ class SkinTask:
         self._publisher.publish(message)
 
     def _judged_torque(self, sample: SkinSample, reading: SkinReading, now_ns: int) -> TorqueSample:
-        """Return the torque with what tells a load from drift; without a radius the load is a force."""
+        """Return the torque, and the load beyond drift; without a radius the load is a force."""
         load, loaded_n = self._estimator.why_not_at_rest(sample), self._estimator.loaded_n
         if self._radius_m is not None:
             torque = skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns)
@@ -312,7 +312,7 @@ def skin_device(
 ) -> ShearSkin:
     """Return the skin's instruments, not yet open; `averaged` readings become a sample.
 
-    `observer_of` returns what is told of an instrument's link. Raises UserError if the instruments cannot measure these
+    `observer_of` returns the observer of an instrument's link. Raises UserError if the instruments cannot measure these
     gauges.
     """
     check_circuit(config, calibration)

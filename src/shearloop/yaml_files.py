@@ -240,7 +240,7 @@ def _meant(path: Path, model: type[Any] | None) -> str:
 
 
 def _may_be(path: Path, model: type[Any]) -> bool:
-    """Return whether a file may be meant for a model: most of its keys are the model's, or nothing tells."""
+    """Return whether a file may be meant for a model: most of its keys are the model's, or it cannot be known."""
     try:
         content = parse_yaml(read_file(path, MAX_BYTES))
     except OSError:

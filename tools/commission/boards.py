@@ -116,11 +116,17 @@ def measure(context: Context) -> Measured:
 
 def _unloaded(config: DaemonConfig) -> list[str]:
     """Return what the operator has to see before the boards are measured at rest."""
-    untouched = [*(["the fingertips"] if config.fingertips else []), *(["the skin"] if config.skin is not None else [])]
-    return [
-        *([f"nothing touches {' and '.join(untouched)}"] if untouched else []),
-        *(["the load cell carries no load"] if config.load_cell is not None else []),
-    ]
+    untouched = []
+    if config.fingertips:
+        untouched.append("the fingertips")
+    if config.skin is not None:
+        untouched.append("the skin")
+    seen = []
+    if untouched:
+        seen.append(f"nothing touches {' and '.join(untouched)}")
+    if config.load_cell is not None:
+        seen.append("the load cell carries no load")
+    return seen
 
 
 def unmeasured(config: DaemonConfig) -> list[Line]:

@@ -42,7 +42,7 @@ class GivenWord:
             self._beat_ns = now_ns
 
     def standstill_s(self) -> float:
-        """Return how long this program stood still since the word; 0 where that was short, or nobody watched."""
+        """Return how long this program stood still since the word; 0 where that was short, or outside `watched`."""
         if not self._watched:
             return 0.0
         self.beat()

@@ -112,7 +112,7 @@ def report_for(rig: RigIdentity, found: Report | None, path: Path) -> Report:
 
 
 def page_path(report: Path) -> Path:
-    """Return the path of a report's page, beside it."""
+    """Return the path of a report's page, in the report's folder."""
     return report.with_suffix(".html")
 
 

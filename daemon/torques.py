@@ -111,7 +111,7 @@ class SensorListener(Protocol):
 
     @property
     def stated_tool_mm(self) -> float | None:
-        """The diameter of the tool that the latest experiment states; None without one."""
+        """The diameter of the tool that the latest experiment states; None once its tool may be gone."""
 
     def on_link(self, device: str, sentence: str, *, up: bool) -> None:
         """Take the return or the loss of a device, with a sentence."""

@@ -206,10 +206,12 @@ class FrameParser(Parser[Frame]):
         for number, (values, rejected) in enumerate(complete, 1):
             sent_ns = self.clock.arrived(t_arrival_ns, rejected, self._waited_since_ns, len(complete) - number)
             after_ns = sent_ns - self._sent_ns
-            self._sent_ns = max(sent_ns, self._sent_ns)
-            if self.clock.period_ns >= AWAY_NS and after_ns < SOONEST_FRAME * self.clock.period_ns:
+            # The configured period may be another board's.
+            known = self.clock.learned and self.clock.period_ns >= AWAY_NS
+            if known and after_ns < SOONEST_FRAME * self.clock.period_ns:
                 self._refuse_soon(after_ns)
             else:
+                self._sent_ns = sent_ns
                 frames.append(self._frame(values, sent_ns, t_arrival_ns))
         return frames
 

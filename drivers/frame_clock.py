@@ -18,6 +18,8 @@ SPACING_FRAMES = 4
 LONGEST_GAP = 2.5
 # A period further from the usual spacing is a burst of late frames. So are spacings whose middle half differs by more.
 PLAUSIBLE = 0.05
+# Spacings that scatter by more than this fraction about their median are of a burst, or of a reader that was away.
+STEADY = 0.25
 
 
 class FrameClock:
@@ -120,7 +122,7 @@ class FrameClock:
             return
         # A burst of late frames has other spacings before and after it.
         middle = sorted(self._spacings)[LEARN_FROM // 4 : -LEARN_FROM // 4]
-        steady = max(abs(one - spacing) for one in middle) <= PLAUSIBLE * spacing
+        steady = max(abs(one - spacing) for one in middle) <= STEADY * spacing
         if steady and abs(self._exact_period_ns - spacing) > PLAUSIBLE * spacing:
             self._exact_period_ns, self.learned = spacing, True
         if len(self._seen) >= LEARN_FROM:

@@ -196,7 +196,7 @@ class Session:
 
         Its torque belongs to the history of the newer ones.
         """
-        return frame.read_after_s > _WAITED_PERIODS * self._period_s
+        return frame.read_after_periods > _WAITED_PERIODS
 
     def estimate(self, frame: TactileFrame) -> Estimate:
         """Return the estimate of a frame of the calibration's sides.

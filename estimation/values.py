@@ -33,8 +33,8 @@ class TactileFrame:
     """Frames of m sides at one time: t_s in seconds (middle of the acquisition), channels (m, c) in volts.
 
     usable (m, c) is False at dead and saturated channels, `repeated` True where a board sent a frame again.
-    fingers_moved: they opened or closed during a part of the acquisition. `read_after_s` passed from the middle of the
-    acquisition until the last of the frames was read. Do not change the arrays afterwards.
+    fingers_moved: they opened or closed during a part of the acquisition. `read_after_periods` frame periods passed
+    from the middle of the acquisition until the last of the frames was read. Do not change the arrays afterwards.
     """
 
     t_s: float
@@ -42,7 +42,7 @@ class TactileFrame:
     usable: BoolArray
     repeated: bool = False
     fingers_moved: bool = False
-    read_after_s: float = 0.0
+    read_after_periods: float = 0.0
 
     @classmethod
     def of(

@@ -69,6 +69,8 @@ class ControlLoop:
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
         self.safety = SafetyMonitor(patience)
         self.experiment: Experiment | None = None
+        # The diameter that the latest experiment states, while it runs and as long as the gripper may hold its tool.
+        self.stated_tool_mm: float | None = None
         # How many experiments have begun.
         self.runs = 0
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
@@ -109,11 +111,6 @@ class ControlLoop:
     def running(self) -> Experiment | None:
         """The experiment while it may still move something."""
         return self.experiment if self.experiment is not None and self.experiment.running else None
-
-    @property
-    def stated_tool_mm(self) -> float | None:
-        """The diameter of the tool that the latest experiment states: after its end, the tool may still be held."""
-        return self.experiment.file.tool_mm if self.experiment is not None else None
 
     def on_torque(self, torque: TorqueSample) -> None:
         """Accept a torque sample from any source."""
@@ -228,6 +225,7 @@ class ControlLoop:
             return reason
         speeds = Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
         self.experiment, self._watched = Experiment(file, t_ns, speeds), watched
+        self.stated_tool_mm = file.tool_mm
         self.wrist = self._wrists[file.torque_source]
         # What the last experiment knew of the tool may be wrong by now.
         self.wrist.reset()
@@ -276,6 +274,8 @@ class ControlLoop:
         if self.tool.release_error is not None:
             found.append(Fault(FaultCode.NOT_RELEASED, self.tool.release_error))
         if running is None:
+            if not self.tool.may_hold():
+                self.stated_tool_mm = None
             # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
             return self._ended(self.safety.report(self._at_rest(found)))
         decision = self.safety.judge(found, t_ns)

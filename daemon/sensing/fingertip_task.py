@@ -274,9 +274,10 @@ def tactile_frame(frames: tuple[Frame, ...], *, fingers_moved: bool = False) -> 
     repeated = any(frame.repeated and frame.channels.any() for frame in frames)
     t_s = sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9
     usable = [~(frame.saturated | frame.dead) for frame in frames]
+    period_s = 2e-9 * max(frame.t_mid_ns - frame.t_begin_ns for frame in frames)
     read_after_s = max(frame.t_arrival_ns for frame in frames) / 1e9 - t_s
     channels = np.array([frame.channels for frame in frames])
-    return TactileFrame(t_s, channels, np.array(usable), repeated, fingers_moved, read_after_s)
+    return TactileFrame(t_s, channels, np.array(usable), repeated, fingers_moved, read_after_s / period_s)
 
 
 async def estimate_frames(session: Session, frames: tuple[Frame, ...], *, fingers_moved: bool = False) -> Estimate:

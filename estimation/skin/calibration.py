@@ -187,7 +187,10 @@ class SkinCalibration(BaseModel):
         if self.missing_side and abs(response) <= self.friction_response(normal_n) + half:
             # The straight line through the origin, which the other side gave.
             low, high = (end / self.slope_per_n for end in ends)
-            tensions = max(tensions[0], low), min(tensions[1], high)
+            if self.missing_side == "negative":
+                tensions = max(tensions[0], low), tensions[1]
+            else:
+                tensions = tensions[0], min(tensions[1], high)
         low, high = (
             self._shear_range(end, tension, normal_n, direction)[side]
             for side, (end, tension) in enumerate(zip(ends, tensions, strict=True))

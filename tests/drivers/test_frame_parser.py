@@ -231,12 +231,21 @@ def test_the_first_frame_of_a_board_that_was_just_started_counts():
     assert len(parser.feed(GOOD, PERIOD_NS)) == 1
 
 
-def test_a_board_that_is_much_faster_than_configured_is_read_once_its_period_is_learned():
-    parser, fast_ns = opened_at(0), PERIOD_NS // 20
-    frames = [frame for n in range(1, 200) for frame in parser.feed(LINES[n % 4], n * fast_ns)]
-    assert parser.clock.period_ns == pytest.approx(fast_ns, rel=1e-3)
-    assert np.diff([frame.t_mid_ns for frame in frames[1:]]).max() < 1.01 * fast_ns
-    assert len(frames) > 140
+@pytest.mark.parametrize("late_s", [0.0, 0.19])
+@pytest.mark.parametrize("period_s", [0.027, 0.05, 0.1, 0.2, 0.26])
+def test_a_board_that_is_faster_than_configured_loses_no_frame(period_s, late_s):
+    """Its period is learned also where its reader is late at times: a frame cannot arrive before it was sent."""
+    chance = np.random.default_rng(1)
+    parser, period_ns = opened_at(0), round(period_s * 1e9)
+    sent_ns = period_ns * np.arange(1, 400)
+    read_ns = np.maximum.accumulate(sent_ns + (chance.uniform(0.0, late_s, len(sent_ns)) * 1e9).astype(int))
+    frames = [frame for n, t_ns in enumerate(read_ns) for frame in parser.feed(LINES[n % 4], int(t_ns))]
+    dropped = parser.dropped_at_opening
+    assert len(frames) + dropped + parser.errors.total() == len(sent_ns)
+    assert parser.errors.total() <= 0.05 * len(sent_ns)
+    if late_s == 0.0:
+        assert parser.clock.period_ns == pytest.approx(period_ns, rel=1e-3)
+        assert np.diff([frame.t_mid_ns for frame in frames[50:]]) == pytest.approx(period_ns, rel=0.01)
 
 
 def test_frames_of_one_board_are_never_closer_than_half_a_period():
@@ -265,7 +274,7 @@ def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts):
         frames = parser.feed(GOOD * number, now_ns)
         assert all(frame.t_mid_ns < frame.t_arrival_ns for frame in frames)
         middles += [frame.t_mid_ns for frame in frames]
-    assert all(b - a >= 0.5 * PERIOD_NS - 2 for a, b in pairwise(middles))
+    assert all(a < b for a, b in pairwise(middles))
 
 
 def flagged(lines: list[NDArray[np.float64]]) -> list[Frame]:

@@ -666,3 +666,21 @@ async def test_a_second_stop_of_an_operator_ends_the_daemon_at_once(acknowledged
         if acknowledged:
             cell.control_loop.acknowledge()
         assert await stop_command(of_now()) == {"ended": True, "process": os.getpid()}
+
+
+@pytest.mark.parametrize("released", [False, True])
+def test_the_stated_diameter_counts_as_long_as_its_tool_may_be_held(released):
+    """Another tool may be in the fingers, or clamped, after the release: nothing says which."""
+    last = {"do": "release"} if released else {"do": "wait", "wait_s": 0.1}
+    rig = started(Rig(new_loop()), GRIP, last, tool_mm=20.0)
+    assert rig.control_loop.stated_tool_mm == 20.0
+    rig.run(30.0)
+    if released:
+        rig.force_n = 0.0
+    rig.step()
+    rig.step()
+    assert rig.control_loop.stated_tool_mm == (None if released else 20.0)
+    # The next tool, by hand.
+    rig.force_n = 20.0
+    rig.step()
+    assert rig.control_loop.stated_tool_mm == (None if released else 20.0)

@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from collections.abc import AsyncGenerator, Mapping
+from dataclasses import replace
 from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
@@ -17,7 +18,7 @@ from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.finger_motion import FingerMotion
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes
-from shearloop.daemon.sensing.fingertip_task import FingertipTask
+from shearloop.daemon.sensing.fingertip_task import FingertipTask, tactile_frame
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.session_inputs import before_frame
 from shearloop.daemon.sensing.sessions import COMBINED
@@ -610,3 +611,14 @@ def test_health_and_log_name_the_electrode_whose_channels_are_dead(log):
     assert log.said == [own.sentence]
     own.update("right", PAPER_TABLE, np.arange(896) == 500)
     assert own.sentence == ""
+
+
+@pytest.mark.parametrize("period_s", [0.1, PERIOD_S, 1.4, 3.0])
+def test_a_frame_that_is_read_at_once_has_waited_half_a_period_whatever_its_board(period_s):
+    """A slow board's frames do not wait behind newer ones, although the configured period is shorter."""
+    end_ns = round(10e9)
+    times = {"t_begin_ns": end_ns - round(period_s * 1e9), "t_mid_ns": end_ns - round(period_s * 0.5e9)}
+    read = replace(frame(1), **times, t_arrival_ns=end_ns)
+    assert tactile_frame((read,)).read_after_periods == pytest.approx(0.5)
+    late = replace(read, t_arrival_ns=end_ns + round(period_s * 1e9))
+    assert tactile_frame((read, late)).read_after_periods == pytest.approx(1.5)

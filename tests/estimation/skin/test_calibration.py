@@ -387,3 +387,18 @@ def test_whatever_the_hand_does_the_band_with_its_noise_holds_the_force_but_for_
     ]
     # Only at a reversal, until the direction is forgotten.
     assert len(missed) <= 5 * len(moves)
+
+
+@pytest.mark.parametrize("wider", [0.0, 0.02, 0.1])
+def test_the_recorded_side_keeps_its_own_curve(wider):
+    """The straight line stands for the missing side alone: a curve may bend either way."""
+    tension_n, response = (0.0, 0.3, 1.0, 2.0, 4.0), (0.0, 0.03, 0.08, 0.12, 0.16)
+    mirrored = [tuple(-one for one in reversed(values[1:])) for values in (tension_n, response)]
+    rest = {
+        "friction": 0.3, "gauge_angle_deg": 30.0, "linear_to_n": 0.3, "response_half_width": 0.002,
+        "slack_half_width": 0.01, "gauge_depth_mm": None, "rows": 100, "rows_beyond": 0, "rest_ohm": (10.0, 10.0),
+    }  # fmt: skip
+    one_side = SkinCalibration(tension_n=tension_n, response=response, slack=(0.0,) * 5, **rest)
+    both = SkinCalibration(tension_n=mirrored[0] + tension_n, response=mirrored[1] + response, slack=(0.0,) * 9, **rest)
+    found, expected = (one.shear_from_response(0.03, 1.0, wider=wider) for one in (one_side, both))
+    assert found.high_n == pytest.approx(expected.high_n)

@@ -219,7 +219,8 @@ class FrameParser(Parser[Frame]):
         """Refuse a whole frame, which the clock has counted."""
         self.errors[FrameErrorKind.TOO_SOON] += 1
         every = f"after {max(after_ns, 0) / 1e9:.3f} s, where one comes every {self.clock.period_ns / 1e9:.2g} s"
-        self.refusal = f"refused {FrameErrorKind.TOO_SOON.value} ({every})"
+        cure = "if that goes on, see `frame_period_s`, and what keeps the board or this computer busy"
+        self.refusal = f"refused {FrameErrorKind.TOO_SOON.value} ({every}); {cure}"
 
     def _read(self, line: bytes | None) -> NDArray[np.float64] | None:
         if line is None:

@@ -42,6 +42,8 @@ class LineParser(Parser[ValueT]):
         self._clock = LineClock(self._period_ns)
         self._last_mid_ns = -(2**63)
         self._first = True
+        # Since when the next bytes may have waited for their reader; None if it was not away.
+        self._waited_since_ns: int | None = None
 
     @abstractmethod
     def _value(self, line: TimedLine) -> ValueT | None:
@@ -53,20 +55,25 @@ class LineParser(Parser[ValueT]):
             case InputKind.OPENED:
                 self._open(event.t_ns)
                 self.restart()
+            case InputKind.WAITED:
+                self._waited_since_ns = int(event.data)
             case InputKind.DATA:
-                return self.feed(event.data, event.t_ns)
+                values = self.feed(event.data, event.t_ns)
+                self._waited_since_ns = None
+                return values
         return []
 
     def restart(self) -> None:
         """Drop a half-received line: the port was opened, perhaps in the middle of one."""
         self._lines.restart()
         self._clock.restart()
-        self._first = True
+        self._first, self._waited_since_ns = True, None
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[ValueT]:
         """Return the values that `data` completes; of several lines each is a period older than the next."""
         values = []
-        lines = self._split(data, t_arrival_ns, self._clock.period_ns)
+        earliest_ns = t_arrival_ns if self._waited_since_ns is None else self._waited_since_ns
+        lines = self._split(data, earliest_ns, self._clock.period_ns)
         for waiting, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
             partial, self._first = self._first, False
             if line is None:

@@ -147,6 +147,7 @@ class Parser(ABC, Generic[ValueT]):
         """Begin with a port that was opened then."""
         self._lines.restart()
         self._opened_ns = self._before_ns = t_ns
+        self._refused_in_a_row = 0
 
     def _split(self, data: bytes, arrival_ns: int, period_ns: int) -> list[bytes | None]:
         """Return the lines that `data` completes; it arrived then at the earliest.

@@ -141,6 +141,19 @@ def test_a_late_line_of_a_load_cell_has_the_time_of_its_measurement():
     assert np.ptp(np.array([one.t_mid_ns for one in samples]) - truth) < 1_000
 
 
+@pytest.mark.parametrize("waited", [False, True])
+def test_lines_that_a_late_reader_finds_after_an_opening_may_be_older_than_it(waited):
+    """Three lines after a second and a half: without the note that their reader was away, they came just now."""
+    parser = LoadParser(LoadCalibration.of_torque_lines(), 1e9 / PERIOD_NS)
+    parser.handle(RawEvent(InputKind.OPENED, 0))
+    read_ns = 16 * PERIOD_NS
+    if waited:
+        parser.handle(RawEvent(InputKind.WAITED, read_ns, b"0"))
+    found = parser.handle(RawEvent(InputKind.DATA, read_ns, b"0.51\n0.52\n0.53\n"))
+    assert (len(found), parser.dropped_at_opening) == ((0, 3) if waited else (3, 0))
+    assert len(parser.handle(RawEvent(InputKind.DATA, read_ns + PERIOD_NS, b"0.01\n"))) == 1
+
+
 def test_lines_that_waited_before_the_port_was_opened_are_dropped():
     """The queue of their sender comes at once. Its lines had the time of the opening."""
     parser = LoadParser(LoadCalibration.of_torque_lines(), 1e9 / PERIOD_NS)

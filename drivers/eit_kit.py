@@ -14,9 +14,9 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.connection import AWAY_NS, Diagnostics, Link, Port
+from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.defaults import FRAME_PERIOD_S
-from shearloop.drivers.frame_clock import LONGEST_GAP, FrameClock
+from shearloop.drivers.frame_clock import LATE_NS, LONGEST_GAP, FrameClock
 from shearloop.drivers.refused_lines import refusal_sentence
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, Parser, RawEvent, SerialSensor
 
@@ -40,9 +40,8 @@ DEAD_AFTER_FRAMES = 200
 START = b"y"
 # A board that sends no frame for this many periods is opened and started again.
 SILENT_FRAMES = 4
-# A frame sooner after the one before, in periods, waited on its way. Arrivals cannot tell it of a board whose period is
-# shorter than what a reader may be late without a notice.
-SOONEST_FRAME = 0.5
+# Frames that follow each other sooner, in periods, waited on their way together.
+TOGETHER = 0.5
 # At fast frame rates a shorter silence may come from a busy computer.
 MIN_SILENCE_S = 0.5
 
@@ -171,8 +170,9 @@ class FrameParser(Parser[Frame]):
         self._rejected_since_frame: int | None = 0
         # Since when the next bytes may have waited for their reader; None if it was not away.
         self._waited_since_ns: int | None = None
-        # When the last frame of this connection was sent.
-        self._sent_ns = self._last_mid_ns = NEVER_NS
+        # When the last frame of this connection was sent, by the clock, and when it can have been sent at the earliest.
+        self._sent_ns = self._earliest_ns = NEVER_NS
+        self._last_mid_ns = NEVER_NS
         self._last_channels = np.full(np.count_nonzero(~zero_slots), np.nan)
         self._equal_readings = np.zeros(len(self._last_channels), np.int64)
 
@@ -194,46 +194,52 @@ class FrameParser(Parser[Frame]):
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[Frame]:
         """Return the frames that `data` completes, in order; all of it had arrived at `t_arrival_ns`."""
-        complete = []
         earliest_ns = t_arrival_ns if self._waited_since_ns is None else self._waited_since_ns
-        for line in self._split(data, earliest_ns, self.clock.period_ns):
-            values = self._read(line)
-            self._first_line = False
-            if values is not None:
-                complete.append((values, self._rejected_since_frame))
-                self._rejected_since_frame = self._refused_in_a_row = 0
+        read = [self._read(line) for line in self._split(data, earliest_ns, self.clock.period_ns)]
+        behind = sum(isinstance(one, np.ndarray) for one in read)
         frames = []
-        for number, (values, rejected) in enumerate(complete, 1):
-            sent_ns = self.clock.arrived(t_arrival_ns, rejected, self._waited_since_ns, len(complete) - number)
-            after_ns = sent_ns - self._sent_ns
-            # The configured period may be another board's.
-            known = self.clock.learned and self.clock.period_ns >= AWAY_NS
-            if known and after_ns < SOONEST_FRAME * self.clock.period_ns:
-                self._refuse_soon(after_ns)
-            else:
-                self._sent_ns = sent_ns
-                frames.append(self._frame(values, sent_ns, t_arrival_ns))
+        for one in read:
+            if isinstance(one, FrameError):
+                self._reject(one)
+            elif one is not None:
+                behind -= 1
+                sent_ns = self.clock.arrived(t_arrival_ns, self._rejected_since_frame, self._waited_since_ns, behind)
+                if self._has_known_time(sent_ns):
+                    frames.append(self._frame(one, sent_ns, t_arrival_ns))
+                # A whole frame is of this board, whatever its time is.
+                self._rejected_since_frame = self._refused_in_a_row = 0
         return frames
 
-    def _refuse_soon(self, after_ns: int) -> None:
-        """Refuse a whole frame, which the clock has counted."""
-        self.errors[FrameErrorKind.TOO_SOON] += 1
-        every = f"after {max(after_ns, 0) / 1e9:.3f} s, where one comes every {self.clock.period_ns / 1e9:.2g} s"
+    def _has_known_time(self, sent_ns: int) -> bool:
+        """Return whether the clock's time of the next frame is at most LATE_NS late; refuse the frame otherwise.
+
+        Of frames that come together, each was sent a period after the one before, and the first one at most LATE_NS
+        before it came. A frame that comes sooner than that shows that the first one was older, and may be as old.
+        """
+        after_ns, period_ns = sent_ns - self._sent_ns, self.clock.period_ns
+        # The configured period may be another board's.
+        together = self.clock.learned and after_ns < TOGETHER * period_ns
+        self._sent_ns = sent_ns
+        self._earliest_ns = self._earliest_ns + period_ns if together else sent_ns - LATE_NS
+        if sent_ns >= self._earliest_ns:
+            return True
+        self._count_refused(FrameErrorKind.TOO_SOON)
+        every = f"after {max(after_ns, 0) / 1e9:.3f} s, where one comes every {period_ns / 1e9:.2g} s"
         cure = "if that goes on, see `frame_period_s`, and what keeps the board or this computer busy"
         self.refusal = f"refused {FrameErrorKind.TOO_SOON.value} ({every}); {cure}"
+        return False
 
-    def _read(self, line: bytes | None) -> NDArray[np.float64] | None:
+    def _read(self, line: bytes | None) -> NDArray[np.float64] | FrameError | None:
+        """Return the values of a line, or the reason to reject it; None for the rest of a line at an opening."""
+        is_first, self._first_line = self._first_line, False
         if line is None:
-            self._reject(FrameError(FrameErrorKind.TOO_LONG, self._lines.too_long_start))
-            return None
+            return FrameError(FrameErrorKind.TOO_LONG, self._lines.too_long_start)
         line = line.removesuffix(b"\r")
-        values = read_line(line, self._zero_slots)
-        if not isinstance(values, FrameError):
-            return values
+        found = read_line(line, self._zero_slots)
         whole = len(line) >= self._zero_slots.size * CELL_BYTES
-        if whole or not self._first_line or values.kind not in _PARTIAL_ERRORS:
-            self._reject(values)
-        return None
+        if isinstance(found, FrameError) and is_first and not whole and found.kind in _PARTIAL_ERRORS:
+            return None
+        return found
 
     def _reject(self, error: FrameError) -> None:
         self.refusal = error.sentence(self._count_refused(error.kind))

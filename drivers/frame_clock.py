@@ -5,8 +5,8 @@ from collections.abc import Iterable
 from itertools import islice, pairwise
 from statistics import median
 
-from shearloop.drivers.connection import AWAY_NS
-
+# A busy computer delivers a frame up to this late to a reader that was not away.
+LATE_NS = 500_000_000
 # Frames behind the period: 35 s at 0.54 s, while a crystal drifts by microseconds.
 PERIOD_WINDOW = 64
 # Frames behind the phase: a board that paused is followed within 6 s.
@@ -30,9 +30,11 @@ class FrameClock:
     edge of their lower convex hull that spans the middle (Moon, Skelly and Towsley 1999, "Estimation and removal of
     clock skew from network delay measurements"). Its slope is the period; its height over the last few frames is the
     phase. All times are integer nanoseconds of one monotonic clock. The nominal period applies until the real one is
-    `learned`. After a pause of more than `longest_gap` periods the board counts as stopped; before, a frame is late. So
-    it is within AWAY_NS, for which a reader may be late without a notice. A frame that may have waited for its reader
-    says nothing of a pause: it came in time if it can have.
+    `learned`.
+
+    A frame is late, or the board paused before it and has a new phase. A pause of more than `longest_gap` periods shows
+    at once. A shorter one shows by two frames that are equally late, later than LATE_NS. The phase of the last frames
+    follows what is shorter still.
     """
 
     def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:
@@ -48,10 +50,9 @@ class FrameClock:
         self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
         # (frame number, arrival) of the frames that did not wait, since the last restart.
         self._seen: deque[tuple[int, int]] = deque(maxlen=PERIOD_WINDOW)
-        # When the last frame was read, or may have arrived at the earliest if it waited, and when it would have at a
-        # reader that is never late.
-        self._found_ns = 0
+        # When the last frame would have arrived at a reader that is never late, and how late it came, in periods.
         self._straight_ns = 0
+        self._late = 0.0
 
     def restart(self) -> None:
         """Forget the phase and keep the period: the board was restarted."""
@@ -66,53 +67,58 @@ class FrameClock:
         periods follows from the time; otherwise a late frame is the next one. `waited_since_ns`: its reader was away,
         and it may have arrived since then. `behind`: so many frames were read together with it, and came after it.
         """
-        # Frames that waited together were sent one period apart, the last one by now.
+        # Frames that are read together were sent one period apart, the last one by now.
         arrival_ns = read_ns - behind * self.period_ns
         earliest_ns = arrival_ns if waited_since_ns is None else min(waited_since_ns, arrival_ns)
-        self._waited_in_a_row = self._waited_in_a_row + 1 if earliest_ns < arrival_ns else 0
-        found_ns = earliest_ns if earliest_ns < arrival_ns else read_ns
-        if self._seen:
-            self._count(arrival_ns, earliest_ns, found_ns, rejected)
-        else:
-            self._number += 1
-        self._found_ns = found_ns
+        waited = earliest_ns < arrival_ns
+        # One that may have waited says nothing of a pause: it came in time if it can have.
+        found_ns = earliest_ns if waited else read_ns
+        steps = self._steps_to(arrival_ns, rejected, waited=waited)
+        # A full buffer loses its newest bytes: this frame came after the reader was back, and its number is unknown.
+        lost = waited and rejected is None
+        # Half a period early means that the last one was counted as two, or stamped too late.
+        early = self._periods_to(arrival_ns) < steps - 0.5
+        if early or lost or self._has_paused(earliest_ns, found_ns, steps):
+            self.restart()
+        self._number += steps
+        self._waited_in_a_row = self._waited_in_a_row + 1 if waited else 0
         # A frame that waited does not show the board's period, unless all frames wait.
         if not self._seen or not 0 < self._waited_in_a_row <= PERIOD_WINDOW:
-            self._seen.append((self._number, arrival_ns))
-            self._latest.append((self._number, arrival_ns))
-            if len(self._latest) > SPACING_FRAMES:
-                (n, before_ns), (m, _) = self._latest[0], self._latest[-1]
-                self._spacings.append((arrival_ns - before_ns) / (m - n))
-            self._learn()
-        straight_ns = float(arrival_ns)
-        for n, seen_ns in islice(reversed(self._seen), PHASE_WINDOW):
-            straight_ns = min(straight_ns, seen_ns + (self._number - n) * self._exact_period_ns)
-        self._straight_ns = round(straight_ns)
+            self._take(arrival_ns)
+        phase = islice(reversed(self._seen), PHASE_WINDOW)
+        by_phase = (seen_ns + (self._number - n) * self._exact_period_ns for n, seen_ns in phase)
+        self._straight_ns = round(min([arrival_ns, *by_phase]))
+        self._late = (found_ns - self._straight_ns) / self._exact_period_ns
         return self._straight_ns
 
-    def _count(self, arrival_ns: int, earliest_ns: int, found_ns: int, rejected: int | None) -> None:
-        """Count the periods until a frame that arrived between two times; restart where the board has paused."""
-        elapsed, elapsed_at_least, elapsed_found = (
-            (t_ns - self._straight_ns) / self._exact_period_ns for t_ns in (arrival_ns, earliest_ns, found_ns)
-        )
-        waited, steps = earliest_ns < arrival_ns, 1
-        if rejected != 0 and self.learned:
-            steps = max(1, round(elapsed))
-            if waited and rejected is not None:
-                # The time is only an upper bound for the number of frames that waited.
-                steps = min(steps, 1 + rejected)
-        self._number += steps
-        late = elapsed_found - steps
-        late_before = (self._found_ns - self._straight_ns) / self._exact_period_ns
-        # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
-        # board. Half a period early means that the last one was counted as two.
-        unnoticed = AWAY_NS / self._exact_period_ns
-        paused = min(late, late_before) > max(0.5, unnoticed) and late > late_before - 0.5
-        # A buffer that is not read for long loses its newest bytes: this frame came after the reader was back.
-        lost = waited and rejected is None
-        stopped = elapsed_at_least > max(self._longest_gap, unnoticed)
-        if stopped or elapsed - steps < -0.5 or paused or lost:
-            self.restart()
+    def _periods_to(self, t_ns: int) -> float:
+        """Return the periods from the last frame to a time."""
+        return (t_ns - self._straight_ns) / self._exact_period_ns
+
+    def _steps_to(self, arrival_ns: int, rejected: int | None, *, waited: bool) -> int:
+        """Return how many periods after the last frame the next one was sent."""
+        if not self._seen or not self.learned or rejected == 0:
+            return 1
+        steps = max(1, round(self._periods_to(arrival_ns)))
+        # For a frame that waited, the time is only an upper bound.
+        return min(steps, 1 + rejected) if waited and rejected is not None else steps
+
+    def _has_paused(self, earliest_ns: int, found_ns: int, steps: int) -> bool:
+        """Return whether the board stopped before a frame, which came at `earliest_ns` at the earliest."""
+        unnoticed = LATE_NS / self._exact_period_ns
+        late, before = self._periods_to(found_ns) - steps, self._late
+        # Frames that waited come in a burst, each less late than the one before.
+        equally_late = min(late, before) > max(0.5, unnoticed) and late > before - 0.5
+        return equally_late or self._periods_to(earliest_ns) > max(self._longest_gap, unnoticed)
+
+    def _take(self, arrival_ns: int) -> None:
+        """Take a frame that shows the board's phase and period."""
+        self._seen.append((self._number, arrival_ns))
+        self._latest.append((self._number, arrival_ns))
+        if len(self._latest) > SPACING_FRAMES:
+            (n, before_ns), (m, _) = self._latest[0], self._latest[-1]
+            self._spacings.append((arrival_ns - before_ns) / (m - n))
+        self._learn()
 
     def _learn(self) -> None:
         if len(self._spacings) < LEARN_FROM:
@@ -123,7 +129,9 @@ class FrameClock:
         # A burst of late frames has other spacings before and after it.
         middle = sorted(self._spacings)[LEARN_FROM // 4 : -LEARN_FROM // 4]
         steady = max(abs(one - spacing) for one in middle) <= STEADY * spacing
-        if steady and abs(self._exact_period_ns - spacing) > PLAUSIBLE * spacing:
+        # A late frame makes spacings wrong, too.
+        plausible_ns = max(PLAUSIBLE * spacing, LATE_NS / SPACING_FRAMES)
+        if steady and abs(self._exact_period_ns - spacing) > plausible_ns:
             self._exact_period_ns, self.learned = spacing, True
         if len(self._seen) >= LEARN_FROM:
             slope = slope_below(self._seen)

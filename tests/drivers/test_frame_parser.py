@@ -10,6 +10,7 @@ from scipy.io import loadmat
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.drivers import eit_kit
 from shearloop.drivers.eit_kit import ADC_STEP_V, FULL_SCALE_SINE_RMS_V, Frame, FrameErrorKind, FrameParser
+from shearloop.drivers.frame_clock import LATE_NS
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.emulators.boards import format_line
 from tests.slices import slices
@@ -264,6 +265,83 @@ def test_frames_of_one_board_are_never_closer_than_half_a_period():
     assert f"where one comes every {PERIOD_NS / 1e9:.2g} s" in parser.refusal
     assert [frame.seq for frame in frames] == list(range(len(frames)))
     assert parser.clock.period_ns == pytest.approx(PERIOD_NS, rel=1e-6)
+
+
+def settled(period_ns: int = PERIOD_NS, n: int = 40) -> FrameParser:
+    """Return a parser that has learned a board's period, from frames 0 to n - 1."""
+    parser = FrameParser(PAPER_TABLE.zero_slots, nominal_period_ns=period_ns)
+    for number in range(n):
+        parser.feed(LINES[number % 4], number * period_ns)
+    assert parser.clock.learned
+    return parser
+
+
+def sent_ns_of(frame: Frame, parser: FrameParser) -> int:
+    return frame.t_mid_ns + eit_kit.TRANSFER_NS + parser.clock.period_ns // 2
+
+
+@pytest.mark.parametrize("reopened", [False, True])
+@given(st.lists(st.floats(0.0, 0.9), min_size=1, max_size=40), st.sampled_from([0.027, 0.1, 0.26, 0.5412, 2.0]))
+def test_no_frame_is_lost_that_comes_late_by_what_a_busy_computer_delays_it(reopened, delays, period_s):
+    """Its reader was not away. Two frames that were late by more than half a period counted as a board that paused."""
+    period_ns, first = round(period_s * 1e9), 40
+    parser = settled(period_ns, first)
+    if reopened:
+        first = 60
+        # The first frame is as new as it seems: it comes half a period after the opening.
+        parser.handle(RawEvent(InputKind.OPENED, 59 * period_ns))
+    truth = period_ns * np.arange(first, first + len(delays))
+    read = np.maximum.accumulate(truth + (np.array(delays) * LATE_NS).astype(int))
+    frames = [frame for n, t_ns in enumerate(read.tolist()) for frame in parser.feed(LINES[n % 4], t_ns)]
+    assert not parser.errors
+    assert len(frames) + parser.dropped_at_opening == len(delays)
+    sent = np.array([sent_ns_of(frame, parser) for frame in frames])
+    late = sent - truth[len(truth) - len(sent) :]
+    assert late.min() > -0.06 * LATE_NS, "as the period is learned from late frames"
+    assert late.max() < LATE_NS
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_frames_that_a_busy_computer_delivers_late_have_the_times_of_their_board(seed):
+    """At most 0.5 s late: one in thirty was refused, and its neighbour had the time of its delivery."""
+    truth = PERIOD_NS * np.arange(40, 240)
+    late_ns = np.random.default_rng(seed).uniform(0.0, LATE_NS, len(truth)).astype(int)
+    parser = settled()
+    read = np.maximum.accumulate(truth + late_ns)
+    frames = [frame for n, t_ns in enumerate(read.tolist()) for frame in parser.feed(LINES[n % 4], t_ns)]
+    assert (len(frames), dict(parser.errors)) == (len(truth), {})
+    sent = np.array([sent_ns_of(frame, parser) for frame in frames])
+    assert abs(sent - truth).max() < 0.5 * LATE_NS
+    assert np.diff(sent).min() > 0.5 * PERIOD_NS
+
+
+@given(st.integers(3, 30), st.lists(st.floats(0.0, 0.49), min_size=1, max_size=9))
+def test_of_frames_that_waited_at_their_sender_for_long_none_passes_for_a_new_one(periods, gaps):
+    """None that tells: the first one comes as after a pause, and a second one may follow a first one that was late."""
+    parser = settled()
+    t_ns = (40 + periods) * PERIOD_NS
+    passed = len(parser.feed(GOOD, t_ns))
+    for number, gap in enumerate(gaps):
+        t_ns += int(gap * PERIOD_NS)
+        passed += len(parser.feed(LINES[number % 4], t_ns))
+    fast = not gaps or gaps[0] * PERIOD_NS < PERIOD_NS - LATE_NS
+    assert passed == 1 + (not fast)
+    # The board goes on: what comes more than half a period later is new.
+    live = [len(parser.feed(LINES[n % 4], t_ns + round((n + 0.6) * PERIOD_NS))) for n in range(30)]
+    assert live == [1] * 30
+    assert parser.refused == len(gaps) + 1 - passed
+    assert parser.clock.period_ns == pytest.approx(PERIOD_NS, rel=0.01)
+
+
+def test_a_frame_that_is_too_soon_counts_as_refused_and_does_not_accuse_another_board():
+    parser = settled()
+    back_ns = 60 * PERIOD_NS
+    parser.feed(GOOD, back_ns)
+    for number in range(5):
+        parser.feed(LINES[number % 4], back_ns + number)
+    assert (parser.refused, dict(parser.errors)) == (5, {FrameErrorKind.TOO_SOON: 5})
+    parser.feed(b"1.0\n", back_ns + 10)
+    assert "A single line like this has lost bytes" in parser.refusal
 
 
 @given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3 * PERIOD_NS)), max_size=25))

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from shearloop.cli.connection import MissingKeyError, add_connection, client_keys, with_connection
 from shearloop.cli.options import TIMEOUT_S, add_option
 from shearloop.daemon.messaging import addresses, stop_client
-from shearloop.daemon.messaging.bound_requests import LateRequestError, meant_for
+from shearloop.daemon.messaging.bound_requests import TYPED_WITHIN_S, LateRequestError, meant_for
 from shearloop.daemon.messaging.callers import caller
-from shearloop.daemon.messaging.deadlines import NEVER_LATE, TYPED_WITHIN_S, boot_ns
+from shearloop.daemon.messaging.deadlines import NEVER_LATE, boot_ns
 from shearloop.daemon.running_rig import EMULATED, EMULATED_HEADING
 from shearloop.errors import UserError
 

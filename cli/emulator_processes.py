@@ -2,8 +2,10 @@
 
 import argparse
 import contextlib
+import ctypes
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -14,7 +16,6 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
 from shearloop.cli.temporary_folders import run_folder
-from shearloop.daemon.process import end_with_parent
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ READY_S, POLL_S = 20.0, 0.02
 OBEYS_S = 10.0
 # A process needs some of it to remove its port's link, to close its sockets, or to end its workers.
 STOP_S = 2.0
+_PR_SET_PDEATHSIG = 1
 SHEARLOOP = (sys.executable, "-m", "shearloop")
 
 
@@ -36,7 +38,7 @@ def running(command: Sequence[str], **options: Any) -> "Iterator[subprocess.Pope
 
     It ends with this process, also if that is killed.
     """
-    end = partial(end_with_parent, os.getpid())
+    end = partial(_end_with_parent, os.getpid())
     # What runs before the command asks the kernel alone, so that it waits for no thread.
     with subprocess.Popen(command, process_group=0, bufsize=0, preexec_fn=end, **options) as process:  # noqa: PLW1509
         try:
@@ -47,6 +49,17 @@ def running(command: Sequence[str], **options: Any) -> "Iterator[subprocess.Pope
                 process.wait(STOP_S)
             except subprocess.TimeoutExpired:
                 process.kill()
+
+
+def _end_with_parent(parent: int) -> None:
+    """Let the kernel end this process by SIGTERM when its parent ends, also by SIGKILL (prctl(2)).
+
+    To be called in the new process; `parent` is the process that has started it.
+    """
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM))
+    if os.getppid() != parent:
+        # It has ended before.
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> list[argparse.Namespace]:

@@ -19,7 +19,7 @@ from shearloop.daemon.messaging.command_server import (
     Reply,
     Request,
 )
-from shearloop.daemon.messaging.deadlines import NEVER_LATE, boot_ns
+from shearloop.daemon.messaging.deadlines import NEVER_LATE, Deadline, boot_ns
 from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sensors import Sensors
@@ -116,7 +116,7 @@ class Commands:
             if name != STOP and request.get("instance", self.instance) != self.instance:
                 raise CommandRefusedError(_ANOTHER_DAEMON)
             if name not in NEVER_LATE:
-                _refuse_if(self._why_expired(request))
+                _refuse_if(self._deadline(request).why_passed())
             reply = await handler(request)
             refusal = None
         except CommandRefusedError as error:
@@ -130,21 +130,8 @@ class Commands:
                 self.report(Answered(name, request, refusal))
         return reply
 
-    def _why_expired(self, request: Request, since_ns: int = 0, delay: str = "", cure: str = "") -> str | None:
-        """Return why it is too late to begin what a request asks for, or None; one without `until_ns` never expires.
-
-        `delay` names the wait since the request came in time at `since_ns`, and `cure` says how to avoid it.
-        """
-        now_ns = self.now_ns()
-        late_s = (now_ns - request.get("until_ns", now_ns)) / 1e9
-        if late_s <= 0.0:
-            return None
-        reason = f"it came {late_s:.1f} s too late to be what the operator wants now"
-        if delay:
-            reason = (
-                f"{delay} took {(now_ns - since_ns) / 1e9:.1f} s, and the request had expired {late_s:.1f} s before"
-            )
-        return f"{reason}; {cure}look at the rig, and send it again"
+    def _deadline(self, request: Request) -> Deadline:
+        return Deadline(request.get("until_ns"), self.now_ns(), self.now_ns)
 
     async def _experiments(self, _request: Request) -> Reply:
         """Return the experiments that `start` may name, and the configured one, which it runs without a name.
@@ -181,8 +168,7 @@ class Commands:
             if request.get("ask"):
                 question = await rig.start_question(Path(path))
                 return dict(question.facts)
-            why_expired = partial(self._why_expired, request, self.now_ns())
-            _refuse_if(await rig.start(Path(path), request.get("digest"), why_expired))
+            _refuse_if(await rig.start(Path(path), request.get("digest"), self._deadline(request)))
         except QuestionChangedError as error:
             raise CommandRefusedError(str(error), **error.question.facts) from error
         except InvalidExperimentError as error:
@@ -311,7 +297,8 @@ class Commands:
         An older one may have waited on its way, and the daemon may be in use again.
         """
         for_this_one = request.get("instance", self.instance) == self.instance
-        return for_this_one and type(request.get("until_ns")) is int and self._why_expired(request) is None
+        is_dated = type(request.get("until_ns")) is int
+        return for_this_one and is_dated and self._deadline(request).why_passed() is None
 
 
 def check_arguments(name: str, request: Request) -> None:

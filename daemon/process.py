@@ -20,7 +20,6 @@ RETRY_S = 0.05
 NICENESS = -10
 # Many times what the daemon and all its clients use.
 MAX_DESCRIPTORS = 4096
-_PR_SET_PDEATHSIG = 1
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 
@@ -80,17 +79,6 @@ def _raise(number: int, _: FrameType | None) -> NoReturn:
 
 def _number(interrupt: BaseException | None) -> int:
     return int(interrupt.args[0]) if isinstance(interrupt, TerminationInterrupt) else signal.SIGINT
-
-
-def end_with_parent(parent: int) -> None:
-    """Let the kernel end this process by SIGTERM when its parent ends, also by SIGKILL (prctl(2)).
-
-    To be called in the new process; `parent` is the process that has started it.
-    """
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM))
-    if os.getppid() != parent:
-        # It has ended before.
-        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def raise_priority() -> None:

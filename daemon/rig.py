@@ -22,7 +22,7 @@ from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment, check_experiment
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.logs import LinkReporter
-from shearloop.daemon.messaging.deadlines import WhyExpired, never_expired
+from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
 from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
@@ -250,22 +250,22 @@ class Rig:
     def _start_under_way(self) -> str | None:
         return f"{self.starting} is being started; wait until it has begun, or stop it" if self.starting else None
 
-    async def start(self, path: Path, digest: str | None = None, why_expired: WhyExpired = never_expired) -> str | None:
+    async def start(self, path: Path, digest: str | None = None, deadline: Deadline = NO_DEADLINE) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file.
 
         `digest` is of the question that a person has confirmed, if one was asked; raises QuestionChangedError where
-        another one would be asked now. `why_expired` is asked after each wait: a slow drive makes the request too old.
+        another one would be asked now. `deadline` is checked after each wait: a slow drive makes the request too old.
         """
         # While something moves, no file is read.
         if (reason := self.start_refusal()) is not None:
             return reason
         self.starting = path.name
         try:
-            return await self._start(path, digest, why_expired)
+            return await self._start(path, digest, deadline)
         finally:
             self.starting = ""
 
-    async def _start(self, path: Path, digest: str | None, why_expired: WhyExpired) -> str | None:
+    async def _start(self, path: Path, digest: str | None, deadline: Deadline) -> str | None:
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
         if digest is not None and digest != (question := self._question_of(experiment)).digest:
@@ -274,12 +274,12 @@ class Rig:
                 "something was stopped or run"
             )
             raise QuestionChangedError(f"{path}: {changed}; look at the plan again", question)
-        if (reason := why_expired("reading its file", _SLOW_FILE)) is not None:
+        if (reason := deadline.why_passed("reading its file", _SLOW_FILE)) is not None:
             return reason
         try:
             if self.memory is not None and (reason := await self.memory.begins(experiment.file.name)) is not None:
                 return reason
-            reason = await self.runner.start(experiment.file, stops_before, why_expired)
+            reason = await self.runner.start(experiment.file, stops_before, deadline)
         finally:
             if self.memory is not None:
                 self.memory.starting = ""

@@ -22,7 +22,7 @@ from shearloop.daemon.control.state_publisher import StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.straight_moves import StraightMoves
 from shearloop.daemon.control.wrench import WrenchMean, publish_every
-from shearloop.daemon.messaging.deadlines import WhyExpired, never_expired
+from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import error_text
 from shearloop.daemon.torques import WRENCH, Tareable, TorqueSample
@@ -193,12 +193,12 @@ class ControlLoopRunner:
         return None
 
     async def start(
-        self, file: ExperimentFile, stops_before: int | None = None, why_expired: WhyExpired = never_expired
+        self, file: ExperimentFile, stops_before: int | None = None, deadline: Deadline = NO_DEADLINE
     ) -> str | None:
         """Begin an experiment; return None, or why it cannot begin.
 
-        `stops_before` is the `stop_count` at the request, if the file was read since. `why_expired` says whether the
-        request has become too old once the arm is enabled.
+        `stops_before` is the `stop_count` at the request, if the file was read since. `deadline` is checked once the
+        arm is enabled.
         """
         if self._closed:
             return ENDING
@@ -207,7 +207,7 @@ class ControlLoopRunner:
         # The control loop refuses while an experiment runs or a stop waits for the operator; a stopped arm must not be
         # enabled on the way.
         if self._stop_count == stops_before and self._control_loop.operator.start_refusal() is None:
-            refusal = await self._enable() or why_expired("enabling the arm", "")
+            refusal = await self._enable() or deadline.why_passed("enabling the arm")
         if self._stop_count != stops_before:
             if not self._closed:
                 self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))

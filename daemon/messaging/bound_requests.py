@@ -4,10 +4,13 @@ It imports little, so that `shearloop command stop` is quick on a busy computer.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
-from shearloop.daemon.messaging.deadlines import why_too_old
 from shearloop.errors import UserError
+
+# The page's clicks, and commands that are typed, whose program takes a while to begin on a busy computer.
+CLICK_WITHIN_S: Final = 2.0
+TYPED_WITHIN_S: Final = 5.0
 
 
 class LateRequestError(UserError):
@@ -21,8 +24,11 @@ def meant_for(status: Mapping[str, Any], age_s: float, within_s: float) -> dict[
     at most `age_s` ago when the reply came. Raises LateRequestError if no time is left. Nothing binds it to a daemon
     that does not say which one it is, or what its clock shows.
     """
-    if (reason := why_too_old(age_s, within_s)) is not None:
-        raise LateRequestError(reason)
+    if age_s > within_s:
+        raise LateRequestError(
+            f"it may have been asked for {age_s:.1f} s ago, and nothing begins later than {within_s:g} s after that; "
+            "look at the rig, and send it again"
+        )
     daemon = status.get("daemon", {})
     bound: dict[str, str | int] = {}
     if isinstance(instance := daemon.get("instance"), str):

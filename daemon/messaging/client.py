@@ -14,7 +14,7 @@ import zmq.asyncio
 from zmq.utils.monitor import parse_monitor_message
 
 from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, READ_ONLY, has_valid_port, needs_keys
-from shearloop.daemon.messaging.deadlines import TYPED_WITHIN_S
+from shearloop.daemon.messaging.bound_requests import TYPED_WITHIN_S
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, decode, encode
 from shearloop.daemon.messaging.stop_client import foreign_reply, is_open_to_network, other_listeners

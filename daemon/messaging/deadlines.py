@@ -6,19 +6,11 @@ act, and the request carries the reading back. The time since that reading is at
 
 import time
 from collections.abc import Callable
-from typing import Final, TypeAlias
+from dataclasses import dataclass
+from typing import Final
 
-# The page's clicks, and commands that are typed, whose program takes a while to begin on a busy computer.
-CLICK_WITHIN_S: Final = 2.0
-TYPED_WITHIN_S: Final = 5.0
 # They let nothing move: they are never too late.
 NEVER_LATE: Final = ("status", "stop", "pause")
-# Says why a request has become too old while something was waited for, or None. It takes what that was, and its cure.
-WhyExpired: TypeAlias = Callable[[str, str], str | None]
-
-
-def never_expired(_delay: str, _cure: str) -> None:
-    """Return that a request has not become too old: it names no time."""
 
 
 def boot_ns() -> int:
@@ -26,11 +18,31 @@ def boot_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-def why_too_old(age_s: float, within_s: float) -> str | None:
-    """Return why a request is not carried out at this age of the operator's act, or None."""
-    if age_s <= within_s:
-        return None
-    return (
-        f"it may have been asked for {age_s:.1f} s ago, and nothing begins later than {within_s:g} s after that; look "
-        "at the rig, and send it again"
-    )
+@dataclass(frozen=True, slots=True)
+class Deadline:
+    """The time until which a request may begin something, and when it came, both by `now_ns`.
+
+    Without `until_ns` it may begin at any time.
+    """
+
+    until_ns: int | None = None
+    came_ns: int = 0
+    now_ns: Callable[[], int] = boot_ns
+
+    def why_passed(self, delay: str = "", cure: str = "") -> str | None:
+        """Return why it is too late to begin, or None.
+
+        `delay` names the wait since the request came in time, and `cure` says how to avoid it.
+        """
+        now_ns = self.now_ns()
+        late_s = (now_ns - self.until_ns) / 1e9 if self.until_ns is not None else 0.0
+        if late_s <= 0.0:
+            return None
+        reason = f"it came {late_s:.1f} s too late to be what the operator wants now"
+        if delay:
+            took_s = (now_ns - self.came_ns) / 1e9
+            reason = f"{delay} took {took_s:.1f} s, and the request had expired {late_s:.1f} s before"
+        return f"{reason}; {cure}look at the rig, and send it again"
+
+
+NO_DEADLINE: Final = Deadline()

@@ -12,10 +12,9 @@ import zmq.asyncio
 
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
-from shearloop.daemon.messaging.bound_requests import meant_for
+from shearloop.daemon.messaging.bound_requests import CLICK_WITHIN_S, meant_for
 from shearloop.daemon.messaging.callers import caller
 from shearloop.daemon.messaging.client import ask, connect
-from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to_stop_socket
 from shearloop.daemon.web.message_store import MessageStore

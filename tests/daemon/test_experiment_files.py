@@ -21,7 +21,7 @@ from shearloop.daemon.control.known_tool import AT_REST
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.experiment_files import ExperimentFiles, read_experiment
 from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
-from shearloop.daemon.messaging.deadlines import WhyExpired
+from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.errors import UserError
@@ -238,7 +238,7 @@ class Runner:
     def motion(self) -> str | None:
         return self.refusal
 
-    async def start(self, file: Any, stops_before: int, _why_expired: WhyExpired) -> None:
+    async def start(self, file: Any, stops_before: int, _deadline: Deadline) -> None:
         self.started.append((file.name, stops_before))
 
 

@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from shearloop.daemon.messaging.deadlines import TYPED_WITHIN_S, boot_ns
+from shearloop.daemon.messaging.bound_requests import TYPED_WITHIN_S
+from shearloop.daemon.messaging.deadlines import boot_ns
 
 # A word that is older than a typed command may be is no longer meant for what moves now.
 LONGEST_STANDSTILL_S: Final = TYPED_WITHIN_S

@@ -13,6 +13,7 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
+from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.errors import DriverError
@@ -219,18 +220,17 @@ async def test_a_stop_during_the_start_of_an_experiment_counts(how):
 
 async def test_a_request_that_expires_while_the_arm_is_enabled_begins_nothing():
     async with driven() as cell:
-        asked: list[str] = []
+        now_ns = cell.robot.bench.now_ns
 
-        def why_expired(delay: str, _cure: str) -> str:
+        def enabled_for_long() -> int:
             assert any(isinstance(command, Enable) for command in cell.robot.commands), "only then it is known"
-            asked.append(delay)
-            return "it is too late"
+            return now_ns + 3_500_000_000
 
-        starting = asyncio.create_task(cell.runner.start(experiment(TWIST), why_expired=why_expired))
+        deadline = Deadline(now_ns + 2_000_000_000, now_ns, enabled_for_long)
+        starting = asyncio.create_task(cell.runner.start(experiment(TWIST), deadline=deadline))
         while not starting.done():
             await cell.cycles(1)
-        assert starting.result() == "it is too late"
-        assert asked == ["enabling the arm"]
+        assert "enabling the arm took 3.5 s, and the request had expired 1.5 s before" in starting.result()
         assert cell.control_loop.experiment is None
         await cell.cycles(10)
         assert cell.state.motion == "idle"

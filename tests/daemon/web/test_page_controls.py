@@ -6,7 +6,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from playwright.sync_api import Page, Route
 
-from shearloop.daemon.messaging.deadlines import CLICK_WITHIN_S
+from shearloop.daemon.messaging.bound_requests import CLICK_WITHIN_S
 from tests.daemon.web.fake_daemon import CAUSE, MESSAGES, PLAN, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")

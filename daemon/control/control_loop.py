@@ -288,9 +288,8 @@ class ControlLoop:
     def _running_step(self, running: Experiment, awaited: str) -> RunningStep:
         """Return what the experiment needs and expects; `awaited` are the torques that a turn waits for."""
         command, controller = running.command, self.wrist.controller
-        grasp = Grasp.HELD if self.tool.expected else Grasp.NONE
-        grasp = Grasp.CHANGING if isinstance(command.action, GripStep) else grasp
-        needed = grasp is Grasp.HELD and _turns(command) and not awaited
+        grasp = self._grasp(command)
+        needed = grasp.may_hold and _turns(command) and not awaited
         runs = running.phase is ExperimentPhase.RUNNING
         return RunningStep(
             torque_needed=needed and runs,
@@ -301,6 +300,13 @@ class ControlLoop:
             overdue=running.overdue,
             others_requests=self.tool.others_requests,
         )
+
+    def _grasp(self, command: StepCommand) -> Grasp:
+        if isinstance(command.action, GripStep):
+            return Grasp.CHANGING
+        if self.tool.expected:
+            return Grasp.HELD
+        return Grasp.POSSIBLE if self.tool.may_turn else Grasp.NONE
 
     def _at_rest(self, found: Sequence[Fault]) -> list[Fault]:
         """Return the faults while no experiment runs, with what the operator should know of a held tool."""
@@ -339,7 +345,7 @@ class ControlLoop:
         clock_stands = on_hold or bool(awaited and _turns(experiment.command))
         self._choose_command(experiment, origin_rad, t_ns, on_hold=on_hold, clock_stands=clock_stands)
         turns = _turns(experiment.command)
-        if turns and self.tool.expected and not awaited:
+        if turns and self.tool.may_turn and not awaited:
             # From the first turn on, a torque that does not come is a fault.
             self._unmeasured_since_ns = None
         waits = turns and bool(awaited)
@@ -362,8 +368,8 @@ class ControlLoop:
         torque_nm = latest.torque_nm if latest is not None and not on_hold else None
         twisted_rad = self.tool.twisted_rad
         experiment.update(t_ns, twisted_rad, torque_nm, gripped_at_rad=origin_rad, clock_stands=clock_stands)
-        # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now. A `grip` that
-        # may meet nothing allows turns, although a tool as wide as its target is not felt.
+        # After a stop, the gripper's doubt may arrive only now. A `grip` that may meet nothing allows turns, although a
+        # tool as wide as its target is not felt: it is watched like a held one.
         gripper = self.inputs.gripper
         unfelt = gripper is not None and gripper.unfelt
         if _turns(experiment.command) and not (self.tool.expected or unfelt) and (uncertain := self.tool.uncertain):
@@ -415,7 +421,7 @@ class ControlLoop:
         An estimator needs some frames of the new grip; a source without a torque after its `warm_up_s` is a fault.
         """
         since_ns = self._unmeasured_since_ns
-        if since_ns is None or not self.tool.expected:
+        if since_ns is None or not self.tool.may_turn:
             return ""
         awaited, reason = [], ""
         for name, source in self._sources.items():

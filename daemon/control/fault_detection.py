@@ -30,7 +30,13 @@ class Grasp(Enum):
 
     NONE = "none"
     CHANGING = "changing"  # they open or close: a fingertip measures their motion, and no torque
+    POSSIBLE = "possible"  # they may hold one that is not felt: it is watched like a held one
     HELD = "held"
+
+    @property
+    def may_hold(self) -> bool:
+        """Whether a turn of the wrist may turn a tool."""
+        return self in (Grasp.POSSIBLE, Grasp.HELD)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +85,7 @@ def detect_faults(
         found += _torque_faults(inputs, watched, step, t_ns)
     grasp = step.grasp if step is not None else Grasp.NONE
     found += _torque_limit_faults(inputs, watched, limits.torque_nm, grasp, t_ns)
-    if step is not None and grasp is Grasp.HELD and abs(step.twisted_rad) > limits.angle_rad:
+    if step is not None and grasp.may_hold and abs(step.twisted_rad) > limits.angle_rad:
         found.append(_angle_limit_fault(inputs, watched, limits.angle_rad, step.twisted_rad))
     found += _device_faults(inputs, watched, step, t_ns)
     for name, reason in inputs.died.items():

@@ -232,6 +232,11 @@ class HeldTool:
         """Whether our gripper is known to hold nothing; a tool that is held by other means is not known."""
         return self.has_gripper and self.inputs.gripper is not None and not self.may_hold()
 
+    @property
+    def may_turn(self) -> bool:
+        """Whether a turn of the wrist may turn a tool: one is expected, or the fingers are not known to be empty."""
+        return self.expected or self.may_hold()
+
     def may_be_loaded(self) -> bool:
         """Return whether a tool may load the sensors: a held one, or a clamped one whose angle counts."""
         return self.may_hold() if self.has_gripper else self.grip.origin_rad is not None

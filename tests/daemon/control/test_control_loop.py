@@ -451,6 +451,34 @@ def test_a_grip_that_may_meet_nothing_allows_turns_after_it():
     assert "stand at their target" in (rig.control_loop.tool.may_still_hold or "")
 
 
+def turning_what_is_not_felt(**keys: Any) -> Rig:
+    """Return a rig that turns after a grip whose fingers have reached their target: a tool as wide is not felt."""
+    rig = Rig(new_loop())
+    rig.hand, rig.force_n = replace(rig.hand, unfelt=True), 0.0
+    slow = {"do": "twist", "angles_rad": [0.3], "speed_rad_per_s": 0.05}
+    started(rig, {**GRIP, "expect_object": False}, slow, torque_source="load_cell", **keys)
+    while rig.speed == 0.0:
+        rig.step()
+    return rig
+
+
+def test_a_tool_that_is_not_felt_has_an_angle_limit():
+    rig = turning_what_is_not_felt(limits={"angle_rad": 0.1})
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.STOPPED
+    assert rig.control_loop.status.decision.codes == "angle limit"
+    assert abs(rig.control_loop.tool.twisted_rad) < 0.12
+
+
+@pytest.mark.parametrize("silent", ["load_cell", "right"])
+def test_a_tool_that_is_not_felt_holds_without_its_torques(silent):
+    rig = turning_what_is_not_felt()
+    rig.silent.add(silent)
+    while rig.speed:
+        rig.step()
+    assert rig.control_loop.status.decision.codes == "estimate stale"
+
+
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
 @pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
 def test_a_gripper_that_becomes_uncertain_after_the_start_fails_the_turn(sense, turning):

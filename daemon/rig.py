@@ -198,14 +198,15 @@ def make_gripper(
 ) -> GripperTask:
     """Return the gripper's task; it is not connected yet.
 
-    `patience` is the factor on the deadline of its replies; `supplied` is of the rig's report.
+    `patience` is the factor on the deadlines of its replies and states; `supplied` is of the rig's report.
     """
     client, calibration = make_gripper_client(config, patience), gripper_calibration(config)
     measured = measured_widths(supplied, config.model) if config.calibration is None else None
     calibration = measured or calibration
     gripper = RobotiqGripper(client, calibration, monitor=LinkMonitor(LinkReporter("gripper", loop)))
     measures = config.calibration is not None or measured is not None
-    return GripperTask(gripper, publisher, loop, FingertipDiameters(COMBINED), clock, measures)
+    diameters = FingertipDiameters(COMBINED, loop.sources)
+    return GripperTask(gripper, publisher, loop, diameters, clock, measures, patience)
 
 
 @dataclass

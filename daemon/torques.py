@@ -7,7 +7,6 @@ from itertools import groupby
 from statistics import fmean
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
-from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
 if TYPE_CHECKING:
@@ -68,7 +67,7 @@ class TorqueSource:
     `noise_nm`: the torque is known to this; such a source supervises beyond it only, and drives nothing gentler.
     `needs_zero`: its torques count from a zero that has to be taken. `only_sign`: of the only torques that it
     measures, 0 for both; a torque of the other sign may read as 0. `calibration` is a fingertip's, where it could be
-    opened: it says on which tools there is a torque.
+    opened: it says on which tools there is a torque. `min_fresh_s`: a torque is fresh for this long at least.
     """
 
     name: str
@@ -83,18 +82,21 @@ class TorqueSource:
     needs_zero: bool = False
     only_sign: int = 0
     calibration: "Calibration | None" = None
+    min_fresh_s: float = 0.0
 
-    def fresh_s(self, config: LoopConfig) -> float:
-        """Return how long after its arrival a torque is fresh."""
-        return max(STALE_AFTER_PERIODS * self.period_s, config.stale_after_s)
+    @property
+    def fresh_s(self) -> float:
+        """How long after its arrival a torque is fresh."""
+        return max(STALE_AFTER_PERIODS * self.period_s, self.min_fresh_s)
 
-    def oldest_s(self, config: LoopConfig) -> float:
-        """Return how long after its measurement a torque is fresh.
+    @property
+    def oldest_s(self) -> float:
+        """How long after its measurement a torque is fresh.
 
         A torque is half its acquisition old at its end. The rest of its age is transport: a board or an estimator that
         falls behind sends on time, but old torques.
         """
-        return self.fresh_s(config) + self.acquired_s
+        return self.fresh_s + self.acquired_s
 
     @property
     def acquired_s(self) -> float:

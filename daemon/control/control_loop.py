@@ -65,7 +65,8 @@ class ControlLoop:
         `patience` is the factor on the deadlines, above 1 on an emulated rig alone. `compute` begins a computation that
         would make the loop late.
         """
-        kept_s = max(ADAPTED_OVER_S, compared_for_s(sources.values(), config))
+        sources = {name: replace(source, min_fresh_s=config.stale_after_s) for name, source in sources.items()}
+        kept_s = max(ADAPTED_OVER_S, compared_for_s(sources.values()))
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
         self.safety = SafetyMonitor(patience)
         self.experiment: Experiment | None = None
@@ -75,7 +76,7 @@ class ControlLoop:
         self.runs = 0
         self.status = LoopStatus("idle", "", WristCommand(), SafetyDecision(Response.NOTE))
         self.config = config
-        self._sources = sources
+        self.sources = sources
         self._creep = creep
         self._wrists = {
             name: WristController(source, config, compute) for name, source in sources.items() if source.measures_torque
@@ -105,7 +106,7 @@ class ControlLoop:
     @property
     def warm_up_s(self) -> float:
         """The longest time from a grip to the first torque of a source."""
-        return max((one.warm_up_s for one in self._sources.values() if one.measures_torque), default=0.0)
+        return max((one.warm_up_s for one in self.sources.values() if one.measures_torque), default=0.0)
 
     @property
     def running(self) -> Experiment | None:
@@ -135,7 +136,7 @@ class ControlLoop:
         Torques within the source's noise are as in `beyond_noise`.
         """
         times_ns, torques_nm = self.inputs.history.get(source, ([], []))
-        noise_nm = self._sources[source].noise_nm if source in self._sources else 0.0
+        noise_nm = self.sources[source].noise_nm if source in self.sources else 0.0
         return times_ns, beyond_noise(times_ns, torques_nm, noise_nm)
 
     def on_arm(self, arm: ArmStatus) -> None:
@@ -156,7 +157,7 @@ class ControlLoop:
         else:
             self.inputs.lost[device] = sentence
             # A device that was unplugged or switched off may return with another zero.
-            for name, source in self._sources.items():
+            for name, source in self.sources.items():
                 if name == device or (source.from_robot and device == "robot"):
                     self.on_zero(name, known=False)
 
@@ -183,7 +184,7 @@ class ControlLoop:
         if not isinstance(action, TareStep | GripStep):
             return
         if isinstance(action, TareStep):
-            for name, source in self._sources.items():
+            for name, source in self.sources.items():
                 if source.from_robot:
                     self.on_zero(name)
         # The tool was identified with another zero, or in another grip.
@@ -218,7 +219,7 @@ class ControlLoop:
             self.tool.judge(self.inputs.gripper)
         if (reason := self.operator.why_no_source(file)) is not None:
             return reason
-        driving = self._sources[file.torque_source]
+        driving = self.sources[file.torque_source]
         watched = replace(self._watched, driving=driving, supervising=self._others(driving))
         faults = detect_faults(self.inputs, watched, file.limits, None, t_ns)
         if reason := _refusal_by(faults) or self.operator.why_not_with_tool(file) or self._awaited_judgement():
@@ -331,7 +332,7 @@ class ControlLoop:
         return None
 
     def _others(self, driving: TorqueSource) -> tuple[TorqueSource, ...]:
-        return tuple(source for source in self._sources.values() if source is not driving)
+        return tuple(source for source in self.sources.values() if source is not driving)
 
     def _run_step(
         self, experiment: Experiment, decision: SafetyDecision, awaited: str, wrist_rad: float, t_ns: int
@@ -424,7 +425,7 @@ class ControlLoop:
         if since_ns is None or not self.tool.may_turn:
             return ""
         awaited, reason = [], ""
-        for name, source in self._sources.items():
+        for name, source in self.sources.items():
             latest = self.inputs.torques.get(name)
             measured = latest is not None and latest.torque_nm is not None and latest.t_mid_ns >= since_ns
             due = t_ns - since_ns < source.warm_up_s * 1e9 and name not in self.inputs.lost

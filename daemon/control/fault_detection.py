@@ -68,9 +68,9 @@ class RunningStep:
     others_requests: int
 
 
-def compared_for_s(sources: Iterable[TorqueSource], config: LoopConfig) -> float:
+def compared_for_s(sources: Iterable[TorqueSource]) -> float:
     """Return the history that comparing two sources takes: the oldest fresh torque with its acquisition."""
-    return max(one.fresh_s(config) + 2.0 * max(one.window_s, one.period_s) for one in sources)
+    return max(one.fresh_s + 2.0 * max(one.window_s, one.period_s) for one in sources)
 
 
 def detect_faults(
@@ -109,7 +109,7 @@ def _torque_limit_faults(
             continue
         if grasp is Grasp.CHANGING and source.warm_up_s:
             continue
-        if t_ns - torque.t_ns <= source.fresh_s(watched.config) * 1e9:
+        if t_ns - torque.t_ns <= source.fresh_s * 1e9:
             beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
             if source.noise_nm:
                 beyond += f" and its noise {source.noise_nm:g} N·m"
@@ -141,15 +141,15 @@ def _largest(inputs: LatestInputs, source: TorqueSource) -> TorqueSample | None:
 
 
 def _torque_faults(inputs: LatestInputs, watched: Watched, step: RunningStep, t_ns: int) -> list[Fault]:
-    source, config = watched.driving, watched.config
+    source = watched.driving
     # The age of a robot's torque is checked with its state.
     judged = (*(one for one in watched.supervising if not one.from_robot), source)
-    faults = [_unusable(inputs, one, config, t_ns) for one in judged]
+    faults = [_unusable(inputs, one, t_ns) for one in judged]
     found = [fault for fault in faults if fault is not None]
     latest = inputs.torques.get(source.name)
     if faults[-1] is not None or latest is None or latest.torque_nm is None:
         return found
-    if step.expected_nm is not None and abs(latest.torque_nm - step.expected_nm) > config.max_innovation_nm:
+    if step.expected_nm is not None and abs(latest.torque_nm - step.expected_nm) > watched.config.max_innovation_nm:
         jumped = f"{source.name} measured {latest.torque_nm:+.3f} N·m where {step.expected_nm:+.3f} N·m was expected"
         found.append(Fault(FaultCode.ESTIMATE_JUMPED, jumped, t_ns=latest.t_mid_ns))
     for other in watched.supervising:
@@ -157,7 +157,7 @@ def _torque_faults(inputs: LatestInputs, watched: Watched, step: RunningStep, t_
     return found
 
 
-def _unusable(inputs: LatestInputs, source: TorqueSource, config: LoopConfig, t_ns: int) -> Fault | None:
+def _unusable(inputs: LatestInputs, source: TorqueSource, t_ns: int) -> Fault | None:
     """Return the fault of a source that is gone, silent, late or invalid."""
     latest = inputs.torques.get(source.name)
     if source.name in inputs.lost:
@@ -167,23 +167,25 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, config: LoopConfig, t_
         return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
     what = "torque" if source.measures_torque else "frame"
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
-    allowed_s, oldest_s = source.fresh_s(config), source.oldest_s(config)
-    late = (
-        f"the last {what} of {source.name} was measured {measured_s:.1f} s ago, {oldest_s:.1f} s are allowed; "
-        f"it took {measured_s - came_s:.1f} s to come"
-    )
     transport_s = measured_s - came_s - source.acquired_s
-    if measured_s > oldest_s and transport_s > came_s:
-        return Fault(FaultCode.ESTIMATE_LATE, late, t_ns=latest.t_mid_ns)
-    if came_s > allowed_s:
-        silent = f"the last {what} of {source.name} came {came_s:.1f} s ago, {allowed_s:.1f} s are allowed"
+    if measured_s > source.oldest_s and transport_s > came_s:
+        return Fault(FaultCode.ESTIMATE_LATE, _late(source, what, came_s, measured_s), t_ns=latest.t_mid_ns)
+    if came_s > source.fresh_s:
+        silent = f"the last {what} of {source.name} came {came_s:.1f} s ago, {source.fresh_s:.1f} s are allowed"
         return Fault(FaultCode.ESTIMATE_STALE, silent, t_ns=latest.t_ns)
-    if measured_s > oldest_s:
-        return Fault(FaultCode.ESTIMATE_STALE, late, t_ns=latest.t_mid_ns)
+    if measured_s > source.oldest_s:
+        return Fault(FaultCode.ESTIMATE_STALE, _late(source, what, came_s, measured_s), t_ns=latest.t_mid_ns)
     if latest.torque_nm is None and source.measures_torque:
         said = f"{source.name} says: {latest.reason}" if latest.reason else f"{source.name} gives no torque"
         return Fault(FaultCode.ESTIMATE_INVALID, said, t_ns=latest.t_mid_ns)
     return None
+
+
+def _late(source: TorqueSource, what: str, came_s: float, measured_s: float) -> str:
+    return (
+        f"the last {what} of {source.name} was measured {measured_s:.1f} s ago, {source.oldest_s:.1f} s are allowed; "
+        f"it took {measured_s - came_s:.1f} s to come"
+    )
 
 
 def _disagreement(inputs: LatestInputs, other: TorqueSource, watched: Watched, t_ns: int) -> list[Fault]:
@@ -192,7 +194,7 @@ def _disagreement(inputs: LatestInputs, other: TorqueSource, watched: Watched, t
     if slow.period_s < fast.period_s:
         slow, fast = fast, slow
     latest = inputs.torques.get(slow.name)
-    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > slow.fresh_s(config) * 1e9:
+    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > slow.fresh_s * 1e9:
         return []
     other_nm = _torque_at(inputs, fast, latest.t_mid_ns, 0.5 * max(slow.window_s, fast.period_s))
     if other_nm is None:

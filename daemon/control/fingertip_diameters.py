@@ -1,17 +1,18 @@
 """Diameter of the tool from the fingertips. No I/O; times are passed in."""
 
-from shearloop.daemon.messaging.messages import stale_after_s
-from shearloop.estimation import Estimate, Measured, combine
+from collections.abc import Mapping
 
-STALE_AFTER_NS = round(stale_after_s("eit.estimate") * 1e9)
+from shearloop.daemon.torques import TorqueSource
+from shearloop.estimation import Estimate, Measured, combine
 
 
 class FingertipDiameters:
     """The latest diameter of each fingertip, and of all together."""
 
-    def __init__(self, combined: str) -> None:
-        """Take the name of the source that already combines the fingertips."""
+    def __init__(self, combined: str, sources: Mapping[str, TorqueSource]) -> None:
+        """`combined` is the source that already combines the fingertips; a diameter is fresh as long as a torque."""
         self._combined = combined
+        self._sources = sources
         self._latest: dict[str, tuple[int, Measured]] = {}
 
     def update(self, source: str, estimate: Estimate, t_ns: int) -> None:
@@ -24,5 +25,9 @@ class FingertipDiameters:
 
     def latest(self, t_ns: int) -> Measured | None:
         """Return the fingertips' diameter at t_ns, None where none of them has a recent one."""
-        fresh = {name: one for name, (then_ns, one) in self._latest.items() if t_ns - then_ns <= STALE_AFTER_NS}
+        fresh = {
+            name: diameter
+            for name, (then_ns, diameter) in self._latest.items()
+            if t_ns - then_ns <= self._sources[name].fresh_s * 1e9
+        }
         return fresh.get(self._combined) or combine(*fresh.values())

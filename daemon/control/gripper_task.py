@@ -45,7 +45,8 @@ TRIED_FOR_S, TRIED_AGAIN_S = 5.0, 0.1
 class GripperTask:
     """Connects the gripper to publisher and control loop; `diameters` are the fingertips'.
 
-    A gripper `measures_diameters` if its widths were calibrated with its fingertips on.
+    A gripper `measures_diameters` if its widths were calibrated with its fingertips on. `patience` is the factor on the
+    deadlines, above 1 on an emulated rig alone.
     """
 
     gripper: RobotiqGripper
@@ -55,6 +56,7 @@ class GripperTask:
     # The time of commands.
     clock: Clock
     measures_diameters: bool = True
+    patience: float = 1.0
     _motion: FingerMotion = field(default_factory=FingerMotion)
 
     async def run(self) -> None:
@@ -157,7 +159,9 @@ class GripperTask:
     def held_tool(self, t_ns: int) -> Measured | None:
         """Return the diameter in mm of the held tool at t_ns, or None."""
         state = self.gripper.latest
-        if state is None or not self.measures_diameters or t_ns - state.t_ns > GRIPPER_STALE_S * 1e9:
+        if state is None or not self.measures_diameters:
+            return None
+        if t_ns - state.t_ns > self.patience * GRIPPER_STALE_S * 1e9:
             return None
         return self._diameter(state)
 

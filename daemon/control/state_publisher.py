@@ -128,7 +128,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     status, experiment, wrist = control_loop.status, control_loop.experiment, control_loop.wrist
     driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
-    if latest is not None and now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s(control_loop.config):
+    if latest is not None and now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s:
         latest = None
     return LoopState(
         source="loop",

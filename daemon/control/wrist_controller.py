@@ -204,6 +204,6 @@ def controller_settings(
         wrist_limit=WristLimit.of(config),
         travel_limit_rad=TRAVEL_LIMIT_RAD,
         # As the fault `estimate stale`, so that the wrist does not rest before its reason is reported.
-        age_limit_s=source.oldest_s(config),
-        fresh_s=source.fresh_s(config),
+        age_limit_s=source.oldest_s,
+        fresh_s=source.fresh_s,
     )

@@ -59,7 +59,7 @@ def test_only_an_emulated_rig_has_longer_deadlines(tmp_path):
         config = load_daemon_config(tmp_path / "rig.yaml")
         settings = open_settings(config)
         loop = make_loop(config, settings, {"right": EIT}, {})
-        found[emulated] = settings.command_timeout_s, settings.state_timeout_s, EIT.fresh_s(loop.config)
+        found[emulated] = settings.command_timeout_s, settings.state_timeout_s, loop.wrist.source.fresh_s
         # The watchdog is the last resort, after the deadlines have stopped the wrist.
         assert settings.standstill_s < 1 / settings.watchdog_hz
     assert found == {False: (0.1, 0.25, pytest.approx(2.5 * 0.5412)), True: (1.0, 5.0, 5.0)}

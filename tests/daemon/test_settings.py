@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import TrackTorque
 from shearloop.daemon.control.experiment_schema import IdentifyStep
 from shearloop.daemon.control.wrist_controller import WristController, controller_settings
@@ -122,9 +123,11 @@ def test_equal_defaults_of_one_name_come_from_one_constant():
 @pytest.mark.parametrize("stale_after_s", [0.1, 4.0])
 def test_the_controller_uses_every_torque_that_is_no_fault(stale_after_s):
     """A torque that it refuses and no fault reports would let the wrist rest without a reason."""
-    config, source = LoopConfig(stale_after_s=stale_after_s), TorqueSource(name="right", period_s=0.5, window_s=0.6)
+    config, right = LoopConfig(stale_after_s=stale_after_s), TorqueSource(name="right", period_s=0.5, window_s=0.6)
+    source = ControlLoop(config, {"right": right}, ("robot",)).wrist.source
     tuned = controller_settings(config, FOUND, source, TrackTorque(0.1, 0.05), 0.5)
-    assert (tuned.fresh_s, tuned.age_limit_s) == (source.fresh_s(config), source.fresh_s(config) + 0.3)
+    fresh_s = max(1.25, stale_after_s)
+    assert (tuned.fresh_s, tuned.age_limit_s) == (fresh_s, fresh_s + 0.3)
 
 
 @pytest.mark.usefixtures("ur_rtde")

@@ -162,8 +162,8 @@ def test_a_frame_that_is_missed_and_a_mean_of_several_are_borne(source):
 
 
 def test_a_torque_that_counts_as_new_is_held_against_its_limit():
-    """Beyond 2.5 of its short periods, and younger than `stale_after_s`."""
-    quick = replace(LOAD, period_s=0.005)
+    """Beyond 2.5 of its short periods, and younger than `min_fresh_s`."""
+    quick = replace(LOAD, period_s=0.005, min_fresh_s=0.1)
     beyond = torque(quick, 0.9, came_s=0.05)
     assert found(beyond, driving=quick, supervising=()).keys() == {FaultCode.TORQUE_LIMIT}
 
@@ -189,7 +189,7 @@ def test_means_that_lie_before_a_single_frame_are_the_latest_and_judged_and_do_n
 def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_hz):
     """Else a disagreement would come and go with every frame, and a hold would never become a stop."""
     quick = replace(LOAD, period_s=1.0 / rate_hz)
-    kept_s = compared_for_s((EIT, quick), LoopConfig())
+    kept_s = compared_for_s((EIT, quick))
     senses = LatestInputs(kept_s, arm=ArmStatus(0.0, NOW_NS))
     frame = torque(EIT, 0.1, came_s=2.4 * EIT.period_s)
     senses.add_torque(frame)

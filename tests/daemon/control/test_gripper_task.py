@@ -35,10 +35,13 @@ class Felt(list[GripperStatus]):
         self.tool = SimpleNamespace(was_gripped=False)
 
 
-def task_of(rig: Rig, felt: Felt | None = None, *, measures_diameters: bool = True) -> GripperTask:
+def task_of(
+    rig: Rig, felt: Felt | None = None, *, measures_diameters: bool = True, patience: float = 1.0
+) -> GripperTask:
     silent = SimpleNamespace(publish=lambda _: None)
-    diameters = FingertipDiameters("combined")
-    return GripperTask(rig.driver, silent, Felt() if felt is None else felt, diameters, Clock(), measures_diameters)
+    diameters = FingertipDiameters("combined", {})
+    felt = Felt() if felt is None else felt
+    return GripperTask(rig.driver, silent, felt, diameters, Clock(), measures_diameters, patience)
 
 
 async def holding(rig: Rig) -> tuple[GripperTask, float]:
@@ -326,7 +329,9 @@ async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path):
         tool = task.held_tool(state.t_ns)
         assert tool.half_width == pytest.approx(TWO_SIDED_95 * state.width_std_mm)
         assert abs(tool.value - 40.0) < tool.half_width
-        assert task.held_tool(state.t_ns + round(GRIPPER_STALE_S * 1e9) + 1) is None
+        stale_ns = state.t_ns + round(GRIPPER_STALE_S * 1e9) + 1
+        assert task.held_tool(stale_ns) is None
+        assert task_of(rig, patience=10.0).held_tool(stale_ns) is not None, "as long as the loop takes the state"
         assert task_of(rig, measures_diameters=False).held_tool(state.t_ns) is None, "the maker's widths are no gauge"
         await task.release()
         assert task.held_tool((await rig.driver.read()).t_ns) is None

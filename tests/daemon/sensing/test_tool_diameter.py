@@ -1,7 +1,13 @@
 import pytest
 
-from shearloop.daemon.control.fingertip_diameters import STALE_AFTER_NS, FingertipDiameters
+from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
+from shearloop.daemon.torques import TorqueSource
 from shearloop.estimation import Estimate
+
+SOURCES = {
+    name: TorqueSource(name=name, period_s=0.5, min_fresh_s=min_fresh_s)
+    for name, min_fresh_s in (("right", 0.0), ("left", 5.0), ("combined", 0.0))
+}
 
 
 def estimate(diameter_mm: float, half_width_mm: float) -> Estimate:
@@ -14,7 +20,7 @@ def estimate(diameter_mm: float, half_width_mm: float) -> Estimate:
 
 
 def test_the_diameter_of_two_fingertips_is_their_weighted_mean_or_the_combined_one():
-    diameters = FingertipDiameters("combined")
+    diameters = FingertipDiameters("combined", SOURCES)
     assert diameters.latest(0) is None
     diameters.update("right", estimate(20.0, 2.0), 0)
     diameters.update("left", estimate(22.0, 4.0), 0)
@@ -33,9 +39,12 @@ def test_the_diameter_of_two_fingertips_is_their_weighted_mean_or_the_combined_o
 
 
 def test_what_is_old_or_taken_back_is_no_diameter():
-    diameters = FingertipDiameters("combined")
+    diameters = FingertipDiameters("combined", SOURCES)
     diameters.update("right", estimate(20.0, 2.0), 0)
-    assert diameters.latest(STALE_AFTER_NS) is not None
-    assert diameters.latest(STALE_AFTER_NS + 1) is None
+    diameters.update("left", estimate(22.0, 4.0), 0)
+    assert diameters.latest(1_250_000_000).value < 22.0, "2.5 periods"
+    assert diameters.latest(1_250_000_001).value == 22.0
+    assert diameters.latest(5_000_000_000).value == 22.0, "as long as its torque"
+    assert diameters.latest(5_000_000_001) is None
     diameters.update("right", Estimate(valid=False), 1)
-    assert diameters.latest(1) is None
+    assert diameters.latest(1).value == 22.0

@@ -51,7 +51,7 @@ class Gripper:
 
     def __init__(self, estimates: FingertipTask, tool: Measured, held: range) -> None:
         self._estimates, self._tool, self._held = estimates, tool, held
-        self.diameters = FingertipDiameters("combined")
+        self.diameters = FingertipDiameters("combined", {})
 
     def moved_between(self, _from_ns: int, _to_ns: int) -> bool:
         return self._estimates.count in self.moves

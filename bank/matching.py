@@ -47,8 +47,8 @@ class Match:
 class Matcher(ABC):
     """Scores differences against all valid cells of a bank; keeps no state between calls."""
 
-    # The basis model of the bank that it was made from.
-    model = ""
+    # The basis model, the identity and the geometry of the bank that it was made from.
+    model = identity = geometry_hash = ""
 
     def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Take (K, S, n) difference signals, (K, S) validity, and the (K,) and (S,) grids.
@@ -70,7 +70,7 @@ class Matcher(ABC):
     def from_bank(cls, bank: Bank) -> Self:
         """Return the matcher of an opened bank."""
         made = cls(bank.signals, bank.valid, bank.k_grid, bank.sigma_grid)
-        made.model = bank.model
+        made.model, made.identity, made.geometry_hash = bank.model, bank.identity, bank.geometry_hash
         return made
 
     def heatmap(self, difference: ArrayLike) -> FloatArray:

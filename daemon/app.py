@@ -27,7 +27,7 @@ from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sd_notify import notify
 from shearloop.daemon.sensing.sessions import COMBINED
-from shearloop.daemon.sensors import build_sensors, open_sessions
+from shearloop.daemon.sensors import Sessions, build_sensors, open_sessions
 from shearloop.daemon.supervisor import MAX_ERROR_LENGTH, HealthReporter, Reporter, Supervisor, Task, TaskFacts
 from shearloop.daemon.torques import LatestTorques
 from shearloop.printable import printable
@@ -82,7 +82,8 @@ class Daemon:
             robot = _take_robot(config, opened)
             self.publisher = opened.enter_context(contextlib.closing(Publisher(context, config.publish, clock, keys)))
             self.publisher.add_listener(self._summary)
-            self.recorder = _recorder_of(config, clock)
+            sessions = open_sessions(config)
+            self.recorder = _recorder_of(config, sessions, clock)
             if self.recorder is not None:
                 self.publisher.add_listener(self.recorder.record_message)
                 opened.callback(self.recorder.close)
@@ -91,9 +92,8 @@ class Daemon:
             self._experiment: ConfiguredExperiment | None = None
             torques = LatestTorques()
             if robot is not None:
-                self._build_rig(config, *robot, clock)
+                self._build_rig(config, *robot, sessions, clock)
             else:
-                sessions = open_sessions(config)
                 self.sensors = build_sensors(config, self.publisher, clock, self.recorder, sessions, torques)
             tare_refusal = torques.tare_refusal if self.rig is None else self.rig.tare_refusal
             self.health.refusals["tare"] = tare_refusal
@@ -123,14 +123,16 @@ class Daemon:
             if isinstance(part, Reporter):
                 self.health.reporters[name] = part
 
-    def _build_rig(self, config: DaemonConfig, settings: "UrSettings", files: "RobotFiles", clock: Clock) -> None:
+    def _build_rig(
+        self, config: DaemonConfig, settings: "UrSettings", files: "RobotFiles", sessions: Sessions, clock: Clock
+    ) -> None:
         """Build robot, gripper and control loop, and the sensors that drive it."""
         # Only a rig with a robot loads their modules.
         from shearloop.daemon.configured_experiment import ConfiguredExperiment
         from shearloop.daemon.rig import build_rig
 
         self.sensors, self.rig = build_rig(
-            config, settings, files, open_sessions(config), self.publisher, clock, self.recorder, self.supervisor
+            config, settings, files, sessions, self.publisher, clock, self.recorder, self.supervisor
         )
         if self.rig.commissioning is not None:
             self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
@@ -215,13 +217,13 @@ class Daemon:
         return self._experiment is None or self._experiment.finished
 
 
-def _recorder_of(config: DaemonConfig, clock: Clock) -> "Recorder | None":
+def _recorder_of(config: DaemonConfig, sessions: Sessions, clock: Clock) -> "Recorder | None":
     """Return the recorder of a configuration that records."""
     if config.recording is None:
         return None
     from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 
-    return Recorder(config.recording.folder, daemon_identity(config), clock)
+    return Recorder(config.recording.folder, daemon_identity(config, sessions.fingertips), clock)
 
 
 def _server_keys(config: DaemonConfig) -> "KeyPair | None":

@@ -50,20 +50,17 @@ def open_sessions(config: DaemonConfig) -> Sessions:
     refuse_emulated_calibrations(config)
     fingertips = {name: open_session(fingertip, name) for name, fingertip in config.fingertips.items()}
     combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
-    log_banks(config)
+    log_banks(config, fingertips)
     log_assumptions(fingertips if combined is None else {**fingertips, COMBINED: combined})
     return Sessions(fingertips, combined)
 
 
-def log_banks(config: DaemonConfig) -> None:
+def log_banks(config: DaemonConfig, fingertips: Mapping[str, Session]) -> None:
     """Log the geometry of each fingertip's bank: no frame shows whether it is the fingertip's own."""
-    for name, fingertip in config.fingertips.items():
-        if fingertip.bank is not None:
-            from shearloop.bank.bank_file import Bank
-
-            bank = Bank.open(fingertip.bank)
-            found = {"geometry": bank.geometry_hash[:12], "channels": bank.table.description}
-            structlog.get_logger().info(f"the bank of {name}", file=str(bank.path), **found)
+    for name, session in fingertips.items():
+        if session.search is not None:
+            found = {"geometry": session.search.geometry_hash[:12], "channels": session.calibration.table.description}
+            structlog.get_logger().info(f"the bank of {name}", file=str(config.fingertips[name].bank), **found)
 
 
 def log_assumptions(sessions: Mapping[str, Session]) -> None:

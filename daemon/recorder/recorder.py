@@ -24,7 +24,6 @@ from typing import Any, Self
 import numpy as np
 from pydantic_core import PydanticSerializationError
 
-from shearloop.bank.bank_file import Bank
 from shearloop.daemon.clock import Clock, ClockReading
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging.messages import LoopState, Scalar
@@ -33,6 +32,7 @@ from shearloop.daemon.recorder.writer import PARTIAL, McapFile
 from shearloop.daemon.sensing.sessions import channel_table
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.errors import UserError
+from shearloop.estimation import Session
 from shearloop.files import read_file
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.
@@ -81,18 +81,19 @@ class Identity:
     attached: tuple[AttachedFile, ...] = ()
 
 
-def daemon_identity(config: DaemonConfig) -> Identity:
+def daemon_identity(config: DaemonConfig, fingertips: Mapping[str, Session]) -> Identity:
     """Return the identity of a daemon's recordings: software, configuration, and the files that it names.
 
-    Raises BankError for a bank that cannot be opened, and UserError for a path that is not UTF-8.
+    `fingertips` are the sessions of the configured ones. Raises UserError where they are of different kinds, and for a
+    path that is not UTF-8.
     """
-    metadata = schema.basic_identity(f"a daemon on {platform.node()}", channel_table(config))
+    metadata = schema.basic_identity(f"a daemon on {platform.node()}", channel_table(fingertips))
     metadata["python"] = f"{platform.python_version()}, numpy {np.__version__}, {platform.machine()}"
     if config.emulated:
         metadata[schema.EMULATED] = "every device"
-    for name, fingertip in config.fingertips.items():
-        if fingertip.bank is not None:
-            metadata[f"bank_{name}"] = Bank.open(fingertip.bank).identity
+    for name, session in fingertips.items():
+        if session.search is not None:
+            metadata[f"bank_{name}"] = session.search.identity
     try:
         as_json = config.model_dump_json(indent=1).encode()
     except PydanticSerializationError as error:

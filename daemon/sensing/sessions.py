@@ -32,25 +32,13 @@ _in_use: "WeakValueDictionary[tuple[str, str], BankSearch]" = WeakValueDictionar
 _WARM_UP_FACTOR = 2.0
 
 
-def channel_table(config: DaemonConfig) -> ChannelTable:
-    """Return the channels of the fingertips, by their banks and calibrations.
-
-    Raises UserError where these differ, and BankError as `open_session` does.
-    """
-    tables = {name: fingertip_table(fingertip) for name, fingertip in config.fingertips.items()}
+def channel_table(fingertips: Mapping[str, Session]) -> ChannelTable:
+    """Return the channels of the fingertips with these sessions; raises UserError where they differ."""
+    tables = {name: session.calibration.table for name, session in fingertips.items()}
     if len({*tables.values()}) > 1:
         kinds = ", ".join(f"{name} has {each.n_channels} channels" for name, each in tables.items())
         raise UserError(f"the fingertips are of different kinds ({kinds}); run a daemon for each kind")
     return next(iter(tables.values()), PAPER_TABLE)
-
-
-def fingertip_table(config: FingertipConfig) -> ChannelTable:
-    """Return a fingertip's channels, by its bank or its calibration, else the paper's."""
-    if config.bank is not None:
-        return _open_bank(config.bank).table
-    if config.calibration is not None and os.path.exists(config.calibration):
-        return Calibration.load(config.calibration).table
-    return PAPER_TABLE
 
 
 def open_session(config: FingertipConfig, name: str) -> Session:
@@ -86,8 +74,7 @@ def open_session(config: FingertipConfig, name: str) -> Session:
     if config.calibration is not None:
         # The file is missing, and the error says how to make it.
         return _open(config.calibration, Calibration.load(config.calibration), config)
-    bank = _open_bank(config.bank)
-    return _session(Calibration.uncalibrated(bank.identity, bank.table), config)
+    return _session(None, config)
 
 
 def refuse_emulated_calibrations(config: DaemonConfig) -> None:
@@ -160,9 +147,16 @@ def _open(path: Path, calibration: Calibration, config: FingertipConfig) -> Sess
         raise CalibrationError(f"{path}: {error}") from error
 
 
-def _session(calibration: Calibration, config: FingertipConfig) -> Session:
-    """Return a session; raises CalibrationError for a bank that is missing or another one."""
+def _session(calibration: Calibration | None, config: FingertipConfig) -> Session:
+    """Return a session; without a calibration it has no torque, and needs a bank.
+
+    Raises CalibrationError for a bank that is missing or another one.
+    """
     bank = _open_bank(config.bank) if config.bank is not None else None
+    if calibration is None:
+        if bank is None:
+            raise ValueError("a session without a calibration needs a bank")
+        calibration = Calibration.uncalibrated(bank.identity, bank.table)
     if bank is not None and calibration.sides:
         check_bank_table(bank, calibration.table, "the calibration has")
     search = _shared_search(bank, config.matching) if bank is not None else None

@@ -11,7 +11,6 @@ import numpy as np
 
 from shearloop.daemon.commissioning import Line
 from shearloop.daemon.config import DaemonConfig, SkinConfig
-from shearloop.daemon.sensing.sessions import fingertip_table
 from shearloop.daemon.sensing.skin_task import tool_radius_m
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
@@ -41,6 +40,7 @@ from shearloop.tools.commission.tap import (
     skin_step_s,
     why_hidden,
 )
+from shearloop.tools.fingertip_table import fingertip_table
 
 STAGE: Final = "6 boards"
 # The converter's step is 0.8 mV; the paper's boards have some steps of noise.

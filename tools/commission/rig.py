@@ -8,7 +8,6 @@ from typing import Protocol
 from shearloop.daemon.config import DaemonConfig, LoadCellConfig, SkinConfig
 from shearloop.daemon.patience import patience_of
 from shearloop.daemon.rig import gripper_calibration, make_gripper_client
-from shearloop.daemon.sensing.sessions import fingertip_table
 from shearloop.daemon.sensing.skin_task import skin_device
 from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.drivers.connection import SerialLink
@@ -30,6 +29,7 @@ from shearloop.tools.commission.listening import BoardListener
 from shearloop.tools.commission.mover import Mover, MoverProcess
 from shearloop.tools.commission.observer import Observer
 from shearloop.tools.commission.observer_process import ObserverProcess
+from shearloop.tools.fingertip_table import fingertip_table
 
 
 class Rig(Protocol):

@@ -12,7 +12,6 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.bank.errors import BankError
 from shearloop.daemon.config import AdcConfig, FingertipConfig, LoadCellConfig, SerialDevice
-from shearloop.daemon.sensing.sessions import fingertip_table
 from shearloop.daemon.sensors import load_cell_calibration
 from shearloop.drivers.connection import SerialPort, find_port
 from shearloop.drivers.eit_kit import START, Frame, FrameParser
@@ -22,6 +21,7 @@ from shearloop.drivers.refused_lines import shown
 from shearloop.drivers.serial_sensor import InputKind, Parser, RawEvent
 from shearloop.drivers.shear_skin.instruments import PairParser
 from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
+from shearloop.tools.fingertip_table import fingertip_table
 from shearloop.tools.serial_ports import access_error
 from shearloop.words import counted
 

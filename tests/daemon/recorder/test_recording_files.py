@@ -378,7 +378,7 @@ def test_a_folder_name_that_is_not_utf8_is_an_error(config):
     with pytest.raises(
         UserError, match=r"not UTF-8 \(the folder of the recordings is 'caf\\udce9'\); choose another name"
     ):
-        daemon_identity(load_daemon_config(config()).model_copy(update={"recording": recorded}))
+        daemon_identity(load_daemon_config(config()).model_copy(update={"recording": recorded}), {})
 
 
 PERIOD_S = 0.5408
@@ -558,7 +558,7 @@ def test_unusable_files_are_refused_by_name(mat_folder, tmp_path):
 
 @pytest.mark.parametrize("emulated", [False, True])
 def test_a_recording_of_an_emulated_rig_says_so(emulated, config, tmp_path, ran):
-    identity = daemon_identity(load_daemon_config(config()).model_copy(update={"emulated": emulated}))
+    identity = daemon_identity(load_daemon_config(config()).model_copy(update={"emulated": emulated}), {})
     notes = {key: value for key, value in identity.metadata.items() if key == EMULATED}
     path = tmp_path / "moved" / "twist.mcap"
     path.parent.mkdir()

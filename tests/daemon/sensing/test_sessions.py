@@ -13,6 +13,7 @@ from shearloop.bank.bank_file import Bank, BankDefinition, write_bank
 from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import BankError
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
+from shearloop.daemon.recorder.recorder import daemon_identity
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
 from shearloop.daemon.sensing.sessions import open_combined, open_session, refuse_emulated_calibrations
 from shearloop.daemon.sensors import log_assumptions, open_sessions
@@ -71,6 +72,20 @@ def test_the_geometry_of_a_bank_is_logged_at_the_start(tiny_bank):
     (entry,) = [log for log in logs if log["event"] == "the bank of right"]
     assert entry["geometry"] == Bank.open(tiny_bank).geometry_hash[:12]
     assert entry["channels"].startswith("896 channels of 32 electrodes")
+
+
+def test_a_start_opens_the_bank_of_a_fingertip_once(tiny_bank, monkeypatch):
+    config = DaemonConfig.model_validate({"fingertips": {"right": {"device": {"path": "eit"}, "bank": tiny_bank}}})
+    opened, opens = [], Bank.open
+
+    def counted(path: Path, *args: bool) -> Bank:
+        opened.append(path)
+        return opens(path, *args)
+
+    monkeypatch.setattr(Bank, "open", counted)
+    identity = daemon_identity(config, open_sessions(config).fingertips)
+    assert opened == [tiny_bank]
+    assert identity.metadata["bank_right"] == opens(tiny_bank).identity
 
 
 def frame(

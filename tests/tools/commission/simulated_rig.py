@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from shearloop.daemon.config import DaemonConfig, SkinConfig
-from shearloop.daemon.sensing.sessions import fingertip_table
 from shearloop.daemon.sensing.skin_task import gauge_ohm
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.eit_kit import Frame, FrameParser
@@ -50,6 +49,7 @@ from shearloop.tools.commission.mover import WATCHDOG_WORKER, Mover
 from shearloop.tools.commission.mover_process import CAUSES, WORKERS, Driver
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
+from shearloop.tools.fingertip_table import fingertip_table
 from tests.drivers.ur import robots
 from tests.drivers.ur.scripted_arm import ScriptedArm
 

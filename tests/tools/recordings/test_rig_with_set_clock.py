@@ -22,6 +22,7 @@ from shearloop.daemon.clock import Clock, ClockReading
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
+from shearloop.daemon.sensors import open_sessions
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.emulators.boards import format_line
 from shearloop.emulators.synthetic_frames import RigFrames
@@ -95,7 +96,7 @@ class RigRun:
     def record(self, folder: Path, set_s: float) -> Path:
         """Return the file of a daemon whose wall clock was set by so much."""
         clock = SetClock(set_s)
-        recorder = Recorder(folder, daemon_identity(self.config), clock)
+        recorder = Recorder(folder, daemon_identity(self.config, open_sessions(self.config).fingertips), clock)
         recorder.record_experiment("twist", tool_mm=TOOL_MM)
         measured_ns = 0
         for number, (t_ns, record) in enumerate(self.recorded):

@@ -81,7 +81,7 @@ class _DeviceReplacer:
 
     def rehearsal(self) -> Rehearsal:
         """Replace all devices."""
-        from shearloop.daemon.config import RehearsedConfig
+        from shearloop.cli.rehearsed_config import RehearsedConfig
 
         config = self._config
         robot = self._robot(config.robot) if config.robot is not None else None

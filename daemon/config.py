@@ -4,7 +4,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import (
     AfterValidator,
@@ -442,22 +442,6 @@ class DaemonConfig(ConfigModel):
         """The configuration keys and addresses that are open to the network."""
         both = {"publish": self.publish, "commands": self.commands}
         return {key: address for key, address in both.items() if not addresses.is_local(address)}
-
-
-class RehearsedConfig(DaemonConfig):
-    """A configuration in which all devices of a real configuration are replaced by emulated ones."""
-
-    _real: DaemonConfig = PrivateAttr()
-
-    def __init__(self, real: DaemonConfig, content: Mapping[str, Any]) -> None:
-        """`real` has the real devices; `content` is the configuration of the emulated ones."""
-        super().__init__(**content)
-        self._real = real
-
-    @property
-    def real(self) -> DaemonConfig:
-        """The configuration of the real devices."""
-        return self._real
 
 
 def _is_hardware(port: Path) -> bool:

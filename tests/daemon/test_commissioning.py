@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from shearloop.cli import main
+from shearloop.cli.rehearsed_config import RehearsedConfig
 from shearloop.daemon.commissioning import (
     CAPPED_M_PER_S,
     CAPPED_NM,
@@ -21,7 +22,7 @@ from shearloop.daemon.commissioning import (
     commissioning_of,
     measured_widths,
 )
-from shearloop.daemon.config import RehearsedConfig, load_daemon_config
+from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.rig import make_loop
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s

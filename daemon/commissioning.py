@@ -306,10 +306,10 @@ def load_report(path: Path) -> Report:
     return load_model(path, Report, UserError, "report of a commissioning", "; make it with `shearloop commission`")
 
 
-def measures_diameters(config: DaemonConfig, robot: Commissioning | None) -> bool:
-    """Return whether the gripper measures a tool's diameter: by its calibration, or by the report's table of widths."""
-    if config.gripper is None:
-        return False
+def knows_tool(stated_mm: float | None, config: DaemonConfig, robot: Commissioning | None) -> bool:
+    """Return whether the tool's diameter is stated, or measured by the gripper's calibration or the report's table."""
+    if stated_mm is not None or config.gripper is None:
+        return stated_mm is not None
     return config.gripper.calibration is not None or (robot is not None and robot.supplied.widths is not None)
 
 

@@ -19,7 +19,7 @@ from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import UNKNOWN_FRAMES, LearnedFrames
 from shearloop.estimation.ridge import CensoredRidge
 from shearloop.estimation.torque_profile import TorqueProfile
-from shearloop.estimation.values import INLINE, LARGEST_TOOL_FRACTION, Measured
+from shearloop.estimation.values import INLINE, Measured, is_another_tool
 
 if TYPE_CHECKING:
     from shearloop.bank.bank_file import Bank
@@ -73,7 +73,7 @@ class Calibration:
         """
         law, own_mm = self.tools, self.tool_mm
         if law is None or self.torque is None:
-            if tool is None or not abs(tool.value - own_mm) > LARGEST_TOOL_FRACTION * own_mm + tool.half_width:
+            if tool is None or not is_another_tool(own_mm, tool):
                 return self
             raise CalibrationError(
                 f"the tool has {tool.value:.3g} mm, and the calibration was made with a tool of {own_mm:g} mm; its "
@@ -92,7 +92,7 @@ class Calibration:
         regressor = self.torque.regressor.scaled(gain, law.spread)
         return replace(self, torque=replace(self.torque, regressor=regressor), tools=None, tool_mm=tool.value)
 
-    def tool_note(self, source: str, *, tool_known: bool) -> str:
+    def tool_note(self, source: str, *, tool_known: bool, cure: str = "state `tool_mm` in the experiment") -> str:
         """Return what the torque of a source rests on that nothing checks about the held tool; empty for nothing.
 
         A calibration of several tools has no torque without a diameter.
@@ -100,11 +100,13 @@ class Calibration:
         if self.torque is None or self.tools is not None:
             return ""
         if math.isnan(self.tool_mm):
-            cure = "calibrate on one tool, and name its diameter"
-            return f"the calibration of {source} names no single tool, so nothing checks that it holds for this: {cure}"
+            again = "calibrate on one tool, and name its diameter"
+            return (
+                f"the calibration of {source} names no single tool, so nothing checks that it holds for this: {again}"
+            )
         if not tool_known:
             only = f"the torque of {source} holds for a tool of {self.tool_mm:g} mm alone"
-            return f"the tool's diameter is not known, and {only}: state `tool_mm` in the experiment"
+            return f"the tool's diameter is not known, and {only}: {cure}"
         return ""
 
     def gain_regressor(self) -> IntervalRegressor:

@@ -14,8 +14,8 @@ from shearloop.estimation.confidence import TWO_SIDED_95
 INLINE = {"inline": True}
 # Load cells on a lever bear some N·m; larger readings come from a damaged line.
 LARGEST_TORQUE_NM = 20.0
-# Tools differ if their diameters differ by a larger fraction.
-LARGEST_TOOL_FRACTION = 0.15
+# A measured tool is another one if its diameter differs by a larger fraction of the known diameter.
+_LARGEST_TOOL_FRACTION = 0.15
 # Recorded loads change by up to 0.76 N·m/s, so older readings say nothing.
 _MAX_TORQUE_AGE_S = 1.0
 
@@ -85,9 +85,9 @@ class HeldTool:
         )
 
 
-def is_another_tool(diameter_mm: float, tool: Measured) -> bool:
-    """Return whether a diameter cannot be the tool's."""
-    return abs(diameter_mm - tool.value) > LARGEST_TOOL_FRACTION * tool.value + tool.half_width
+def is_another_tool(known_mm: float, measured: Measured) -> bool:
+    """Return whether a tool of a known diameter cannot be the measured one; False for an unknown one (NaN)."""
+    return abs(measured.value - known_mm) > _LARGEST_TOOL_FRACTION * known_mm + measured.half_width
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,16 +112,6 @@ class BeforeFrame:
     tool: HeldTool | None = None
     fingers_moved: bool = False
     known_torques: KnownTorques | None = None
-
-    def with_later(self, later: "BeforeFrame") -> "BeforeFrame":
-        """Return both together: what this one and a later one say of the same frame."""
-        return BeforeFrame(
-            begins_tare=self.begins_tare or later.begins_tare,
-            gives_up_tare=self.gives_up_tare or later.gives_up_tare,
-            tool=later.tool or self.tool,
-            fingers_moved=self.fingers_moved or later.fingers_moved,
-            known_torques=later.known_torques or self.known_torques,
-        )
 
 
 class GripState(Enum):

@@ -86,10 +86,11 @@ def evaluate_recordings(
 
 def unknown_tools(calibration: Calibration, named: Sequence[tuple[str, FrameSeries]]) -> list[str]:
     """Return a sentence for each named recording whose tool is not known, if the calibration holds for one alone."""
-    if calibration.torque is None or calibration.tools is not None or math.isnan(calibration.tool_mm):
+    if math.isnan(calibration.tool_mm):
         return []
-    only = f"the calibration holds for a tool of {calibration.tool_mm:g} mm alone: name it with --tool-mm"
-    return [f"{name}: the tool's diameter is not known, and {only}" for name, part in named if part.tool_mm is None]
+    source, cure = " and ".join(calibration.sides), "name it with --tool-mm"
+    note = calibration.tool_note(source, tool_known=False, cure=cure)
+    return [f"{name}: {note}" for name, part in named if note and part.tool_mm is None]
 
 
 def known_data(learned: LearnedFrames, tracks: Sequence[EstimateTrack], paths: Sequence[Path]) -> list[str]:

@@ -140,7 +140,7 @@ def tool_of(recording: Recording, t_ns: IntArray, given_mm: float | None = None)
     conflict = ""
     if len(held) > 1:
         conflict = f"the gripper held tools of {' and '.join(f'{tool.value:.1f}' for tool in held)} mm"
-    elif held and is_another_tool(held[0].value, Measured(named_mm, held[0].half_width)):
+    elif held and is_another_tool(named_mm, held[0]):
         conflict = f"it names a tool of {named_mm:g} mm, and the gripper held one of {held[0].value:.1f} mm"
     if conflict and given_mm is None:
         raise UserError(
@@ -175,7 +175,7 @@ def _held_mm(recording: Recording, t_ns: IntArray) -> list[Measured]:
     if not held:
         return []
     usual = sorted(held, key=lambda tool: tool.value)[len(held) // 2]
-    others = [tool for tool in held if is_another_tool(tool.value, usual)]
+    others = [tool for tool in held if is_another_tool(usual.value, tool)]
     return [usual] if len(others) <= _MOMENTARY * len(held) else [usual, others[len(others) // 2]]
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.daemon.commissioning import Commissioning, MotionCap, measures_diameters
+from shearloop.daemon.commissioning import Commissioning, MotionCap, knows_tool
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
@@ -220,21 +220,21 @@ def experiment_mistakes(
             for number, step in enumerate(file.steps)
             if isinstance(step, GripperStep)
         ]
-    wrong = _wrong_tools(file, sources, measured=measures_diameters(config, robot))
+    wrong = _wrong_tools(file, sources, known=knows_tool(file.tool_mm, config, robot))
     place = "torque_source" if file.tool_mm is None else "tool_mm"
     mistakes += [((place,), why) for why in wrong]
     return mistakes + _unadaptable(file, sources)
 
 
-def _wrong_tools(file: ExperimentFile, sources: Mapping[str, TorqueSource], *, measured: bool) -> Iterator[str]:
-    """Yield why the calibration of a source has no torque on the experiment's tool; `measured`: by the gripper.
+def _wrong_tools(file: ExperimentFile, sources: Mapping[str, TorqueSource], *, known: bool) -> Iterator[str]:
+    """Yield why the calibration of a source has no torque on the experiment's tool; `known`: its diameter will be.
 
     One that only supervises holds the wrist as well, as soon as it turns.
     """
     turns = any(isinstance(step, TwistingStep | TurnToStep) for step in file.steps)
     tool = None if file.tool_mm is None else Measured(file.tool_mm, 0.0)
     for name, source in sources.items():
-        if source.calibration is None or not source.measures_torque or (tool is None and measured):
+        if source.calibration is None or not source.measures_torque or (tool is None and known):
             continue
         try:
             source.calibration.for_tool(tool)
@@ -255,8 +255,7 @@ def tool_note(
     driving = sources.get(file.torque_source)
     if driving is None or driving.calibration is None:
         return ""
-    known = file.tool_mm is not None or measures_diameters(config, robot)
-    return driving.calibration.tool_note(driving.name, tool_known=known)
+    return driving.calibration.tool_note(driving.name, tool_known=knows_tool(file.tool_mm, config, robot))
 
 
 def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[Mistake]:

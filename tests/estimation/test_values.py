@@ -1,3 +1,4 @@
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -6,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import FrameSeries, Measured, TactileFrame, combine
+from shearloop.estimation import FrameSeries, HeldTool, Measured, TactileFrame, combine
 from shearloop.estimation.series import distinct
 
 measurements = st.builds(Measured, st.floats(-1e3, 1e3, allow_nan=False), st.floats(1e-3, 1e3, allow_nan=False))
@@ -46,6 +47,17 @@ def test_the_interval_of_fused_measurements_holds_the_truth_as_often_as_it_says(
     drawn = rng.normal(0.0, halves / 1.96, (4000, 2))
     found = [combine(*(Measured(x, h) for x, h in zip(row, halves.tolist(), strict=True))) for row in drawn.tolist()]
     assert 0.94 < np.mean([one is not None and abs(one.value) <= one.half_width for one in found]) < 0.99
+
+
+@pytest.mark.parametrize(("measured_mm", "is_another"), [(23.05, False), (23.4, True), (16.95, False), (16.6, True)])
+def test_a_calibration_and_an_experiment_name_the_same_measured_tool_another_one(
+    motion_calibration, measured_mm, is_another
+):
+    measured, calibration = Measured(measured_mm, 0.1), replace(motion_calibration, tool_mm=20.0)
+    refused = pytest.raises(CalibrationError, match="made with a tool of 20 mm") if is_another else nullcontext()
+    with refused:
+        assert calibration.for_tool(measured) is calibration
+    assert bool(HeldTool(measured, 20.0).conflict) is is_another
 
 
 def test_combining_no_finite_measurement_gives_none():

@@ -82,6 +82,17 @@ class ReplayEvents(NamedTuple):
     sample_numbers: dict[int, int]
 
 
+def together(earlier: BeforeFrame, later: BeforeFrame) -> BeforeFrame:
+    """Return what two inputs say of the same frame."""
+    return BeforeFrame(
+        begins_tare=earlier.begins_tare or later.begins_tare,
+        gives_up_tare=earlier.gives_up_tare or later.gives_up_tare,
+        tool=later.tool or earlier.tool,
+        fingers_moved=earlier.fingers_moved or later.fingers_moved,
+        known_torques=later.known_torques or earlier.known_torques,
+    )
+
+
 class RecordedBefore:
     """What a recording says of one source's frames, by their numbers: what comes before each."""
 
@@ -93,7 +104,7 @@ class RecordedBefore:
         """Take the next input."""
         if before.tool is not None:
             self._tools.append((number, before.tool))
-        self._before[number] = self._before.get(number, BeforeFrame()).with_later(replace(before, tool=None))
+        self._before[number] = together(self._before.get(number, BeforeFrame()), replace(before, tool=None))
 
     def of(self, number: int, last: int) -> BeforeFrame:
         """Return what comes before a frame and after the `last` one.
@@ -214,6 +225,8 @@ class ReplayComparison:
     compared: Counter[str] = field(default_factory=Counter)
     different: Counter[str] = field(default_factory=Counter)
     examples: list[str] = field(default_factory=list)
+    # Lines of fingertips and load cell that the replay dropped, because they may have waited before an opening.
+    dropped_at_opening: int = 0
     # Sources that continue from a state which has not come yet: their messages are sent as they were recorded, and
     # counted here by topic and source.
     awaited: set[str] = field(default_factory=set)
@@ -330,6 +343,8 @@ class Replay:
             if number % 100 == 0:
                 # Let signals and sockets run.
                 await asyncio.sleep(0)
+        parsers = [*self._frame_parsers.values(), *filter(None, [self._load_parser])]
+        self.comparison.dropped_at_opening = sum(parser.dropped_at_opening for parser in parsers)
 
     async def _process(self, event: RecordedEvent) -> None:
         if event.topic == schema.CLOCK_TOPIC:

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from shearloop.daemon.sensing.session_inputs import SESSION_KINDS, before_frame, session_inputs
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.estimation import BeforeFrame, HeldTool, KnownTorques, Measured
+from shearloop.tools.recordings.replay import together
 
 WHOLE = BeforeFrame(
     begins_tare=True,
@@ -44,7 +45,7 @@ def test_all_inputs_of_a_frame_together_say_what_was_recorded():
     for event in session_inputs(7, WHOLE, 99):
         number, part = before_frame(event)
         assert number == 7
-        read = read.with_later(part)
+        read = together(read, part)
     assert plain(read) == plain(WHOLE)
 
 

@@ -5,18 +5,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from shearloop.cli.options import path_of
-from shearloop.tools.outputs import check_apart
+from shearloop.tools.outputs import check_apart, check_link
 
 
 class OutputPath:
-    """Takes the path of a file or folder to write; `check` refuses one that another argument names too."""
+    """Takes the path of a file or folder to write; `check` refuses a link to nothing, and one that is an input."""
 
     def __call__(self, text: str) -> Path:
         """Return the path."""
         return path_of(text)
 
     def check(self, own: argparse.Action, every: Sequence[argparse.Action], found: argparse.Namespace) -> None:
-        """Raise UserError where the path of `own` is that of another of the arguments, as they were found."""
+        """Raise UserError where the path of `own` is a link to nothing, or that of another argument as it was found."""
         others = [
             (f"{_name_of(action)} {path}", path)
             for action in every
@@ -24,6 +24,7 @@ class OutputPath:
             for path in _paths(getattr(found, action.dest, None))
         ]
         for out in _paths(getattr(found, own.dest)):
+            check_link(_name_of(own), out)
             check_apart(_name_of(own), out, others)
 
 

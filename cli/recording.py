@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -201,7 +202,7 @@ def _destination(recording: Path, out: Path | None, form: str) -> Path:
     if out.is_dir():
         return out / f"{stem}.{form}"
     # A pipe has no ending.
-    return out if out.suffix or out.exists() else out.with_name(f"{out.name}.{form}")
+    return out if out.suffix or os.path.lexists(out) else out.with_name(f"{out.name}.{form}")
 
 
 def _export(args: argparse.Namespace) -> int:

@@ -54,6 +54,22 @@ def test_a_file_that_cannot_be_written_is_named_as_the_person_named_it(tmp_path,
     assert refused.value.filename == "missing/table.csv"
 
 
+def test_a_link_is_kept_and_its_target_written(tmp_path):
+    folder = tmp_path / "targets"
+    folder.mkdir()
+    for name in ("a.yaml", "a.mcap"):
+        (folder / name).touch()
+        (tmp_path / name).symlink_to(folder / name)
+    with replace_file(tmp_path / "a.yaml") as file:
+        file.write(b"new")
+    with new_recording(tmp_path / "a.mcap", "a bench") as recording:
+        recording.add_torque(10**18, 0.1)
+    assert [(tmp_path / name).readlink() for name in ("a.yaml", "a.mcap")] == [folder / "a.yaml", folder / "a.mcap"]
+    assert (folder / "a.yaml").read_bytes() == b"new"
+    assert (folder / "a.mcap").stat().st_size
+    assert {path.name for path in (*tmp_path.iterdir(), *folder.iterdir())} == {"a.yaml", "a.mcap", "targets"}
+
+
 def test_a_file_has_one_writer(tmp_path):
     table = tmp_path / "table.csv"
     with replace_file(table) as first:

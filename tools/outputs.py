@@ -2,6 +2,7 @@
 
 import codecs
 import contextlib
+import errno
 import io
 import os
 import re
@@ -44,6 +45,21 @@ def check_apart(option: str, out: Path, others: Iterable[tuple[str, Path]]) -> N
             )
 
 
+def check_link(option: str, out: Path) -> None:
+    """Raise UserError if `out`, which `option` names, is a link to nothing.
+
+    A link is written through to its target. Without a target, the file would appear where nobody looks for it.
+    """
+    try:
+        out.stat()
+    except OSError as error:
+        if error.errno in (errno.ENOENT, errno.ELOOP) and out.is_symlink():
+            raise UserError(
+                f"{out} is a link to {out.readlink()}, which leads to no file: nothing was changed; remove the link, "
+                f"or choose another {option}"
+            ) from None
+
+
 def is_same_file(one: Path, other: Path) -> bool:
     """Return whether both paths lead to one file or folder, over links too, or would once it is written."""
     try:
@@ -57,8 +73,9 @@ def check_overwrite(out: Path, kind: str, begins: bytes | re.Pattern[bytes] | No
     """Raise UserError if `out` is a file of another kind: one that does not begin with `begins`, or is no text.
 
     A missing word in `calibrate --out recordings/*.mcap` would otherwise overwrite a recording. Errors of reading are
-    left to the code that writes the file.
+    left to the code that writes the file. A link to nothing is refused too.
     """
+    check_link("--out", out)
     if not out.is_file():
         return
     try:

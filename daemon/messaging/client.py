@@ -55,7 +55,7 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         on_quiet: Callable[[], None] | None = None,
     ) -> None:
         """Connect; an address on another computer needs keys."""
-        self._topics = [topics] if isinstance(topics, str) else list(topics)
+        self._topics = _names(topics)
         prefixes = [prefix_of(topic) for topic in self._topics]
         # A connection takes a moment: without any time no message comes.
         if timeout_s is not None and _milliseconds(timeout_s) == 0:
@@ -152,6 +152,18 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         return name.decode(errors="replace"), content
 
 
+def _names(topics: str | Iterable[str]) -> list[str]:
+    """Return one topic or several as a list; raises UserError for what is neither a text nor a list."""
+    if isinstance(topics, str):
+        return [topics]
+    if isinstance(topics, bytes) or not isinstance(topics, Iterable):
+        raise UserError(
+            f"topics is {topics!r}; give the name of a topic, such as {next(iter(TOPICS))!r}, or a list of names, or "
+            "leave it out to receive all"
+        )
+    return list(topics)
+
+
 def prefix_of(topic: str) -> bytes:
     """Return what a topic, or the topics of a first part, begin with; raises UserError if there is none.
 
@@ -206,14 +218,14 @@ class _Probe(AbstractContextManager["_Probe", None]):
 def _milliseconds(timeout_s: float | None) -> int | None:
     if timeout_s is None:
         return None
-    if not 0 <= timeout_s <= LONGEST_TIMEOUT_S:
+    if not isinstance(timeout_s, int | float) or not 0 <= timeout_s <= LONGEST_TIMEOUT_S:
         raise _no_such_time(timeout_s)
     return math.ceil(1000 * timeout_s)
 
 
 def _no_such_time(timeout_s: float) -> UserError:
     allowed = f"seconds above 0 and up to {LONGEST_TIMEOUT_S:g}, or None to wait without end"
-    return UserError(f"timeout_s is {timeout_s:g}; give {allowed}")
+    return UserError(f"timeout_s is {timeout_s!r}; give {allowed}")
 
 
 def receive_messages(
@@ -302,6 +314,8 @@ def _end_sentence(stop: Mapping[str, Any]) -> str:
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
     """Connect a socket; raises UserError for a malformed address and for a network address without keys."""
+    if not isinstance(address, str):
+        raise UserError(f"{address!r} is no address; it looks like {PUBLISH_ADDRESS}")
     if not has_valid_port(address):
         raise UserError(
             f"{address} has no valid port (a whole number up to {LARGEST_PORT}); give one such as tcp://127.0.0.1:7761"

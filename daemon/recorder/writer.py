@@ -224,17 +224,18 @@ def new_recording(
 ) -> Iterator[McapFile]:
     """Yield the file of a recording of data from `source`.
 
-    After an error it keeps the name NAME.partial, or is removed unless `keep_unfinished`. Raises UserError where it
-    cannot be written, and where another program is writing it.
+    After an error it keeps the name NAME.partial, or is removed unless `keep_unfinished`. The target of a link is
+    written. Raises UserError where it cannot be written, and where another program is writing it.
     """
-    partial = Path(f"{path}{PARTIAL}")
+    target = path.resolve()
+    partial = Path(f"{target}{PARTIAL}")
     try:
         with sole_writer(partial), nullcontext() if keep_unfinished else _removed_on_failure(partial):
             file, name = McapFile(io.FileIO(partial, "wb")), None
             try:
                 file.identify({**schema.basic_identity(source, table), **(notes or {})})
                 yield file
-                name = path
+                name = target
             finally:
                 file.close(name)
     except OSError as error:

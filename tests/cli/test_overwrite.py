@@ -194,6 +194,51 @@ def test_no_command_writes_over_what_it_reads(slip, way, tmp_path, monkeypatch, 
     assert source.read_text() == TABLE
 
 
+def outputs() -> Iterator[Slip]:
+    """Yield every option of every command that names what is written, once."""
+    yield from {(one.words, one.writes.dest): one for one in slips()}.values()
+
+
+@pytest.mark.parametrize("way", ["missing", "itself"])
+@pytest.mark.parametrize("slip", list(outputs()), ids=lambda one: "-".join([*one.words, one.writes.dest]))
+def test_no_command_writes_through_a_link_to_nothing(slip, way, tmp_path, mistake):
+    source, link = tmp_path / "source", tmp_path / "link"
+    source.write_text(TABLE)
+    link.symlink_to("missing" if way == "missing" else "link")
+    said = mistake(*slip.typed(link, source))
+    target = "missing" if way == "missing" else "link"
+    assert f"{link} is a link to {target}, which leads to no file: nothing was changed; remove the link" in said
+    assert {path.name for path in tmp_path.iterdir()} == {"source", "link"}
+
+
+@pytest.mark.parametrize("form", ["csv", "mat", "rrd", "lerobot"])
+def test_a_file_of_an_export_is_no_link_to_nothing_nor_to_the_recording(form, imported, tmp_path, mistake):
+    out, content = tmp_path / "out", imported.read_bytes()
+    links = {"csv": out / "units.csv", "mat": tmp_path / "out.mat", "rrd": tmp_path / "out.rrd"}
+    link = links.get(form, out / "meta" / "info.json")
+    link.parent.mkdir(parents=True, exist_ok=True)
+    for target, why in ((tmp_path / "missing", "leads to no file"), (imported, "it was not changed|are the same file")):
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
+        assert re.search(why, mistake("recording", "export", imported, "--format", form, "--out", out))
+        assert imported.read_bytes() == content
+        assert link.readlink() == target
+        assert not (tmp_path / "missing").exists()
+
+
+def test_an_export_to_a_link_writes_its_target_and_the_parts_beside_that(imported, tmp_path, ran, monkeypatch):
+    monkeypatch.setattr("shearloop.tools.recordings.export._MAT_SIZE", 1000)
+    target, link = tmp_path / "targets" / "a.mat", tmp_path / "link"
+    target.parent.mkdir()
+    target.touch()
+    link.symlink_to(target)
+    ran("recording", "export", imported, "--format", "mat", "--out", link)
+    assert link.readlink() == target
+    assert target.stat().st_size
+    assert (target.parent / "a_2.mat").exists()
+    assert not [*tmp_path.glob("link*_*"), *tmp_path.glob("link.*")]
+
+
 def test_the_default_figure_is_no_calibration_and_no_other_picture(tmp_path, mistake):
     calibration, recording = tmp_path / "right.png", tmp_path / "twist.mcap"
     for path in (calibration, recording):

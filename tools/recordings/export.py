@@ -14,7 +14,7 @@ from scipy.io import savemat
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
-from shearloop.tools.outputs import LentFile, check_apart, lent_file, new_folder
+from shearloop.tools.outputs import LentFile, check_apart, check_link, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.message_content import column_units, columns
 from shearloop.tools.recordings.reader import read_messages
@@ -47,8 +47,11 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
 
 
 def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) -> list[Path]:
+    # Further parts stand beside the target of a link.
+    first = out.resolve() if out.is_symlink() else out
+
     def part(number: int) -> Path:
-        return out.with_name(f"{out.stem}_{number}{out.suffix}") if number > 1 else out
+        return first.with_name(f"{first.stem}_{number}{first.suffix}") if number > 1 else out
 
     def check_new(target: Path) -> None:
         if target.exists():
@@ -107,7 +110,9 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
     if form == "parquet":
         require("pyarrow", "export", "Parquet")
     paths = {topic: out / f"{topic}.{form}" for topic in topics}
-    for target in paths.values():
+    units = {_UNITS: out / f"{_UNITS}.csv"} if form == "csv" else {}
+    for target in (paths | units).values():
+        check_link("--out", target)
         check_apart("--out", target, [(f"the recording {path}", path)])
     tables: dict[str, _CsvTable | _ParquetTable] = {}
     with new_folder(out), ExitStack() as files:
@@ -126,9 +131,8 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
         if form == "csv":
             rows = [(topic, *unit) for topic in tables for unit in column_units(topic).items()]
             lines = [",".join(map(_csv_cell, row)) for row in (("topic", "column", "unit"), *rows)]
-            paths[_UNITS] = out / f"{_UNITS}.csv"
-            files.enter_context(replace_file(paths[_UNITS])).write("".join(f"{line}\r\n" for line in lines).encode())
-    return list(paths.values())
+            files.enter_context(replace_file(units[_UNITS])).write("".join(f"{line}\r\n" for line in lines).encode())
+    return list((paths | units).values())
 
 
 class _CsvTable:

@@ -26,7 +26,7 @@ from shearloop.daemon.messaging.messages import (
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
-from shearloop.tools.outputs import LentFile, lent_file, new_folder
+from shearloop.tools.outputs import LentFile, check_apart, check_link, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.message_content import ContentError, check_length, column_units
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
@@ -151,7 +151,7 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
     units = {message.feature: message.units for message in held.values()}
     about = {"recording": path.name, "identity": recording.identity, "configuration": configuration, "units": units}
     with ExitStack() as files:
-        dataset = Dataset(out, held, files)
+        dataset = Dataset(path, out, held, files)
         dataset.write_rows(path, progress)
         return dataset.finish(experiment, about, attachments)
 
@@ -177,11 +177,11 @@ def _check_length(path: Path, first_ns: int, known_ns: int) -> None:
 class Dataset:
     """The files of a dataset of one episode."""
 
-    def __init__(self, out: Path, held: Mapping[str, _Held], replaced: ExitStack) -> None:
-        """Take the folder, and what replaces its files at the end."""
+    def __init__(self, recording: Path, out: Path, held: Mapping[str, _Held], replaced: ExitStack) -> None:
+        """Take the recording, which no file replaces, the folder, and what replaces its files at the end."""
         import pyarrow as pa
 
-        self._out = out
+        self._recording, self._out = recording, out
         self._files: list[Path] = []
         self._replaced = replaced
         self._held = held
@@ -312,6 +312,8 @@ class Dataset:
     def _new(self, name: str) -> BinaryIO:
         """Return a new file of the dataset, which stands in its place at the end."""
         path = self._out / name
+        check_link("--out", path)
+        check_apart("--out", path, [(f"the recording {self._recording}", self._recording)])
         self._replaced.enter_context(new_folder(path.parent))
         self._files.append(path)
         return self._replaced.enter_context(replace_file(path))

@@ -13,6 +13,7 @@ from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL, new_writer
 from shearloop.errors import UserError
 from shearloop.files import replace_file
+from shearloop.tools.outputs import check_link
 from shearloop.tools.recordings.intact_records import NOTHING_INTACT, IntactRecords, Progress
 
 
@@ -38,6 +39,7 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
     if out is None:
         name = source.name.removesuffix(PARTIAL)
         out = source.with_name(name if name != source.name else f"{source.stem}.repaired.mcap")
+    check_link("--out", out)
     if out.exists():
         raise UserError(f"{out} exists already; move it away, or name another file with --out")
     records = IntactRecords(source, progress)

@@ -196,6 +196,10 @@ def test_no_topic_begins_with_another():
         ("load.torque.x", "there is no topic 'load.torque.x'; did you mean load.torque?"),
         ([""], "there is no topic ''"),
         ([7], "7 is no topic; give the name of one, such as 'eit.frame'"),
+        ([b"eit"], "b'eit' is no topic; give the name of one, such as 'eit.frame'"),
+        (None, "topics is None; give the name of a topic, such as 'eit.frame', or a list of names, or leave it out"),
+        (b"eit", "topics is b'eit'; give the name of a topic, such as 'eit.frame', or a list of names, or leave it"),
+        (7, "topics is 7; give the name of a topic, such as 'eit.frame', or a list of names, or leave it out"),
     ],
 )
 def test_a_topic_that_does_not_exist_is_refused_at_once(topics, said, tmp_path):
@@ -204,7 +208,14 @@ def test_a_topic_that_does_not_exist_is_refused_at_once(topics, said, tmp_path):
     assert str(refused.value).startswith(said)
 
 
-@pytest.mark.parametrize("timeout_s", [float("nan"), float("inf"), -1.0, 0.0])
+@pytest.mark.parametrize("address", [None, 7761, b"tcp://127.0.0.1:7761"])
+def test_an_address_that_is_no_text_is_refused(address):
+    with pytest.raises(UserError) as refused:
+        Subscriber(address)
+    assert str(refused.value) == f"{address!r} is no address; it looks like tcp://127.0.0.1:7761"
+
+
+@pytest.mark.parametrize("timeout_s", [float("nan"), float("inf"), -1.0, 0.0, "5"])
 def test_a_time_that_nobody_can_wait_is_refused(timeout_s, tmp_path):
     with pytest.raises(UserError, match=r"timeout_s is .*; give seconds above 0 .*or None to wait without end"):
         Subscriber(f"ipc://{tmp_path}/publish", timeout_s=timeout_s)

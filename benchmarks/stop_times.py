@@ -40,6 +40,7 @@ from benchmarks.common import (
     write_rig_config,
 )
 from shearloop.bank.bank_file import BankDefinition, write_bank
+from shearloop.daemon.messaging.bound_requests import meant_for
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, TOPICS, decode
 from shearloop.drivers.defaults import FRAME_PERIOD_S, LOAD_CELL_RATE_HZ
@@ -173,7 +174,10 @@ class RunningRig:
 
     def send(self, name: str, **arguments: Any) -> dict[str, Any]:
         """Send the daemon a command; return its reply."""
-        return send_command(f"ipc://{self._folder}/commands", {"command": name, **arguments}, DEADLINE_S)
+        address, bound = f"ipc://{self._folder}/commands", {}
+        if name != "stop":
+            bound = meant_for(send_command(address, {"command": "status"}, DEADLINE_S), 0.0, DEADLINE_S)
+        return send_command(address, {"command": name, **bound, **arguments}, DEADLINE_S)
 
     def wait_for(self, condition: Callable[[str, Mapping[str, Any]], bool]) -> Mapping[str, Any]:
         """Return the next new message that meets a condition on topic and content."""

@@ -19,7 +19,7 @@ from shearloop.daemon.messaging.command_server import (
     Reply,
     Request,
 )
-from shearloop.daemon.messaging.deadlines import NEVER_LATE, Deadline, boot_ns
+from shearloop.daemon.messaging.deadlines import MAY_BE_UNBOUND, NEVER_LATE, Deadline, boot_ns
 from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sensors import Sensors
@@ -115,6 +115,8 @@ class Commands:
             check_arguments(name, request)
             if name != STOP and request.get("instance", self.instance) != self.instance:
                 raise CommandRefusedError(_ANOTHER_DAEMON)
+            if name not in MAY_BE_UNBOUND and not request.get("ask"):
+                _refuse_if(_why_unbound(name, request))
             if name not in NEVER_LATE:
                 _refuse_if(self._deadline(request).why_passed())
             reply = await handler(request)
@@ -319,6 +321,20 @@ def check_arguments(name: str, request: Request) -> None:
             raise CommandRefusedError(f"`{name}` has no argument {printable(key)[:40]!r}{has}")
         if type(value) is not known[key] or value == "":
             raise CommandRefusedError(f"`{key}` is {printable(repr(value))[:40]}, and has to be {_KINDS[known[key]]}")
+
+
+def _why_unbound(name: str, request: Request) -> str | None:
+    """Return which arguments are missing that say of when a request is, and for which daemon; None if none is.
+
+    The clock of `until_ns` begins again with the computer, so the daemon's `instance` belongs to it.
+    """
+    missing = [f"`{key}`" for key in ("instance", "until_ns") if key not in request]
+    if not missing:
+        return None
+    return (
+        f"{' and '.join(missing)} {'are' if missing[1:] else 'is'} missing, and this {name} may be an old one that "
+        "waited on its way: take them from the reply to `status`, as docs/messages.md says"
+    )
 
 
 def required_rig(rig: "Rig | None") -> "Rig":

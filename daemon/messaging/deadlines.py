@@ -11,6 +11,8 @@ from typing import Final
 
 # They let nothing move: they are never too late.
 NEVER_LATE: Final = ("status", "stop", "pause")
+# Without its age and its daemon, any other command that acts is refused: something could move that nobody asks for now.
+MAY_BE_UNBOUND: Final = (*NEVER_LATE, "tare")
 
 
 def boot_ns() -> int:

@@ -28,6 +28,7 @@ from tests.emulator_process import own_address
 from tests.fixtures.daemons import (
     DEADLINE_S,
     ask,
+    bound_handlers,
     collector,
     deadline,
     emulated_kit,
@@ -302,7 +303,7 @@ async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, wait
         await log.says("waiting to start")
         ready.set()
         path = tmp_path / ("experiment.yaml" if own else "another.yaml")
-        await daemon.commands.handlers()["start"]({"experiment": str(path)})
+        await bound_handlers(daemon.commands)["start"]({"experiment": str(path)})
         if not own:
             await log.says(LEFT_TO_OPERATOR)
             daemon.stop()

@@ -25,7 +25,7 @@ from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.errors import UserError
-from tests.fixtures.daemons import deadline
+from tests.fixtures.daemons import bound_handlers, deadline
 
 SECRET = "host:5432:lab:ada:hunter2"  # noqa: S105 - the content that no reply may have
 VALID = {"name": "one", "steps": [{"do": "wait", "wait_s": 1}]}
@@ -319,7 +319,7 @@ async def test_a_start_whose_file_comes_too_late_begins_nothing(folder, slow_dri
     subject = rig(folder, runner)
     commands = Commands(subject, None, None, None, asyncio.Event(), None, now_ns=lambda: now_ns)
     request = {"experiment": str(path), "until_ns": 2_000_000_000}
-    starting = asyncio.create_task(commands.handlers()["start"](request))
+    starting = asyncio.create_task(bound_handlers(commands)["start"](request))
     await asyncio.to_thread(slow_drive.asked.wait)
     now_ns = 3_500_000_000
     slow_drive.answers.set()
@@ -329,7 +329,7 @@ async def test_a_start_whose_file_comes_too_late_begins_nothing(folder, slow_dri
     with pytest.raises(CommandRefusedError, match=said):
         await starting
     assert runner.started == []
-    assert (await commands.handlers()["start"]({**request, "until_ns": now_ns}))["run"] == 1
+    assert (await bound_handlers(commands)["start"]({**request, "until_ns": now_ns}))["run"] == 1
     assert runner.started == [("one", 0)]
 
 
@@ -387,14 +387,14 @@ def test_an_experiment_whose_plan_would_take_long_is_refused(steps, said, folder
 
 
 def answers_of(subject: Rig) -> Any:
-    return Commands(subject, None, None, None, asyncio.Event(), None).handlers()
+    return bound_handlers(Commands(subject, None, None, None, asyncio.Event(), None))
 
 
 async def test_what_a_person_confirmed_is_what_starts(folder):
     """The file is replaced between the question and its answer, by another or by what the question showed."""
     runner, path = Runner(), write(folder / "one.yaml", VALID)
     subject = rig(folder, runner)
-    start = Commands(subject, None, None, None, asyncio.Event(), None).handlers()["start"]
+    start = bound_handlers(Commands(subject, None, None, None, asyncio.Event(), None))["start"]
     asked = await start({"experiment": str(path), "ask": True})
     assert asked["question"].startswith("Start 'one'?")
     before = path.read_bytes()

@@ -12,6 +12,7 @@ import yaml
 
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.faults import FaultCode
+from shearloop.daemon.messaging.bound_requests import meant_for
 from shearloop.daemon.messaging.client import Subscriber, send_command
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand
@@ -55,7 +56,11 @@ async def twisting_process(config: Path, rig: asyncio.subprocess.Process) -> Asy
             async for topic, content in published:
                 # A change of the loop's state comes at once, and every second one comes.
                 if topic == "loop.state" and content["phase"] != "running":
-                    await asyncio.to_thread(send_command, addresses.commands, start, DEADLINE_S)
+                    status = await asyncio.to_thread(
+                        send_command, addresses.commands, {"command": "status"}, DEADLINE_S
+                    )
+                    bound = start | meant_for(status, 0.0, DEADLINE_S)
+                    await asyncio.to_thread(send_command, addresses.commands, bound, DEADLINE_S)
                 if topic == "load.torque" and content["valid"] and abs(content["torque_nm"]) > 0.01:
                     break
         assert (await truth(rig))["gripped"]

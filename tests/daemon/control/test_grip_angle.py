@@ -22,6 +22,7 @@ from shearloop.drivers.ur.client import UrRobot
 from tests.daemon.control.cell import TWIST, driven
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS
+from tests.fixtures.daemons import bound_handlers
 
 TWIST_AGAIN = {"do": "twist", "angles_rad": [0.25], "return_to_start": False, "speed_rad_per_s": 0.2, "hold_s": 0.1}
 TWISTED = {"limits": {"angle_rad": 0.3, "torque_nm": 0.5}, "torque_source": "load_cell"}
@@ -300,7 +301,7 @@ async def test_a_release_is_on_the_disk_before_it_is_answered():
         occasion=lambda: (),
     )
     commands = Commands(subject, None, None, None, asyncio.Event(), None)
-    assert await commands.handlers()["release"]({"confirmed": True}) == {}
+    assert await bound_handlers(commands)["release"]({"confirmed": True}) == {}
     assert not read_memories(FILES).grip.known
 
 

@@ -31,7 +31,7 @@ from shearloop.drivers.robotiq.models import MODELS
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
-from tests.fixtures.daemons import of_now
+from tests.fixtures.daemons import bound_handlers, of_now
 
 WAIT = {"do": "wait", "wait_s": 60}
 
@@ -134,7 +134,9 @@ def commands_of(cell: Cell) -> Any:
 
 def commands_with(rig: RigOfDaemon, sensors: dict[str, Any] | None = None) -> Any:
     health = SimpleNamespace(tasks=dict)
-    return Commands(rig, SimpleNamespace(tareable=sensors), None, health, asyncio.Event(), rig.tare_refusal).handlers()
+    return bound_handlers(
+        Commands(rig, SimpleNamespace(tareable=sensors), None, health, asyncio.Event(), rig.tare_refusal)
+    )
 
 
 @pytest.mark.parametrize("hand", [{"holding": True}, {"uncertain": True}, {"unfelt": True}, {"moving": True}])

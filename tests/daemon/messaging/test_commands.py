@@ -31,6 +31,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.errors import UserError
+from tests.fixtures.daemons import bound_handlers
 from tests.running import running
 
 
@@ -111,6 +112,27 @@ async def test_a_stop_is_for_every_daemon_and_another_request_may_be():
         with pytest.raises(CommandRefusedError, match="held"):
             await commands.handlers()["tare"](bound)
     assert (await commands.handlers()[STOP]({"instance": "another", "spare_daemon": True}))["stopped"] == ""
+
+
+@pytest.mark.parametrize("missing", ["instance", "until_ns", "instance and until_ns"])
+async def test_nothing_moves_for_a_request_that_does_not_say_of_when_it_is_and_for_which_daemon(missing):
+    health = SimpleNamespace(tasks=dict, rig="bench")
+    sensors = SimpleNamespace(tareable={})
+    commands = Commands(None, sensors, None, health, asyncio.Event(), lambda **_: "tare is asked for")
+    bound = meant_for(await commands.handlers()[STATUS]({}), 0.0, 2.0)
+    request = {key: value for key, value in bound.items() if key not in missing}
+    named = " and ".join(f"`{key}`" for key in missing.split(" and "))
+    found = {}
+    for name in {*DAEMON_COMMANDS} - {STATUS, STOP, EXPERIMENTS}:
+        with pytest.raises(CommandRefusedError) as refused:
+            await commands.handlers()[name](request)
+        found[name] = f"{named} " in str(refused.value) and "missing" in str(refused.value)
+    moves = {"start", "resume", "unlock", "release"}
+    assert {name for name, is_refused in found.items() if is_refused} == moves
+    for name in ("start", "release"):
+        with pytest.raises(CommandRefusedError) as refused:
+            await commands.handlers()[name]({**request, "ask": True})
+        assert "missing" not in str(refused.value), "a question moves nothing"
 
 
 @pytest.mark.parametrize("name", sorted({*DAEMON_COMMANDS} - {STATUS, STOP, EXPERIMENTS}))
@@ -258,15 +280,17 @@ async def test_a_command_that_crashes_or_is_cut_off_is_reported_as_not_carried_o
     rig = SimpleNamespace(
         runner=Runner(), control_loop=SimpleNamespace(operator=operator, pause=crash), occasion=tuple, memory=None
     )
-    handlers = Commands(
-        rig=rig,
-        sensors=None,
-        experiment=None,
-        health=None,
-        daemon_end=asyncio.Event(),
-        tare_refusal=None,
-        report=lambda answered: reported.append(answered.refusal),
-    ).handlers()
+    handlers = bound_handlers(
+        Commands(
+            rig=rig,
+            sensors=None,
+            experiment=None,
+            health=None,
+            daemon_end=asyncio.Event(),
+            tare_refusal=None,
+            report=lambda answered: reported.append(answered.refusal),
+        )
+    )
     with pytest.raises(ZeroDivisionError):
         await handlers["pause"]({})
     releasing = asyncio.create_task(handlers["release"]({"confirmed": True}))

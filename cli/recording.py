@@ -92,7 +92,8 @@ def _list(args: argparse.Namespace) -> int:
         # A recording without an index has neither of these; an empty cell would look like a shifted row.
         began = "–" if recording.first_unix_ns is None else _local_time(recording.first_unix_ns)
         lasts = "–" if recording.duration_s is None else f"{recording.duration_s:.0f} s"
-        remark = recording.unreadable or ("" if recording.closed else "not closed, or being written")
+        unclosed = "being written" if recording.being_written else "not closed, or being written"
+        remark = recording.unreadable or ("" if recording.closed else unclosed)
         ran = ", ".join(recording.experiments) or "–"
         rows.append((began, lasts, f"{recording.size_bytes / 1e6:.1f} MB", recording.path, ran, remark))
     print(*table(("from", "lasts", "size", "file", "experiment", "remark"), rows), sep="\n")
@@ -158,7 +159,10 @@ def _summary_text(found: "RecordingSummary") -> str:
         cure = f"`shearloop recording repair {shlex.quote(found.path)}` makes an indexed copy"
         cure = cure if found.topics else "It holds no intact message"
         torn = counted(found.torn_bytes, "byte is", "bytes are")
-        lines.append(f"  It was not closed, or is being written; {torn} incomplete. {cure}.")
+        if found.being_written:
+            lines.append("  It is being written, and its writer finishes it at the end of the run.")
+        else:
+            lines.append(f"  It was not closed, or is being written; {torn} incomplete. {cure}.")
     if found.damaged_chunks:
         lines.append(f"  {counted(found.damaged_chunks, 'chunk is', 'chunks are')} damaged and left out.")
     if found.damaged_attachments:
@@ -185,6 +189,8 @@ def _repair(args: argparse.Namespace) -> int:
     saved = counted(result.messages, "message is", "messages are")
     sentences = [f"{result.path}: {saved} saved; left out: {' and '.join(lost) or 'nothing'}."]
     sentences += [f"Lost: {_lost_text(result.lost)}."] if result.lost else []
+    if result.being_written:
+        sentences.append(f"{path} is being written: the copy ends with what was there now.")
     return print_result({**asdict(result), "path": str(result.path)}, sentences, as_json=args.json)
 
 

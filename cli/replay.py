@@ -52,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
     with nullcontext(load_daemon_config(args.config)) if args.config else run.configuration() as config:
         comparison = asyncio.run(_replay(run, config, args))
     same_code = run.metadata.get("code_sha256") == code_digest()
-    for line in _comparison_text(comparison, same_code):
+    made_by = "" if same_code else run.metadata.get("software", "of an unknown version")
+    for line in _comparison_text(comparison, made_by):
         print(line, file=sys.stderr)
     if args.json:
         counts = {"compared": comparison.compared, "different": comparison.different}
@@ -62,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
             "without_state": comparison.without_state,
             "unrecorded": comparison.unrecorded,
             "examples": comparison.examples,
+            "dropped_at_opening": comparison.dropped_at_opening,
             "same_code": same_code,
         }
         print_result(counts | others, (), as_json=True)
@@ -112,7 +114,8 @@ def _publisher(context: "zmq.asyncio.Context", args: argparse.Namespace, clock: 
         ) from error
 
 
-def _comparison_text(comparison: "ReplayComparison", same_code: bool) -> list[str]:
+def _comparison_text(comparison: "ReplayComparison", made_by: str) -> list[str]:
+    """Return what to print of a comparison; `made_by`: the version of the other code that made the recording."""
     lines = [
         f"Nothing of {source} was compared: the recording has no state of it." for source in comparison.without_state
     ]
@@ -131,6 +134,12 @@ def _comparison_text(comparison: "ReplayComparison", same_code: bool) -> list[st
             f"{computed} not in the recording: of its last inputs, which the daemon did not publish any more, or of "
             "topics that it did not record; --check does not count them."
         )
-    if comparison.different and not same_code:
-        lines.append("The recording was made by different code, so its results may differ.")
+    if comparison.different and made_by:
+        lines.append(f"The recording was made by other code (shearloop {made_by}), so its results may differ.")
+        if comparison.dropped_at_opening:
+            early = counted(comparison.dropped_at_opening, "line")
+            lines.append(
+                f"{early} may have waited in a port before it was opened: this code drops such lines, and earlier code "
+                "counted them."
+            )
     return lines

@@ -33,7 +33,7 @@ from shearloop.daemon.sensing.sessions import channel_table
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.errors import UserError
 from shearloop.estimation import Session
-from shearloop.files import read_file
+from shearloop.files import lock, read_file
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.
 FLUSH_S = 0.5
@@ -367,9 +367,13 @@ class Recorder:
             began = name if number == 1 else f"{name}-{number}"
             with suppress(FileExistsError):
                 if not any(self._folder.glob(f"{began}*")):
-                    file = McapFile(FileIO(self._folder / f"{began}.mcap{PARTIAL}", "xb"))
+                    path = self._folder / f"{began}.mcap{PARTIAL}"
+                    opened = FileIO(path, "xb")
+                    file = McapFile(opened)
                     break
         try:
+            # So that a repair knows that the file is being written.
+            lock(opened.fileno(), path)
             file.identify({**self._identity.metadata, schema.CLOCK_OFFSET: str(offset_ns)})
             for one in self._identity.attached:
                 file.attach(one.name, one.media_type, one.data, now_ns + offset_ns)

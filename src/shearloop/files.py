@@ -93,20 +93,25 @@ def sole_writer(path: Path) -> Iterator[None]:
     """
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OSError(errno.EBUSY, _OTHER_WRITER, str(path)) from None
-        except OSError as error:
-            # Some network shares have no locks.
-            if error.errno not in _NO_LOCKS:
-                raise
+        lock(handle, path)
         # The one who had the lock may have given the file its name.
         if not (path.exists() and os.path.samestat(os.fstat(handle), path.stat())):
             raise OSError(errno.EBUSY, _OTHER_WRITER, str(path))
         yield
     finally:
         os.close(handle)
+
+
+def lock(handle: int, path: Path) -> None:
+    """Lock an open file until it is closed, as one that is being written; raises OSError where another program did."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise OSError(errno.EBUSY, _OTHER_WRITER, str(path)) from None
+    except OSError as error:
+        # Some network shares have no locks.
+        if error.errno not in _NO_LOCKS:
+            raise
 
 
 @contextmanager

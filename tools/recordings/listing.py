@@ -9,6 +9,7 @@ from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL
 from shearloop.errors import UserError
 from shearloop.files import open_file
+from shearloop.tools.recordings.being_written import is_being_written
 from shearloop.tools.recordings.monotonic_times import has_one_offset
 from shearloop.tools.recordings.reader import reading
 from shearloop.tools.recordings.summary import summarise
@@ -26,6 +27,8 @@ class ListedRecording:
     experiments: tuple[str, ...] = ()
     # Why its index cannot be read; empty where it can, or was never written.
     unreadable: str = ""
+    # Whether a program writes it now, as far as its lock says.
+    being_written: bool = False
 
 
 def list_recordings(folder: Path) -> list[ListedRecording]:
@@ -43,7 +46,7 @@ def list_recordings(folder: Path) -> list[ListedRecording]:
 def _listed(path: Path) -> ListedRecording:
     size = path.stat().st_size
     if path.suffix == PARTIAL:
-        return ListedRecording(str(path), size, closed=False)
+        return ListedRecording(str(path), size, closed=False, being_written=is_being_written(path))
     try:
         with reading(path), open_file(path) as file:
             reader = make_reader(file)

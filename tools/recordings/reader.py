@@ -22,6 +22,7 @@ from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError
 from shearloop.files import open_file
+from shearloop.tools.recordings.being_written import is_being_written
 from shearloop.tools.recordings.intact_records import (
     LARGEST_RECORD_BYTES,
     NOTHING_INTACT,
@@ -128,6 +129,10 @@ def reading(path: Path) -> Iterator[None]:
             raise UserError(
                 f"{path}: the recording is whole, and its content cannot be used: {detail}; another program wrote or "
                 "changed it, so make it again there"
+            ) from error
+        if is_being_written(path):
+            raise UserError(
+                f"{path}: the recording is being written; end the run, and its writer finishes it"
             ) from error
         cure = (
             f"`shearloop recording repair {shlex.quote(str(path))}` saves the intact part" if intact else NOTHING_INTACT

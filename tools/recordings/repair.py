@@ -14,6 +14,7 @@ from shearloop.daemon.recorder.writer import PARTIAL, new_writer
 from shearloop.errors import UserError
 from shearloop.files import replace_file
 from shearloop.tools.outputs import check_link
+from shearloop.tools.recordings.being_written import is_being_written
 from shearloop.tools.recordings.intact_records import NOTHING_INTACT, IntactRecords, Progress
 
 
@@ -28,14 +29,22 @@ class RepairResult:
     damaged_attachments: int
     # Lost messages by topic, as far as the file shows them.
     lost: dict[str, int]
+    # Whether a program was writing the source: the copy has what was there then.
+    being_written: bool
 
 
 def repair(source: Path, out: Path | None = None, progress: Progress = lambda _: None) -> RepairResult:
     """Copy the intact records into a new file with an index; the source is not changed.
 
     The copy is `out`, or the source without `.partial`, or NAME.repaired.mcap. Raises UserError if the copy exists or
-    cannot be written, and if the source has no intact message.
+    cannot be written, if the source has no intact message, and for a source that is being written without `out`: its
+    writer gives it that name.
     """
+    being_written = is_being_written(source)
+    if out is None and being_written:
+        raise UserError(
+            f"{source} is being written, and its writer finishes it: end the run, or name a copy with --out"
+        )
     if out is None:
         name = source.name.removesuffix(PARTIAL)
         out = source.with_name(name if name != source.name else f"{source.stem}.repaired.mcap")
@@ -78,7 +87,13 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
     except OSError as error:
         raise UserError(f"{out}: the repaired recording cannot be written: {error.strerror}") from error
     return RepairResult(
-        out, messages, records.torn_bytes, records.damaged_chunks, records.damaged_attachments, records.lost
+        out,
+        messages,
+        records.torn_bytes,
+        records.damaged_chunks,
+        records.damaged_attachments,
+        records.lost,
+        being_written,
     )
 
 

@@ -343,8 +343,10 @@ class Replay:
             if number % 100 == 0:
                 # Let signals and sockets run.
                 await asyncio.sleep(0)
-        parsers = [*self._frame_parsers.values(), *filter(None, [self._load_parser])]
-        self.comparison.dropped_at_opening = sum(parser.dropped_at_opening for parser in parsers)
+        dropped = [parser.dropped_at_opening for parser in self._frame_parsers.values()]
+        if self._load_parser is not None:
+            dropped.append(self._load_parser.dropped_at_opening)
+        self.comparison.dropped_at_opening = sum(dropped)
 
     async def _process(self, event: RecordedEvent) -> None:
         if event.topic == schema.CLOCK_TOPIC:

@@ -9,6 +9,7 @@ from mcap.records import Attachment, Message, Metadata
 
 from shearloop.daemon.clock import ClockReading, ClockStep
 from shearloop.daemon.recorder import schema
+from shearloop.tools.recordings.being_written import is_being_written
 from shearloop.tools.recordings.intact_records import IntactRecords, Progress
 from shearloop.tools.recordings.message_content import ContentError, read_content
 from shearloop.tools.recordings.monotonic_times import MonotonicTimes
@@ -51,6 +52,8 @@ class FileCondition:
 class RecordingSummary(FileCondition):
     """The content of a recording in numbers, times in Unix ns; the keys of `recording info --json`."""
 
+    # Whether a program writes it now, as far as its lock says.
+    being_written: bool
     dropped: int | None
     first_unix_ns: int | None
     # When the file was begun, by its name; None for another name. Messages of before it waited for it.
@@ -109,6 +112,7 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         damaged_chunks=records.damaged_chunks,
         damaged_attachments=records.damaged_attachments,
         lost=records.lost,
+        being_written=is_being_written(path),
         dropped=dropped,
         first_unix_ns=first_unix_ns,
         named_unix_ns=named_unix_ns(path),

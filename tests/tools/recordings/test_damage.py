@@ -27,6 +27,8 @@ from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.tools.recordings.export import export
 from shearloop.tools.recordings.frames import read_recording
+from shearloop.tools.recordings.listing import list_recordings
+from shearloop.tools.recordings.reader import open_recording
 from shearloop.tools.recordings.repair import repair
 from shearloop.tools.recordings.replay import RecordedRun
 from shearloop.tools.recordings.summary import summarise
@@ -72,6 +74,29 @@ def info(path: Path) -> list[tuple[str, int]]:
     if found.closed and not found.damaged_chunks:
         return sorted((name, topic.messages) for name, topic in found.topics.items())
     return []
+
+
+def test_a_recording_that_is_being_written_says_so_and_an_abandoned_one_is_repaired(tmp_path, ran):
+    recorder = Recorder(tmp_path, Identity(basic_identity("a test")), Clock())
+    recorder.input_recorder("right").record(RawEvent(InputKind.OPENED, 5))
+    recorder.write()
+    (partial,) = tmp_path.glob("*.partial")
+    abandoned = tmp_path / "killed.mcap.partial"
+    abandoned.write_bytes(partial.read_bytes())
+    with pytest.raises(UserError, match="is being written, and its writer finishes it: end the run, or name a copy"):
+        repair(partial)
+    copied = repair(partial, tmp_path / "copy.mcap")
+    assert copied.being_written
+    assert "It is being written" in ran("recording", "info", partial).out
+    assert not repair(abandoned).being_written
+    assert "not closed, or is being written" in ran("recording", "info", abandoned).out
+    listed = {Path(one.path).name: one.being_written for one in list_recordings(tmp_path)}
+    assert listed[partial.name]
+    assert not listed[abandoned.name]
+    with pytest.raises(UserError, match="the recording is being written; end the run"), open_recording(partial):
+        pass
+    recorder.close()
+    assert recorder.failure == ""
 
 
 def repaired(path: Path) -> int:

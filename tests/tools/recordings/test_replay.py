@@ -24,15 +24,19 @@ from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.messaging.messages import EitEstimate, EitHeatmap, wire_map, with_packed_arrays
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
 from shearloop.daemon.recorder.schema import message_json, recorded_topic
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
-from shearloop.drivers.serial_sensor import InputKind
+from shearloop.daemon.sensors import open_sessions
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.emulators.boards import format_line
 from shearloop.estimation import Calibration, Measured, Session
 from shearloop.estimation.session import FINGERS_MOVED
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.message_content import read_content
 from shearloop.tools.recordings.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
-from tests.fixtures.daemons import ask, emulated_kit, played_at, running_daemon
+from tests.daemon.recorder.test_recorder import frame as one_frame
+from tests.fixtures.daemons import ask, emulated_kit, played_at, recording, running_daemon
 from tests.sample_messages import sample
 
 Messages = list[tuple[str, dict[str, Any]]]
@@ -302,6 +306,23 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(config, tmp_path, mo
     for one in after:
         assert [estimates[one["frame"]][key] for key in said] == [one[key] for key in said]
     assert estimates[zeroed]["reason"].startswith("taking the idle frame, 1 of")
+
+
+def test_lines_that_waited_at_an_opening_explain_what_earlier_code_counted(config, tmp_path, ran):
+    loaded = load_daemon_config(config(right=PLAYED))
+    identity = daemon_identity(loaded, open_sessions(loaded).fingertips)
+    earlier = replace(identity, metadata={**identity.metadata, "code_sha256": "earlier", "software": "0.2.0"})
+    recorder = Recorder(tmp_path / "recordings", earlier, Clock())
+    inputs, (_, lines) = recorder.input_recorder("right"), recording(tmp_path, 3)
+    opened_ns = Clock().now_ns()
+    inputs.record(RawEvent(InputKind.OPENED, opened_ns))
+    inputs.record(RawEvent(InputKind.DATA, opened_ns + 1_000_000, b"".join(map(format_line, lines))))
+    recorder.record_message("eit.frame", one_frame(0))
+    recorder.close()
+    (path,) = recorder.closed_files
+    said = ran("recording", "replay", path, "--speed", "max", "--check", status=1).err
+    assert "The recording was made by other code (shearloop 0.2.0), so its results may differ." in said
+    assert "3 lines may have waited in a port before it was opened: this code drops such lines, and earlier" in said
 
 
 STATED = 40

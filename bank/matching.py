@@ -70,8 +70,11 @@ class Matcher(ABC):
     def from_bank(cls, bank: Bank) -> Self:
         """Return the matcher of an opened bank."""
         made = cls(bank.signals, bank.valid, bank.k_grid, bank.sigma_grid)
-        made.model, made.identity, made.geometry_hash = bank.model, bank.identity, bank.geometry_hash
+        made._name_bank(bank)
         return made
+
+    def _name_bank(self, bank: Bank) -> None:
+        self.model, self.identity, self.geometry_hash = bank.model, bank.identity, bank.geometry_hash
 
     def heatmap(self, difference: ArrayLike) -> FloatArray:
         """Return the (K, S) scores, 0 to 1, of one (n,) difference; NaN in invalid cells. Errors as `heatmaps`."""

@@ -106,7 +106,7 @@ def _check_experiment(path: Path, rig: Path | None) -> "Parts":
 
 def _check_named_experiment(path: Path) -> None:
     """Raise UserError for the mistakes of the experiment that an invalid configuration names."""
-    from shearloop.daemon.experiment_files import read_experiment
+    from shearloop.tools.check import read_experiment
     from shearloop.yaml_files import read_yaml
 
     content = read_yaml(path, UserError)

@@ -195,7 +195,7 @@ def mistakes_of(experiment: Path) -> str:
 
     The daemon may read files that this user may not read. Empty if the file is only on the daemon's computer.
     """
-    from shearloop.daemon.experiment_files import read_experiment
+    from shearloop.tools.check import read_experiment
 
     try:
         read_experiment(experiment)

@@ -107,16 +107,6 @@ class Report(Record):
         """Whether the report has a stage, and no stage has a failed line."""
         return bool(self.stages) and all(stage.passed for stage in self.stages)
 
-    def with_stage(self, result: StageResult) -> "Report":
-        """Return the report with this result, which replaces an earlier result of the same stage."""
-        others = [stage for stage in self.stages if stage.stage != result.stage]
-        stages = sorted([*others, result], key=lambda stage: stage.stage)
-        return self.model_copy(update={"stages": tuple(stages)})
-
-    def without_stage(self, result: StageResult) -> "Report":
-        """Return the report without this stage."""
-        return self.model_copy(update={"stages": tuple(stage for stage in self.stages if stage != result)})
-
     def stage(self, number: str) -> StageResult | None:
         """Return the stage with this figure at the beginning of its name, if it was run."""
         return next((stage for stage in self.stages if stage.stage.startswith(number)), None)

@@ -49,12 +49,6 @@ MAX_LISTED = 500
 Found = TypeVar("Found")
 
 
-def read_experiment(path: Path) -> ExperimentFile:
-    """Return the experiment of a file; raises UserError for an invalid one, or one beyond its limits."""
-    document = read_document(path)
-    return without_mistakes(document, check_steps(outline(document.content)))
-
-
 def check_experiment(
     config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None = None
 ) -> ExperimentFile | None:

@@ -17,7 +17,7 @@ from shearloop.words import counted
 if TYPE_CHECKING:
     from shearloop.daemon.commissioning import Commissioning
     from shearloop.daemon.config import CurveConfig, DaemonConfig, EmulatorConfig, SkinConfig
-    from shearloop.daemon.control.experiment_schema import Mistake
+    from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake
     from shearloop.daemon.control.plan import Plan
     from shearloop.daemon.torques import TorqueSource
     from shearloop.drivers.robotiq.models import GripperModel
@@ -132,6 +132,16 @@ def _check_experiment(
         if note := tool_note(experiment, config, sources, robot):
             text += f"; {note}"
         parts.texts["experiment"] = text
+
+
+def read_experiment(path: Path) -> "ExperimentFile":
+    """Return the experiment of a file; raises UserError for an invalid one, or one beyond its limits."""
+    from shearloop.daemon.control.experiment_check import check_steps
+    from shearloop.daemon.control.experiment_schema import outline
+    from shearloop.daemon.experiment_files import read_document, without_mistakes
+
+    document = read_document(path)
+    return without_mistakes(document, check_steps(outline(document.content)))
 
 
 def check_experiment_alone(path: Path) -> Parts:

@@ -16,10 +16,11 @@ from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest, ZeroState
 from shearloop.daemon.torques import SensorListener, TorqueSample, TorqueSource
-from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, LinkObserver, SerialLink, TcpLink
+from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, LinkObserver, SerialLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinSample
+from shearloop.drivers.shear_skin.tcp_link import TcpLink
 from shearloop.errors import UserError
 from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
 from shearloop.estimation.skin.membrane import joule_heating_k

@@ -14,10 +14,11 @@ from scipy.io import loadmat
 from shearloop.bank.bank_file import BankDefinition, write_bank
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.cli.emulate import console
-from shearloop.drivers.connection import Link, SerialLink, TcpLink
+from shearloop.drivers.connection import Link, SerialLink
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
+from shearloop.drivers.shear_skin.tcp_link import TcpLink
 from shearloop.emulators.synthetic_skin import NORMAL_N, SLACK_RATIO
 from shearloop.estimation.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
 from tests.cli.emulate_rig.rig import write_rig_bank

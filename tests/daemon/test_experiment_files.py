@@ -19,12 +19,13 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment_schema import MAX_ANGLES_IN_ALL, MAX_STEPS
 from shearloop.daemon.control.known_tool import AT_REST
 from shearloop.daemon.errors import InvalidExperimentError
-from shearloop.daemon.experiment_files import ExperimentFiles, read_experiment
+from shearloop.daemon.experiment_files import ExperimentFiles
 from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
 from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.errors import UserError
+from shearloop.tools.check import read_experiment
 from tests.fixtures.daemons import bound_handlers, deadline
 
 SECRET = "host:5432:lab:ada:hunter2"  # noqa: S105 - the content that no reply may have

@@ -20,7 +20,15 @@ from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.limits import EMULATED
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.remembered import LeftRobot
-from shearloop.tools.commission.report import Measured, earlier_report, page_path, report_for, save_report
+from shearloop.tools.commission.report import (
+    Measured,
+    earlier_report,
+    page_path,
+    report_for,
+    save_report,
+    with_stage,
+    without_stage,
+)
 from shearloop.tools.commission.rig import ConnectedRig, Rig
 from shearloop.tools.commission.tactile import calibrated_sessions
 from shearloop.tools.outputs import check_apart
@@ -93,7 +101,7 @@ def _without_changed(report: Report, config: DaemonConfig, operator: Operator) -
     for stage in report.stages:
         if differs := stage.changed_since(hashes):
             operator.say(f"Stage {stage.stage} is measured again, because {' and '.join(differs)} changed.")
-            report = report.without_stage(stage)
+            report = without_stage(report, stage)
     return report
 
 
@@ -122,7 +130,7 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
             supplies=measured.supplies,
             judged_sha256s=judged_by(stage, judged_sha256s(context.config)),
         )
-        context.report = context.report.with_stage(result)
+        context.report = with_stage(context.report, result)
         save_report(out, context.report, not_measured(context.report))
         for line in result.lines:
             limit = f" (limit: {line.limit})" if line.limit else ""

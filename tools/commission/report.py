@@ -9,7 +9,16 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 
-from shearloop.daemon.commissioning import MAX_AGE_DAYS, NOTHING_SUPPLIED, Line, Report, Supplied, Verdict, load_report
+from shearloop.daemon.commissioning import (
+    MAX_AGE_DAYS,
+    NOTHING_SUPPLIED,
+    Line,
+    Report,
+    StageResult,
+    Supplied,
+    Verdict,
+    load_report,
+)
 from shearloop.daemon.rig_identity import RigIdentity
 from shearloop.errors import UserError
 from shearloop.yaml_files import save_yaml
@@ -109,6 +118,18 @@ def report_for(rig: RigIdentity, found: Report | None, path: Path) -> Report:
             "one; begin a new report with another --out"
         )
     return found
+
+
+def with_stage(report: Report, result: StageResult) -> Report:
+    """Return a report with this result, which replaces an earlier result of the same stage."""
+    others = [stage for stage in report.stages if stage.stage != result.stage]
+    stages = sorted([*others, result], key=lambda stage: stage.stage)
+    return report.model_copy(update={"stages": tuple(stages)})
+
+
+def without_stage(report: Report, result: StageResult) -> Report:
+    """Return a report without this stage."""
+    return report.model_copy(update={"stages": tuple(stage for stage in report.stages if stage != result)})
 
 
 def page_path(report: Path) -> Path:

@@ -13,9 +13,9 @@ from pydantic_core import from_json
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.recorder import schema
-from shearloop.daemon.sensing.session_inputs import before_frame
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import Measured
+from shearloop.tools.recordings.before_frame import before_frame
 from shearloop.tools.recordings.reader import open_recording, reading, unusable
 from shearloop.words import counted
 

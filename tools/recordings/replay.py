@@ -33,7 +33,6 @@ from shearloop.daemon.sensing.fingertip_messages import (
 from shearloop.daemon.sensing.fingertip_task import estimate_frames
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.load_cell_task import load_message
-from shearloop.daemon.sensing.session_inputs import SESSION_KINDS, before_frame
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCES
 from shearloop.daemon.sensing.snapshots import SnapshotError, restored
@@ -45,6 +44,7 @@ from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.estimation import BeforeFrame, HeldTool, Session
 from shearloop.mistakes import validated
+from shearloop.tools.recordings.before_frame import SESSION_KINDS, before_frame
 from shearloop.tools.recordings.message_content import ContentError
 from shearloop.tools.recordings.reader import open_recording, reading
 from shearloop.tools.recordings.replayed_skin import ReplayedSkin

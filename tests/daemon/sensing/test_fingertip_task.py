@@ -20,7 +20,6 @@ from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes
 from shearloop.daemon.sensing.fingertip_task import FingertipTask, tactile_frame
 from shearloop.daemon.sensing.frame_pairing import FramePairing
-from shearloop.daemon.sensing.session_inputs import before_frame
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.defaults import FRAME_PERIOD_S
@@ -29,6 +28,7 @@ from shearloop.drivers.robotiq.messages import ActivationStatus, GripperState, O
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import ActionError
 from shearloop.estimation import Estimate, Measured, Session, TactileFrame
+from shearloop.tools.recordings.before_frame import before_frame
 from tests.running import running
 
 MS = 1_000_000

@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.sensing.session_inputs import SESSION_KINDS, before_frame, session_inputs
+from shearloop.daemon.sensing.session_inputs import session_inputs
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.estimation import BeforeFrame, HeldTool, KnownTorques, Measured
+from shearloop.tools.recordings.before_frame import SESSION_KINDS, before_frame
 from shearloop.tools.recordings.replay import together
 
 WHOLE = BeforeFrame(

@@ -11,10 +11,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from shearloop.drivers.connection import Link, LinkMonitor, SerialLink, TcpLink
+from shearloop.drivers.connection import Link, LinkMonitor, SerialLink
 from shearloop.drivers.defaults import DAQ_RATE_HZ
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Keithley6430, ScpiScanner, SourceReading, Voltages
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
+from shearloop.drivers.shear_skin.tcp_link import TcpLink
 from shearloop.emulators.ports import SocketServer
 from shearloop.emulators.skin import Circuit, EmulatedKeithley6430, EmulatedScanner, Gauges, SkinInstruments
 from tests.running import DEADLINE_S, LinkEvents, pass_on, running

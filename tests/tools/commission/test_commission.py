@@ -29,7 +29,7 @@ from shearloop.tools.commission import identity
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.identity import EMULATED_CHECKSUM, Identity, judge_identity
 from shearloop.tools.commission.operator import DeclinedError, Operator
-from shearloop.tools.commission.report import earlier_report, report_for, save_report
+from shearloop.tools.commission.report import earlier_report, report_for, save_report, with_stage
 from tests.emulator_process import EmulatorProcess
 from tests.fixtures.robots import TOOL, write_filled_in
 
@@ -145,10 +145,10 @@ def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
         for date, verdict in (("2026-01-01T00:00:00Z", "failed"), ("2026-01-02T00:00:00Z", "passed"))
     )
     path = tmp_path / "report.yaml"
-    save_report(path, begun.with_stage(bad))
+    save_report(path, with_stage(begun, bad))
     found = report_for(RIG, earlier_report(path), path)
     assert (found.stages, found.passed) == ((bad,), False)
-    page = save_report(path, found.with_stage(good), ["4 stops"])
+    page = save_report(path, with_stage(found, good), ["4 stops"])
     assert report_for(RIG, earlier_report(path), path).stages == (good,)
     text = page.read_text()
     HTMLParser().feed(text)

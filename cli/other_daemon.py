@@ -4,8 +4,8 @@ from contextlib import suppress
 from typing import Final
 
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
-from shearloop.daemon.running_rig import whose_daemon
 from shearloop.errors import UserError
+from shearloop.tools.running_daemon import whose_daemon
 
 # A daemon on a busy computer answers within it.
 STATUS_S: Final = 2.0

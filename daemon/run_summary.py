@@ -91,8 +91,7 @@ class _Run:
     identified: str = ""
     # What the driving torque rests on that nothing checks.
     torque_note: str = ""
-    held_s: float = 0.0
-    # The part of it with a fault that a busy computer can cause.
+    # The part of the hold time with a fault that a busy computer can cause.
     late_s: float = 0.0
     hold_reasons: Counter[str] = field(default_factory=Counter)
     # By source, why a torque was not valid.
@@ -126,7 +125,7 @@ class RunSummary:
         if topic == "loop.state":
             self._on_loop_state(content)
         elif topic == "loop.stop":
-            self.add(f"The stop, from its cause: {stop_times(content)}.")
+            self.add(f"The stop, {stop_times(content)}.")
         elif self._run is not None:
             _on_sample(self._run, topic, content)
 
@@ -167,7 +166,7 @@ def _may_be_late(run: _Run, content: Mapping[str, Any]) -> bool:
     if FaultCode.HELD_TOO_LONG.text not in codes[:1]:
         return bool(_BY_BUSY_COMPUTER.intersection(codes[:1]))
     # Several holds together have no cause among them, and those that were before may be gone.
-    return bool(_BY_BUSY_COMPUTER.intersection(codes)) or 0.0 < _LATE_FRACTION * run.held_s <= run.late_s
+    return bool(_BY_BUSY_COMPUTER.intersection(codes)) or 0.0 < _LATE_FRACTION * content["held_s"] <= run.late_s
 
 
 def _codes(content: Mapping[str, Any]) -> list[str]:
@@ -190,10 +189,10 @@ def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
 
 def _update(run: _Run, content: Mapping[str, Any]) -> None:
     now_ns = content["t_mono_ns"]
-    if run.last["phase"] == "held":
-        held_s = _elapsed_s(run.last, content)
-        run.held_s += held_s
-        run.late_s += held_s if _BY_BUSY_COMPUTER.intersection(_codes(run.last)) else 0.0
+    # A late decision was held before it is known.
+    holding = run.last if run.last["phase"] == "held" else content
+    if _BY_BUSY_COMPUTER.intersection(_codes(holding)):
+        run.late_s += content["held_s"] - run.last["held_s"]
     if run.last["phase"] == "paused" and run.steps:
         run.steps[-1].paused_s += _elapsed_s(run.last, content)
     if content["response"] == "hold" and run.last["response"] != "hold":
@@ -337,7 +336,7 @@ def recovered_s(t_s: FloatArray, torque_nm: FloatArray, set_nm: float) -> float:
 def _counted(run: _Run) -> Iterator[str]:
     if run.hold_reasons:
         reasons = "; ".join(f"{times(count)} {reason}" for reason, count in run.hold_reasons.most_common())
-        yield f"  by faults, the wrist was held for {run.held_s:.1f} s in all: {reasons}"
+        yield f"  by faults, the wrist was held for {run.last['held_s']:.1f} s in all: {reasons}"
     else:
         yield "  the wrist was never held by a fault"
     for source, reasons_of in run.invalid.items():

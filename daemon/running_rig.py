@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 if TYPE_CHECKING:
     # `shearloop command stop` imports little.
@@ -27,10 +27,3 @@ class RunningRig:
         """Return the rig of a configuration, whose robot has this address."""
         robot = {"robot": robot_host} if robot_host is not None else {}
         return cls(config.name, config.emulated, config.publish, {**config.device_addresses, **robot})
-
-
-def whose_daemon(reply: Mapping[str, Any]) -> str:
-    """Return whose daemon gave this reply to `status`: EMULATED, process, name of the rig, and folder."""
-    daemon = reply.get("daemon", {})
-    label = f"{EMULATED}, " if daemon.get("emulated") else ""
-    return f"{label}process {daemon.get('process')} ({daemon.get('rig')}) in {daemon.get('folder')}"

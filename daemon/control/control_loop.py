@@ -232,6 +232,7 @@ class ControlLoop:
         self.wrist.reset()
         self.tool.begin_experiment()
         self._unmeasured_since_ns = t_ns
+        self.safety.begin_experiment()
         self.runs += 1
         # Until the first tick, the status must not show the end of the previous run.
         phase, activity = self.experiment.phase.value, self.experiment.command.activity

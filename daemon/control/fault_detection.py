@@ -90,7 +90,7 @@ def detect_faults(
     found += _device_faults(inputs, watched, step, t_ns)
     for name, reason in inputs.died.items():
         found.append(Fault(FaultCode.TASK_DIED, f"{name}: {reason}"))
-    found += _lateness_faults(inputs.late_s, watched.patience)
+    found += _lateness_faults(inputs.late_s, watched.patience, t_ns)
     if inputs.recording_error:
         found.append(Fault(FaultCode.RECORDING_FAILED, inputs.recording_error))
     if step is not None and step.not_following:
@@ -125,13 +125,14 @@ def _angle_limit_fault(inputs: LatestInputs, watched: Watched, limit_rad: float,
     return Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None)
 
 
-def _lateness_faults(late_s: float, patience: float) -> Iterator[Fault]:
-    longest_hang_s = patience * LONGEST_HANG_S
-    if late_s > longest_hang_s - LONGEST_TICK_S:
-        stood = f"it stood still for {late_s + LONGEST_TICK_S:.1f} s, and {longest_hang_s:g} s are allowed"
-        yield Fault(FaultCode.DAEMON_PAUSED, stood)
+def _lateness_faults(late_s: float, patience: float, t_ns: int) -> Iterator[Fault]:
+    longest_hang_s, stood_s = patience * LONGEST_HANG_S, late_s + LONGEST_TICK_S
+    decided_ns = t_ns - round(stood_s * 1e9)
+    if stood_s > longest_hang_s:
+        stood = f"it stood still for {stood_s:.1f} s, and {longest_hang_s:g} s are allowed"
+        yield Fault(FaultCode.DAEMON_PAUSED, stood, t_ns=decided_ns)
     elif late_s > patience * LATEST_LOOP_S:
-        yield Fault(FaultCode.LOOP_LATE, f"the loop ran {late_s * 1e3:.0f} ms late")
+        yield Fault(FaultCode.LOOP_LATE, f"the loop ran {late_s * 1e3:.0f} ms late", t_ns=decided_ns)
 
 
 def _largest(inputs: LatestInputs, source: TorqueSource) -> TorqueSample | None:

@@ -378,7 +378,8 @@ class ControlLoopRunner:
             # The stop before may still wait for its standstill.
             self.states.publish_stop(self._timeline.end())
             run, name = self._control_loop.runs, experiment.file.name
-            self._timeline.begin(run, name, status.activity, status.decision, now_ns)
+            rests_since_ns = self._robot.rests_since_ns
+            self._timeline.begin(run, name, status.activity, status.decision, now_ns, rests_since_ns)
         if is_new or self._may_be_moving:
             self._may_be_moving, self._ended_ns = False, now_ns
             self.actions.cancel()

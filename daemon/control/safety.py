@@ -64,6 +64,8 @@ class SafetyMonitor:
         self.acknowledgements = 0
         # How many causes have begun a stop, or joined one that waits for the operator.
         self._causes = 0
+        # How long faults have held the wrist since the experiment began.
+        self.held_ns = 0
         # Hold timers of faults and of the wrist, and the faults of the last judgement that hold.
         self._hold_ns: dict[str, int] = {}
         self._wrist_ns = 0
@@ -71,6 +73,10 @@ class SafetyMonitor:
         # Each fault's contribution to the wrist's timer, for the report.
         self._share_ns: dict[FaultCode, int] = {}
         self._judged_ns: int | None = None
+
+    def begin_experiment(self) -> None:
+        """Count the hold time from now on."""
+        self.held_ns = 0
 
     def judge(self, faults: Iterable[Fault], t_ns: int) -> SafetyDecision:
         """Return the response to the faults at t_ns (monotonic clock) while an experiment runs."""
@@ -173,6 +179,7 @@ class SafetyMonitor:
         }
         self._hold_ns = {timer: hold_ns for timer, hold_ns in counted.items() if hold_ns or timer in holding_timers}
         self._wrist_ns = _counted(self._wrist_ns, passed_ns, up=bool(lasted))
+        self.held_ns += passed_ns if lasted else 0
         if not self._wrist_ns:
             self._share_ns.clear()
         for code in lasted:

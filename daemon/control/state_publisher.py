@@ -142,6 +142,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         speed_command_rad_per_s=status.velocity.speed_rad_per_s,
         speed_sent_rad_per_s=sent_rad_per_s,
         response=status.decision.response.name.lower().replace("_", " "),
+        held_s=control_loop.safety.held_ns / 1e9,
         stop=control_loop.safety.stop_number,
         cause=next(iter(status.decision.reasons), ""),
         faults=status.decision.codes,

@@ -35,12 +35,28 @@ class StopTimeline:
         """Note that a person, or the daemon's end, asks for a stop; it counts until the next `update`."""
         self._requested_ns = now_ns
 
-    def begin(self, run: int, experiment: str, reason: str, decision: SafetyDecision, now_ns: int) -> None:
-        """Take the decision; its cause is the request, or the oldest measurement that shows a fault."""
-        measured = [one.t_ns for one in decision.faults if one.t_ns is not None and not one.is_consequence]
-        cause_ns = min(measured, default=now_ns) if self._requested_ns is None else self._requested_ns
-        self._requested_ns, self._decided_ns = None, now_ns
-        self._sent_ns = self._stands_ns = None
+    def begin(
+        self,
+        run: int,
+        experiment: str,
+        reason: str,
+        decision: SafetyDecision,
+        now_ns: int,
+        rests_since_ns: int | None = None,
+    ) -> None:
+        """Take the decision; its cause is the request, or the oldest measurement that shows a fault.
+
+        A request may have waited while the daemon stood still. `rests_since_ns`: since when the arm stands still, if it
+        does.
+        """
+        faults = [one for one in decision.faults if self._requested_ns is None or one.rule.is_past]
+        times_ns = [one.t_ns for one in faults if not one.is_consequence]
+        measured = [t_ns for t_ns in (self._requested_ns, *times_ns) if t_ns is not None]
+        cause_ns = min(measured, default=now_ns)
+        self._requested_ns, self._decided_ns, self._sent_ns = None, now_ns, None
+        # A standstill that began after the cause is the stop's, also before the decision.
+        is_stops = rests_since_ns is not None and rests_since_ns > cause_ns
+        self._stands_ns = rests_since_ns if is_stops else None
         self._stop = LoopStop(
             source="loop",
             t_mono_ns=cause_ns,
@@ -49,7 +65,7 @@ class StopTimeline:
             cause=reason,
             faults=decision.codes,
             response=decision.response.name.lower().replace("_", " "),
-            decided_after_s=(now_ns - cause_ns) / 1e9,
+            decided_after_s=(now_ns - cause_ns) / 1e9 if measured else None,
             sent_after_s=None,
             stands_after_s=None,
             refusal="",
@@ -60,7 +76,9 @@ class StopTimeline:
         """Take the reply of the worker to the stop."""
         stop = self._stop
         if stop is not None and self._sent_ns is None:
-            self._sent_ns, self._stands_ns = now_ns, None
+            self._sent_ns = now_ns
+            if self._stands_ns is not None and self._stands_ns > self._decided_ns:
+                self._stands_ns = None
             self._stop = replace(stop, sent_after_s=(now_ns - stop.t_mono_ns) / 1e9)
 
     def on_refused(self, refusal: str) -> None:

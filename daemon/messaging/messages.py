@@ -246,6 +246,7 @@ class LoopState(Message):
     speed_command_rad_per_s: float = column("rad/s", "the commanded wrist speed, before the worker's clipping")
     speed_sent_rad_per_s: float = column("rad/s", "the wrist speed that was sent, after the worker's clipping")
     response: str = column("", RESPONSES)
+    held_s: float = column("s", "how long faults have held the wrist since the experiment began")
     stop: int = column("", "number of the stop that waits for `unlock`, larger after each further cause; 0 without one")
     cause: str = column("", "the first reason, which may have caused the others; empty without a reason")
     faults: str = column("", "codes of the reasons, separated by commas, the cause's first; see faults.md")
@@ -261,11 +262,17 @@ class LoopStop(Message):
     cause: str = column("", "why it stopped, in sentences")
     faults: str = column("", "codes of the faults that stopped it, separated by commas, the cause's first")
     response: str = column("", RESPONSES)
-    decided_after_s: float = column("s", "time from the cause, a measurement or a request, to the decision")
+    decided_after_s: float | None = column(
+        "s",
+        "time from the cause, a measurement or a request, to the decision; from the daemon's last decision if it stood "
+        "still before; nil if nothing measured the cause: then all times count from the decision",
+    )
     sent_after_s: float | None = column(
         "s", "time until the robot's worker had sent the stop; nil if it did not answer"
     )
-    stands_after_s: float | None = column("s", "time until the robot measured a standstill; nil without one within 5 s")
+    stands_after_s: float | None = column(
+        "s", "time until a state of the robot showed the standstill, also before the decision; nil without one in 5 s"
+    )
     refusal: str = column("", "why the robot's worker did not send the stop, in sentences; empty when it did")
     blocked_after_s: float | None = column(
         "s", "time until the robot's state showed that it accepts no command; nil unless the stop was refused"
@@ -339,7 +346,7 @@ def cause_of(loop_state: Mapping[str, Any]) -> str:
 
 
 def stop_times(loop_stop: Mapping[str, Any]) -> str:
-    """Return the times of a `loop.stop`, from the stop's cause, in words."""
+    """Return the times of a `loop.stop` in words, from the stop's cause, or from its decision."""
 
     def after(key: str) -> str | None:
         value = loop_stop.get(key)
@@ -351,7 +358,9 @@ def stop_times(loop_stop: Mapping[str, Any]) -> str:
         blocked = after("blocked_after_s")
         sent = f"not sent, because the robot was blocked {blocked}" if blocked else "refused by the robot's worker"
         stands += ", by the robot's own stop" if after("stands_after_s") else ""
-    return f"decided {after('decided_after_s')}, {sent}, {stands}"
+    if decided := after("decided_after_s"):
+        return f"from its cause: decided {decided}, {sent}, {stands}"
+    return f"from its decision, because nothing measured its cause: {sent}, {stands}"
 
 
 def stale_after_s(topic: str) -> float:

@@ -81,9 +81,9 @@ def _loop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
 
 
 def _stop(before: Mapping[str, Any], now: Mapping[str, Any]) -> Events:
-    if before and all(before.get(key) == now.get(key) for key in ("experiment", "decided_after_s", "stands_after_s")):
+    if before and all(before.get(key) == now.get(key) for key in ("t_mono_ns", "experiment", "stands_after_s")):
         return
-    yield "stop", f"the stop, from its cause: {stop_times(now)}"
+    yield "stop", f"the stop, {stop_times(now)}"
     if now.get("refusal"):
         yield "fault", f"the stop was not sent: {now['refusal']}"
 

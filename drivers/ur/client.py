@@ -78,6 +78,8 @@ class UrRobot:
         self.settings = settings
         self._settings_for = settings_for
         self.state: messages.RobotState | None = None
+        # Since when the arm stands still, by its states; None while it moves.
+        self.rests_since_ns: int | None = None
         self.monitor = monitor or LinkMonitor()
         self.losses: Counter[str] = Counter()
         # The number of states that have arrived.
@@ -190,7 +192,7 @@ class UrRobot:
 
     def _disconnect(self) -> None:
         self._connection = None
-        self.state = None
+        self.state = self.rests_since_ns = None
         unanswered = messages.CommandReply("The robot's worker ended before it answered; nothing is sent again.")
         for number in list(self._replies):
             self.handle_message(number, unanswered)
@@ -200,6 +202,7 @@ class UrRobot:
         match message:
             case messages.RobotState():
                 before, self.state = self.state, message
+                self.rests_since_ns = (self.rests_since_ns or message.measured_ns) if message.rests else None
                 self._wrench_zero = message.wrench_zero
                 if not any(message.wrench_zero):
                     # The restored zero ends with a tare, or with a program's start without a load.

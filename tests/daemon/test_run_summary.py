@@ -36,6 +36,7 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
         "cause": "",
         "faults": "",
         "reasons": "",
+        "held_s": 0.0,
         **changes,
     }
 
@@ -46,9 +47,22 @@ def summary_of(
     """Return what is told of these messages, each of the topic of its source."""
     out = StringIO()
     summary = RunSummary(out, SimpleNamespace(torques=lambda: truth, sent=sent))
-    for content in messages:
+    for content in with_hold_times(messages):
         summary(TOPICS.get(content["source"], "eit.estimate"), content)
     return out.getvalue()
+
+
+def with_hold_times(messages: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the messages with the loop's hold time, as it counts without late decisions."""
+    told, held_ns, before = [], 0, loop_state(0)
+    for content in messages:
+        if content["source"] == "loop":
+            held_ns += content["t_mono_ns"] - before["t_mono_ns"] if before["phase"] == "held" else 0
+            before = content
+            told.append({**content, "held_s": content["held_s"] or held_ns / S})
+        else:
+            told.append(content)
+    return told
 
 
 def summary_of_hold(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
@@ -262,6 +276,21 @@ def test_a_stop_that_was_asked_for_is_no_error(code):
     assert "STOPPED" not in text
 
 
+def test_a_pause_of_the_daemon_counts_as_held_though_it_is_known_only_at_its_end():
+    """The loop was late by a second, and the wrist was held until its next decision, 8 ms later."""
+    late = FaultCode.LOOP_LATE
+    told = (
+        loop_state(0),
+        loop_state(5.0),
+        loop_state(6.0, phase="held", response="hold", faults=late.text, held_s=1.0),
+        loop_state(6.008, held_s=1.008),
+        loop_state(9.0, phase="stopped", faults=FaultCode.HELD_TOO_LONG.text, held_s=1.008),
+    )
+    text = summary_of(*told)
+    assert f"by faults, the wrist was held for 1.0 s in all: once {late.value.kind}\n" in text
+    assert "too busy" in text
+
+
 @pytest.mark.parametrize(
     ("phase", "code", "as_asked"),
     [
@@ -390,6 +419,13 @@ def test_each_number_of_a_hold_follows_from_the_messages(seed):
         else:
             ((back_s,),) = in_text(r"back within ± 10% after (\S+) s", back)
             assert float(back_s) == pytest.approx(expected - kick_s, abs=0.051)
+
+
+def test_a_stop_whose_cause_nothing_measured_has_no_time_of_its_decision():
+    stop = {"source": "stop", "decided_after_s": None, "sent_after_s": 0.006, "stands_after_s": 0.12}
+    text = summary_of(loop_state(0), loop_state(5, phase="stopped"), stop)
+    told = "The stop, from its decision, because nothing measured its cause: sent after 0.006 s, standstill after 0.120"
+    assert told in text
 
 
 def test_the_times_of_a_stop_are_those_of_its_message():

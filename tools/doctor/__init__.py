@@ -16,7 +16,7 @@ from shearloop.bank.errors import BankError
 from shearloop.daemon.commissioning import commissioning_of
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
 from shearloop.daemon.rig import configured_settings
-from shearloop.daemon.running_rig import EMULATED, whose_daemon
+from shearloop.daemon.running_rig import EMULATED
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import missing_library
 from shearloop.errors import UserError
@@ -31,6 +31,7 @@ from shearloop.tools.doctor.devices import (
 )
 from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, split_cure, trouble
 from shearloop.tools.doctor.robot_values import check_robot_values
+from shearloop.tools.running_daemon import whose_daemon
 from shearloop.tools.serial_ports import HiddenBoard, has_brltty, list_hidden_boards, list_serial_ports
 from shearloop.yaml_files import read_yaml
 

@@ -390,9 +390,9 @@ export function loopPanel(link) {
   put(byId("other-reasons"), others);
 }
 
-// The times of the stop of this run, from its cause.
+// The times of the stop of this run.
 function stopTimes(link, current) {
   const stop = link.get("loop.stop");
   if (stop?.content.run !== current.run) return "";
-  return `From its cause: ${stop.times}.`;
+  return `${stop.times[0].toUpperCase()}${stop.times.slice(1)}.`;
 }

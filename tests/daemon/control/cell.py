@@ -190,6 +190,10 @@ class Published:
         return list(filter(None, self._loop_state.faults.split(", ")))
 
     @property
+    def held_s(self) -> float:
+        return float(self._loop_state.held_s)
+
+    @property
     def _loop_state(self) -> Any:
         return next(one for one in reversed(self.messages) if one.topic == "loop.state")
 

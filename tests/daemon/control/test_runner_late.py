@@ -10,6 +10,7 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
 from tests.daemon.control.cell import TWIST, Cell, driven
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
@@ -68,6 +69,54 @@ async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_
         await cell.cycles(1)
         assert cell.phase is ExperimentPhase.STOPPED
         assert cell.why == Fault(FaultCode.DAEMON_PAUSED, "it stood still for 6.0 s, and 0.3 s are allowed").sentence
+
+
+@pytest.mark.parametrize("asked", [False, True])
+async def test_the_times_of_a_stop_after_a_pause_count_from_the_last_decision(asked):
+    """The wrist stood long before the decision, by the robot's own deadlines. A person may have asked for it meanwhile.
+
+    It was "decided after 0.000 s", and stood after the daemon's return.
+    """
+    async with driven(TWIST, cycles=50) as cell:
+        decided_ns = cell.robot.bench.now_ns
+        for _ in range(3_000_000_000 // CYCLE_NS):
+            cell.robot.cycle(read=False)
+        if asked:
+            assert cell.runner.stop() == "test"
+        await cell.cycles(20)
+        (stop,) = (one for one in cell.published.messages if isinstance(one, LoopStop))
+        assert stop.faults.split(", ")[0] == (FaultCode.OPERATOR_STOP if asked else FaultCode.DAEMON_PAUSED).text
+        assert stop.t_mono_ns == pytest.approx(decided_ns, abs=2 * CYCLE_NS)
+        assert 3.0 <= stop.decided_after_s <= stop.sent_after_s <= 3.1
+        assert 0.1 <= stop.stands_after_s <= 0.3 + SETTINGS.command_timeout_s
+
+
+async def test_a_cause_that_nothing_measures_has_no_time():
+    """It was "decided after 0.000 s", as if it had been seen at once."""
+    async with driven(TWIST, cycles=50) as cell:
+        cell.died["right"] = "it crashed some time ago"
+        await cell.cycles(60)
+        (stop,) = (one for one in cell.published.messages if isinstance(one, LoopStop))
+        assert stop.faults == FaultCode.TASK_DIED.text
+        assert stop.decided_after_s is None
+        assert 0.0 <= stop.sent_after_s < stop.stands_after_s < 0.3
+
+
+async def test_the_whole_gap_of_a_late_loop_counts_as_held():
+    async with driven(TWIST, cycles=50) as cell:
+        for run in (1, 2):
+            assert cell.published.held_s == 0.0
+            for _ in range(20):
+                cell.robot.cycle(read=False)
+            await cell.cycles(10)
+            assert cell.phase is ExperimentPhase.RUNNING
+            # From the last decision to the one that is late, and on to the next.
+            assert cell.published.held_s == pytest.approx(22 * CYCLE_NS / 1e9, abs=1e-6), run
+            cell.runner.stop()
+            await cell.cycles(60)
+            assert await cell.runner.unlock() is None
+            await cell.start(TWIST)
+            await cell.cycles(50)
 
 
 @pytest.mark.parametrize(("hang_s", "goes_on"), [(0.15, True), (0.28, True), (0.32, False), (0.5, False), (2.0, False)])

@@ -54,6 +54,8 @@ class Remembered:
     force_n: float | None = None
     width_mm: float | None = None
     requested_counts: int | None = None
+    # The diameter that the latest experiment states of the tool.
+    stated_tool_mm: float | None = None
     # The load cell's zero in this grip, in the board's unit, and the torque of one unit, which identifies its
     # calibration. With a tool in the fingers the load cell cannot get a new zero.
     load_zero: float | None = None
@@ -82,6 +84,7 @@ class Remembered:
             for text, value in (
                 ("gripped with at most {:g} N", self.force_n),
                 ("{:.1f} mm wide", self.width_mm),
+                ("with a stated diameter of {:g} mm", self.stated_tool_mm),
                 ("its angle counts from {:.3f} rad of wrist 3", self.origin_rad),
             )
             if value is not None
@@ -110,7 +113,7 @@ class Remembered:
         running = loop.running.file.name if loop.running is not None else ""
         faults = loop.safety.waiting.faults if loop.safety.waiting is not None else ()
         stop = tuple((fault.code.name, fault.detail) for fault in faults)
-        return cls(running, stop, **asdict(loop.tool.grip))
+        return cls(running, stop, **asdict(loop.tool.grip), stated_tool_mm=loop.stated_tool_mm)
 
     def restore(self, loop: ControlLoop, on_judged: OnJudged = lambda _: None) -> None:
         """Give the stored state to a new control loop; a restored stop keeps the grip, even if it had opened it."""
@@ -120,6 +123,7 @@ class Remembered:
             loop.tool.restore_clamped(self.origin_rad)
         elif self.grips:
             loop.tool.restore_grip(self.grip, on_judged)
+            loop.stated_tool_mm = self.stated_tool_mm
 
 
 @dataclass(slots=True)

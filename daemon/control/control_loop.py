@@ -24,7 +24,7 @@ from shearloop.daemon.control.held_tool import HeldTool
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.operator_view import OperatorView
 from shearloop.daemon.control.safety import SafetyDecision, SafetyMonitor
-from shearloop.daemon.control.step_motions import Speeds
+from shearloop.daemon.control.step_motions import Speeds, first_gripper_step
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import Compute, WristController, at_once
 from shearloop.daemon.loop_config import LoopConfig
@@ -70,7 +70,8 @@ class ControlLoop:
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
         self.safety = SafetyMonitor(patience)
         self.experiment: Experiment | None = None
-        # The diameter that the latest experiment states, while it runs and as long as the gripper may hold its tool.
+        # The diameter that the latest experiment states, while it runs and as long as the gripper may hold its tool. It
+        # is kept across a restart.
         self.stated_tool_mm: float | None = None
         # How many experiments have begun.
         self.runs = 0
@@ -113,6 +114,16 @@ class ControlLoop:
         """The experiment while it may still move something."""
         return self.experiment if self.experiment is not None and self.experiment.running else None
 
+    @property
+    def stated_tool_note(self) -> str:
+        """How the widths by the maker's figures differ from the stated diameter; empty where they do not."""
+        running = self.running
+        first = first_gripper_step(running.file) if running is not None else None
+        if running is not None and first is not None and running.step_number <= first[0]:
+            # The fingers may still hold the tool of before.
+            return ""
+        return self.tool.why_not_stated(self.stated_tool_mm)
+
     def on_torque(self, torque: TorqueSample) -> None:
         """Accept a torque sample from any source."""
         creep = self._creep.get(torque.source)
@@ -147,8 +158,10 @@ class ControlLoop:
         """Take a state of the gripper, unless it is older than the latest one."""
         known = self.inputs.gripper
         if known is None or gripper.t_ns >= known.t_ns:
-            self.inputs.gripper = gripper
+            self.inputs.gripper, before = gripper, self.tool.another
             self.tool.on_gripper(gripper, judges=self.running is None)
+            if self.tool.another not in ("", before):
+                self.stated_tool_mm = None
 
     def on_link(self, device: str, sentence: str, *, up: bool) -> None:
         """Take the return or the loss of a device, with a sentence."""

@@ -37,6 +37,9 @@ OPEN_WITHIN_MM = 10.0
 MIN_OPENING_MM = 2.0
 # Fingertips that touch are closer together than this number of standard deviations of a measured width.
 TOUCHING_STDS = 3.0
+# A width by the maker's figures is off by at most this number of standard deviations: bare fingers bow, and are open at
+# other counts.
+LARGEST_ERROR_STDS = 3.0
 # A release or halt is retried for longer than a reconnection takes.
 TRIED_FOR_S, TRIED_AGAIN_S = 5.0, 0.1
 
@@ -179,10 +182,13 @@ class GripperTask:
 
     def status_of(self, state: GripperState) -> GripperStatus:
         """Return what the control loop knows of a gripper's state."""
+        holding = self._holds(state)
+        by_figures = Measured(state.width_mm, LARGEST_ERROR_STDS * state.width_std_mm)
         return GripperStatus(
             state.t_ns,
             state.width_mm,
-            holding=self._holds(state),
+            holding=holding,
+            unmeasured_mm=by_figures if holding and not self.measures_diameters else None,
             moving=state.object is ObjectStatus.MOVING,
             fault=state.fault.sentence if state.fault.needs_activation else "",
             # The gripper detects objects only on its way to a target (gGTO) and there. A reset or a loss of power

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from shearloop.daemon.control.experiment_schema import GripStep, Opening
 from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
 from shearloop.daemon.control.inputs import GripperStatus, LatestInputs
+from shearloop.estimation.values import is_another_tool
 
 # Why it is not known yet whether something is held.
 GRIPPED_BEFORE = "the gripper has not answered yet, and an earlier daemon had gripped a tool"
@@ -170,6 +171,23 @@ class HeldTool:
         if known and self.is_earlier:
             force += " unless it was gripped again before this daemon began"
         return f"{gripper.fingers}, {force}"
+
+    def why_not_stated(self, stated_mm: float | None) -> str:
+        """Return how a width by the maker's figures differs from the tool's stated diameter; empty where it does not.
+
+        The maker's figures are of bare fingers, so the width is no proof of another tool.
+        """
+        gripper = self.inputs.gripper
+        if gripper is None or stated_mm is None or gripper.unmeasured_mm is None:
+            return ""
+        width = gripper.unmeasured_mm
+        if not is_another_tool(stated_mm, width):
+            return ""
+        return (
+            f"the experiment states a tool of {stated_mm:g} mm, and by the maker's figures the gripper's fingers are "
+            f"{width.value:.1f} mm apart: either its fingertips make that difference, or it holds another tool; "
+            "calibrate the gripper, or correct `tool_mm`"
+        )
 
     @property
     def unknown_grip(self) -> str:

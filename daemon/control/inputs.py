@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from shearloop.daemon.torques import TorqueSample
+from shearloop.estimation import Measured
 
 # Torques between two ticks; more come only while the loop stands still.
 MAX_UNJUDGED = 256
@@ -36,7 +37,8 @@ class GripperStatus:
     stopped on its way. `unfelt`: the fingers stand at a target that they did not open to, where an object as wide would
     not be felt. `requested_counts`: the position of the last request of any program. `others_requests`: the number of
     requests of other programs. `inactive`: it activates before its next motion, which opens and closes the fingers
-    once. `too_hot`: it refuses a grip, and activates before it opens.
+    once. `too_hot`: it refuses a grip, and activates before it opens. `unmeasured_mm`: the width of a held object, with
+    its largest error, by the maker's figures; None for a gripper that measures diameters.
     """
 
     t_ns: int
@@ -50,6 +52,7 @@ class GripperStatus:
     others_requests: int = 0
     inactive: bool = False
     too_hot: bool = False
+    unmeasured_mm: Measured | None = None
 
     @property
     def may_hold(self) -> bool:

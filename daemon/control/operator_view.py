@@ -190,7 +190,8 @@ class OperatorView:
         if held is None or not turns:
             return ""
         angle = f" The grip is not known ({unknown}): its angle counts from the start." if unknown else ""
-        return f" At present {held}.{angle}"
+        stated = self.tool.why_not_stated(file.tool_mm)
+        return f" At present {held}.{angle}{f' But {stated}.' if stated else ''}"
 
     def known_at_start(self) -> KnownTool:
         """Return the known angle and torque of the tool at a start."""

@@ -137,7 +137,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         run=control_loop.runs,
         activity=status.activity,
         torque_source=driving,
-        torque_note=latest.note if latest is not None else "",
+        torque_note="; ".join(filter(None, (latest.note if latest is not None else "", control_loop.stated_tool_note))),
         torque_nm=latest.torque_nm if latest is not None else None,
         speed_command_rad_per_s=status.velocity.speed_rad_per_s,
         speed_sent_rad_per_s=sent_rad_per_s,

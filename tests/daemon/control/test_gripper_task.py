@@ -4,9 +4,11 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from shearloop.daemon.clock import Clock
@@ -15,8 +17,13 @@ from shearloop.daemon.control.experiment_schema import GripStep, opening
 from shearloop.daemon.control.fault_detection import GRIPPER_STALE_S
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
+from shearloop.daemon.control.held_tool import HeldTool
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.robotiq.messages import ActivationStatus, GripperFault, GripperState, ObjectStatus
+from shearloop.drivers.robotiq.models import MODELS
+from shearloop.drivers.robotiq.widths import WidthCalibration
+from shearloop.emulators.gripper import Fingers
 from shearloop.errors import ActionError, NotBegunError
 from shearloop.estimation.confidence import TWO_SIDED_95
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
@@ -365,3 +372,43 @@ async def test_absent_gripper_is_reported(tmp_path, monkeypatch):
     async with a_rig("socket", tmp_path) as rig:
         with pytest.raises(DriverError, match="There is no connection to the gripper"):
             await task_of(rig).release()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_no_bare_fingers_make_the_right_tool_look_like_another_one(model):
+    """Whatever their bow, and wherever they are open and closed."""
+    nominal = WidthCalibration.nominal(model)
+    task = GripperTask(SimpleNamespace(model=MODELS[model]), None, Felt(), None, Clock(), measures_diameters=False)
+    shapes = product((3.0, 8.0, 13.0), (227.0, 230.0, 233.0), (0.0, MODELS[model].bow_mm))
+    for open_counts, closed_counts, bow_mm in shapes:
+        fingers = Fingers(MODELS[model], open_counts, closed_counts, bow_mm)
+        for tool_mm in np.arange(2.0, MODELS[model].stroke_mm, 1.0):
+            status = task.status_of(closed_on(round(fingers.counts(tool_mm)), nominal))
+            held = HeldTool(SimpleNamespace(gripper=status), has_gripper=True)
+            assert held.why_not_stated(tool_mm) == ""
+            assert held.why_not_stated(None) == ""
+
+
+def test_another_tool_is_noted_unless_the_gripper_measures_it():
+    nominal = WidthCalibration.nominal("2F-85")
+    notes = []
+    for measures_diameters in (False, True):
+        task = GripperTask(SimpleNamespace(model=MODELS["2F-85"]), None, Felt(), None, Clock(), measures_diameters)
+        status = task.status_of(closed_on(nominal.counts(40.0), nominal))
+        notes.append(HeldTool(SimpleNamespace(gripper=status), has_gripper=True).why_not_stated(20.0))
+    assert "a tool of 20 mm, and by the maker's figures the gripper's fingers are 40." in notes[0]
+    assert notes[1] == "", "the sessions refuse it"
+
+
+def closed_on(counts: int, calibration: WidthCalibration) -> GripperState:
+    """Return the state of fingers that closed on an object at this position."""
+    return GripperState(
+        t_ns=0,
+        position_counts=counts,
+        width_mm=calibration.width_mm(counts),
+        width_std_mm=calibration.width_std_mm,
+        object=ObjectStatus.CONTACT_CLOSING,
+        activation=ActivationStatus.ACTIVE,
+        current_ma=None,
+        fault=GripperFault(0, ""),
+    )

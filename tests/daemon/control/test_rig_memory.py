@@ -125,6 +125,30 @@ def test_the_angle_of_a_grip_is_remembered_and_forgotten_with_the_grip():
     assert not after.control_loop.tool.grip.known
 
 
+@pytest.mark.parametrize("then", ["nothing", "released", "exchanged"])
+def test_the_stated_diameter_is_kept_with_the_grip_and_forgotten_with_it(then):
+    rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 0.1}, tool_mm=20.0)
+    rig.run(5)
+    assert "with a stated diameter of 20 mm" in Remembered.of(rig.control_loop).held
+    after = after_restart(rig)
+    if then == "released":
+        after.force_n = 0.0
+    elif then == "exchanged":
+        after.width_mm = 60.0
+    after.run(0.1)
+    assert after.control_loop.stated_tool_mm == (20.0 if then == "nothing" else None)
+
+
+def test_a_tool_that_was_exchanged_beside_the_daemon_is_not_the_stated_one():
+    rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 0.1}, tool_mm=20.0)
+    rig.run(5)
+    rig.step()
+    assert rig.control_loop.stated_tool_mm == 20.0
+    rig.hand = replace(rig.hand, others_requests=1)
+    rig.step()
+    assert rig.control_loop.stated_tool_mm is None
+
+
 def load_cell(scale_n_per_count: float = 0.001) -> LoadCell:
     return LoadCell(SimpleNamespace(), LoadCalibration(tare_counts=8000.0, scale_n_per_count=scale_n_per_count))
 

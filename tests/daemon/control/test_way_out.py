@@ -19,6 +19,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.loop_runner import UNSEEN_S
 from shearloop.daemon.control.plan import plan_of, speeds_of
+from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.step_motions import first_motion
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ReadExperiment
@@ -28,6 +29,7 @@ from shearloop.daemon.rig import Rig as RigOfDaemon
 from shearloop.daemon.torques import LARGEST_DRIFT_NM, WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import MODELS
+from shearloop.estimation import Measured
 from tests.daemon.control.cell import TWIST, Cell, driven, experiment
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
@@ -668,6 +670,27 @@ async def test_a_second_stop_of_an_operator_ends_the_daemon_at_once(acknowledged
         if acknowledged:
             cell.control_loop.acknowledge()
         assert await stop_command(of_now()) == {"ended": True, "process": os.getpid()}
+
+
+def test_a_stated_diameter_that_an_uncalibrated_gripper_does_not_fit_is_noted_while_its_tool_is_held():
+    rig = Rig(new_loop())
+    # Until the release, the tool of before is held.
+    rig.force_n, rig.hand = 60.0, replace(rig.hand, unmeasured_mm=Measured(40.0, 9.0))
+    started(rig, {"do": "release"}, GRIP, {"do": "wait", "wait_s": 0.5}, tool_mm=20.0)
+    notes: dict[int, str] = {}
+    while rig.control_loop.running is not None:
+        rig.step()
+        held = rig.force_n > 0
+        rig.hand = replace(rig.hand, unmeasured_mm=Measured(40.0, 9.0) if held else None)
+        notes[rig.control_loop.experiment.step_number] = loop_state(rig.control_loop, 0.0, rig.t_ns).torque_note
+    assert "states a tool of 20 mm, and by the maker's figures the gripper's fingers are 40.0 mm apart" in notes[3]
+    assert notes[1] == ""
+    file = ExperimentFile.model_validate(
+        {"name": "test", "tool_mm": 20.0, "steps": [{"do": "twist", "angles_rad": [1]}]}
+    )
+    assert "But the experiment states a tool of 20 mm" in rig.control_loop.operator.held_note(file)
+    as_stated = file.model_copy(update={"tool_mm": 40.0})
+    assert "states" not in rig.control_loop.operator.held_note(as_stated)
 
 
 @pytest.mark.parametrize("released", [False, True])

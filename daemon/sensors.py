@@ -12,7 +12,7 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import patience_of
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask
-from shearloop.daemon.sensing.fingertip_task import ToolHolder
+from shearloop.daemon.sensing.fingertip_task import SessionRecorder, ToolHolder
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.load_cell_task import LoadCellTask
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session, refuse_emulated_calibrations
@@ -22,7 +22,6 @@ from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor, SerialLink
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
-from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.estimation import Session
 
 if TYPE_CHECKING:
@@ -97,7 +96,7 @@ def build_sensors(
     The gripper gives the held tool, and receives the fingertips' diameters.
     """
 
-    def inputs(source: str) -> InputRecorder | None:
+    def inputs(source: str) -> SessionRecorder | None:
         return recorder.input_recorder(source) if recorder is not None else None
 
     def link(name: str, device: SerialDevice) -> SerialLink:

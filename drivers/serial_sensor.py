@@ -4,7 +4,7 @@ import contextlib
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable, Hashable, Sequence
+from collections.abc import AsyncGenerator, Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Generic, Protocol, TypeVar
@@ -64,6 +64,9 @@ class InputRecorder(Protocol):
 
     def record(self, event: RawEvent) -> None:
         """Keep the next input; never blocks."""
+
+    def record_state(self, state: Mapping[str, object], fixed: Mapping[str, object], t_ns: int) -> None:
+        """Keep the state's objects at t_ns; `fixed` are the parts that follow from the configuration, by name."""
 
 
 class LineSplitter:

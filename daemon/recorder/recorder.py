@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import structlog
 from pydantic_core import PydanticSerializationError
 
 from shearloop.daemon.clock import Clock, ClockReading
@@ -29,10 +30,13 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging.messages import LoopState, Scalar
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL, McapFile
+from shearloop.daemon.sensing.fingertip_task import SessionRecorder
+from shearloop.daemon.sensing.session_inputs import session_inputs
 from shearloop.daemon.sensing.sessions import channel_table
-from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
+from shearloop.daemon.sensing.snapshots import SnapshotError, snapshot
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
-from shearloop.estimation import Session
+from shearloop.estimation import BeforeFrame, Session
 from shearloop.files import lock, read_file
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.
@@ -133,6 +137,19 @@ class _SourceRecorder:
     def record(self, event: RawEvent) -> None:
         self.recorder.record_input(self.source, event)
 
+    def record_state(self, state: Mapping[str, object], fixed: Mapping[str, object], t_ns: int) -> None:
+        try:
+            text = snapshot(state, fixed)
+        except SnapshotError as error:
+            # A measurement continues without its recording.
+            structlog.get_logger().error("the recording cannot be replayed from its beginning", reason=str(error))
+            text = b""
+        self.record(RawEvent(InputKind.STATE, t_ns, text))
+
+    def record_before(self, frame: int, before: BeforeFrame, t_ns: int) -> None:
+        for event in session_inputs(frame, before, t_ns):
+            self.record(event)
+
 
 @dataclass(slots=True)
 class _Counts:
@@ -218,7 +235,7 @@ class Recorder:
         size = _OVERHEAD_BYTES + 2 * sum(len(value) for value in content.values() if isinstance(value, bytes))
         self._enqueue(size, partial(self._add_message, topic, content, self._clock.now_ns(), self._clock.reading))
 
-    def input_recorder(self, source: str) -> InputRecorder:
+    def input_recorder(self, source: str) -> SessionRecorder:
         """Return the recorder of one source's raw input."""
         self._carried.sources.add(source)
         return _SourceRecorder(self, source)

@@ -12,8 +12,6 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.fingertip_messages import adapted_message, estimate_message
-from shearloop.daemon.sensing.session_inputs import session_inputs
-from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.sensing.zero_request import ZeroRequest, ZeroState
 from shearloop.daemon.torques import LONGEST_TARE_S, SensorListener, TorqueSample
 from shearloop.drivers.eit_kit import Frame
@@ -35,6 +33,13 @@ from shearloop.words import CountedReasons, counted
 
 # A correction of the gain begins with a frame.
 _LONGEST_WAIT_S = 5.0
+
+
+class SessionRecorder(InputRecorder, Protocol):
+    """Keeps the inputs of one session."""
+
+    def record_before(self, frame: int, before: BeforeFrame, t_ns: int) -> None:
+        """Keep what comes before a frame, by the number of the frame."""
 
 
 class DiameterListener(Protocol):
@@ -83,7 +88,7 @@ class FingertipTask:
     clock: Clock
     loop: SensorListener | None = None
     gripper: ToolHolder | None = None
-    inputs: InputRecorder | None = None
+    inputs: SessionRecorder | None = None
     # The longest time of a tare that no step of an experiment waits for.
     longest_tare_s: float = LONGEST_TARE_S
     count: int = 0
@@ -107,12 +112,12 @@ class FingertipTask:
         before = self._before(frames, now_ns)
         self.session.prepare(before)
         corrected = self._correct_gain()
-        if corrected is None:
-            self._record(frames, before, now_ns)
-        else:
+        if corrected is not None:
             known, correction = corrected
-            self._record(frames, replace(before, known_torques=known), now_ns)
+            before = replace(before, known_torques=known)
             self.publisher.publish(adapted_message(self.name, frames, known.reference, correction))
+        if self.inputs is not None:
+            self.inputs.record_before(frames[0].seq, before, now_ns)
         estimate = await estimate_frames(self.session, frames, fingers_moved=before.fingers_moved)
         now_ns = self.clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
@@ -261,12 +266,7 @@ class FingertipTask:
         """Keep the state of the session, and of the others that belong to it."""
         if self.inputs is not None:
             state = {**others, "session": self.session}
-            record_state(self.inputs, state, self.session.fixed, self.clock.now_ns())
-
-    def _record(self, frames: tuple[Frame, ...], before: BeforeFrame, t_ns: int) -> None:
-        if self.inputs is not None:
-            for event in session_inputs(frames[0].seq, before, t_ns):
-                self.inputs.record(event)
+            self.inputs.record_state(state, self.session.fixed, self.clock.now_ns())
 
 
 def tactile_frame(frames: tuple[Frame, ...], *, fingers_moved: bool = False) -> TactileFrame:

@@ -8,7 +8,6 @@ import structlog
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest
 from shearloop.daemon.torques import LARGEST_DRIFT_NM, LOAD_CELL, SensorListener, TorqueSample, load_of
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
@@ -49,7 +48,7 @@ class LoadCellTask:
             async for samples in batches:
                 inputs = self._board.inputs
                 if not samples and inputs is not None and inputs.wants_state:
-                    record_state(inputs, {"parser": self._board.parser}, {}, self._clock.now_ns())
+                    inputs.record_state({"parser": self._board.parser}, {}, self._clock.now_ns())
                 for sample in samples:
                     self._process(sample)
 

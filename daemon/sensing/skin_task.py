@@ -13,7 +13,6 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
-from shearloop.daemon.sensing.snapshots import record_state
 from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest, ZeroState
 from shearloop.daemon.torques import SensorListener, TorqueSample, TorqueSource
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, LinkObserver, SerialLink
@@ -96,7 +95,7 @@ class SkinTask:
                     self._warn_of_drift()
                 if self._inputs is not None and self._inputs.wants_state:
                     state = {**self._skin.state, "estimator": self._estimator}
-                    record_state(self._inputs, state, self._estimator.fixed, self._clock.now_ns())
+                    self._inputs.record_state(state, self._estimator.fixed, self._clock.now_ns())
 
     def tare(self, *, confirmed: bool = False) -> None:  # noqa: ARG002 - the skin judges by its gauges at rest
         """Take a new zero from samples measured from now on."""

@@ -14,10 +14,7 @@ from enum import Enum
 from typing import Any, Literal
 
 import numpy as np
-import structlog
 from pydantic import BaseModel
-
-from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 
 # Objects of these rooms have a state. The bank's are large, and follow from the configuration.
 _ROOMS = ("shearloop.bank.", "shearloop.estimation.", "shearloop.drivers.", "shearloop.daemon.sensing.")
@@ -29,17 +26,6 @@ _KIND = "$"
 
 class SnapshotError(Exception):
     """A state cannot be stored, or a snapshot does not fit this code."""
-
-
-def record_state(inputs: InputRecorder, state: Mapping[str, object], fixed: Mapping[str, object], now_ns: int) -> None:
-    """Record the state's objects as an input; one that has no stored form is logged, and recorded as empty."""
-    try:
-        text = snapshot(state, fixed)
-    except SnapshotError as error:
-        # A measurement continues without its recording.
-        structlog.get_logger().error("the recording cannot be replayed from its beginning", reason=str(error))
-        text = b""
-    inputs.record(RawEvent(InputKind.STATE, now_ns, text))
 
 
 def snapshot(state: Mapping[str, object], fixed: Mapping[str, object]) -> bytes:

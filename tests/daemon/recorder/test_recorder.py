@@ -401,6 +401,17 @@ def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path, 
     assert [one["frame"] for one in kept] == list(range(20 - dropped))
 
 
+def test_a_state_without_a_stored_form_is_logged_and_recorded_as_empty(tmp_path):
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
+    inputs = recorder.input_recorder("right")
+    with capture_logs() as entries:
+        inputs.record_state({"parser": object()}, {}, 7)
+    recorder.close()
+    assert [entry["event"] for entry in entries] == ["the recording cannot be replayed from its beginning"]
+    (kept,) = topics(recorder.closed_files[0])["input.right"]
+    assert (kept["kind"], kept["data"]) == ("state", "")
+
+
 def test_a_state_that_the_full_queue_drops_is_wanted_again(tmp_path, monkeypatch):
     recorder = Recorder(tmp_path, IDENTITY, Clock())
     inputs = recorder.input_recorder("right")

@@ -20,6 +20,7 @@ from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes
 from shearloop.daemon.sensing.fingertip_task import FingertipTask, tactile_frame
 from shearloop.daemon.sensing.frame_pairing import FramePairing
+from shearloop.daemon.sensing.session_inputs import session_inputs
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.defaults import FRAME_PERIOD_S
@@ -35,6 +36,11 @@ MS = 1_000_000
 PERIOD_S = 0.54
 PERIOD_NS = 540 * MS
 NONE = np.zeros(896, dtype=np.bool_)
+
+
+def keeping(raw: list[RawEvent]) -> Any:
+    """Return a recorder that keeps what comes before each frame, in the form of a recording."""
+    return SimpleNamespace(record_before=lambda *what: raw.extend(session_inputs(*what)))
 
 
 class RecordingPublisher:
@@ -200,7 +206,7 @@ async def test_the_tool_that_an_experiment_states_is_known_before_a_frame_and_re
             tools.append(tool)
 
     recorded: list[RawEvent] = []
-    inputs = SimpleNamespace(record=recorded.append)
+    inputs = keeping(recorded)
     loop = SimpleNamespace(on_torque=lambda _: None, stated_tool_mm=None)
     gripper = resting_gripper()
     gripper.is_holding = True
@@ -279,27 +285,24 @@ class Reads:
 
 
 class Inputs:
-    """The recorder of one source, in a file that began in the middle of a run."""
+    """The recorder of one source, in a file that began in the middle of a run; it adds itself to a state as `of`."""
 
-    wants_state = True
+    def __init__(self, states: list[dict[str, Any]]) -> None:
+        self.wants_state = True
+        self._states = states
 
+    def record_state(self, state: Mapping[str, object], _fixed: object, _t_ns: int) -> None:
+        self.wants_state = False
+        self._states.append({**state, "of": self})
 
-@pytest.fixture
-def states(monkeypatch) -> list[dict[str, Any]]:
-    """The recorded states, with the recorder as `of`."""
-    kept: list[dict[str, Any]] = []
-
-    def keep(inputs: Inputs, state: dict[str, Any], _fixed: object, _now_ns: int) -> None:
-        inputs.wants_state = False
-        kept.append({**state, "of": inputs})
-
-    monkeypatch.setattr("shearloop.daemon.sensing.fingertip_task.record_state", keep)
-    return kept
+    def record_before(self, *_what: object) -> None:
+        pass
 
 
-async def test_a_busy_fingertip_keeps_no_other_state_from_a_recording(states):
+async def test_a_busy_fingertip_keeps_no_other_state_from_a_recording():
+    states = list[dict[str, Any]]()
     publisher, slow, combined = RecordingPublisher(3), FakeSession(waits=0), pairs(RecordingPublisher())
-    right, left, both = Inputs(), Inputs(), Inputs()
+    right, left, both = Inputs(states), Inputs(states), Inputs(states)
     combined.inputs, combined.sides = both, (right, left)
     # A read that completes no frame comes before the first one that a file has.
     busy = BoardTask("right", slow, publisher, Clock(), inputs=right, board=Reads([frame(0)], []), combined=combined)
@@ -314,9 +317,10 @@ async def test_a_busy_fingertip_keeps_no_other_state_from_a_recording(states):
     assert [one["of"] for one in states] == [left, right, both]
 
 
-async def test_pairs_that_wait_are_a_part_of_the_state(states):
+async def test_pairs_that_wait_are_a_part_of_the_state():
+    states = list[dict[str, Any]]()
     combined = pairs(RecordingPublisher())
-    combined.inputs = Inputs()
+    combined.inputs = Inputs(states)
     for number in range(2):
         for side in ("right", "left"):
             combined.add(side, [frame(number)])
@@ -324,7 +328,7 @@ async def test_pairs_that_wait_are_a_part_of_the_state(states):
     (state,) = states
     assert [[one.seq for one in pair] for pair in state["pairs"]] == [[0, 0], [1, 1]]
     # None is recorded while an estimate is made; the next one is after it.
-    combined.inputs = Inputs()
+    combined.inputs = Inputs(states)
     combined.session = slow = FakeSession(waits=0)
     async with running(combined.process_pairs()) as (processing,):
         await asyncio.to_thread(slow.begun.wait)
@@ -338,7 +342,7 @@ async def test_pairs_that_wait_are_a_part_of_the_state(states):
 @pytest.mark.parametrize("since_ms", [1, 100, 540, 621])
 async def test_a_tare_begins_with_the_first_frame_acquired_after_it(since_ms):
     clock, session, raw = FixedClock(), FakeSession(), list[RawEvent]()
-    task = estimates("right", RecordingPublisher(), session, clock, inputs=SimpleNamespace(record=raw.append))
+    task = estimates("right", RecordingPublisher(), session, clock, inputs=keeping(raw))
     asked_ns = clock.t_ns
     task.tare()
     for seq in range(5):
@@ -478,7 +482,7 @@ async def test_a_wait_for_a_tare_that_ends_without_one_leaves_a_later_tare():
 async def test_a_session_that_begins_with_an_idle_frame_takes_none_after_a_tare_that_no_frame_came_for(log):
     """The paper's method takes its first frames for idle; these come after the time of a tare, and could be loaded."""
     clock, session, raw = FixedClock(), Taring(), list[RawEvent]()
-    task = estimates("right", RecordingPublisher(), session, clock, inputs=SimpleNamespace(record=raw.append))
+    task = estimates("right", RecordingPublisher(), session, clock, inputs=keeping(raw))
     task.tare()
     clock.t_ns += round(task.longest_tare_s * 1e9) + 1
     for number in (0, 1):
@@ -490,7 +494,7 @@ async def test_a_session_that_begins_with_an_idle_frame_takes_none_after_a_tare_
 
 async def test_a_tare_of_a_fingertip_that_is_not_there_is_not_taken_at_the_load_of_a_later_hour(log):
     clock, session, raw = FixedClock(), FakeSession(), list[RawEvent]()
-    task = estimates("right", RecordingPublisher(), session, clock, inputs=SimpleNamespace(record=raw.append))
+    task = estimates("right", RecordingPublisher(), session, clock, inputs=keeping(raw))
     task.tare()
     assert task.taring
     clock.t_ns += round(task.longest_tare_s * 1e9) + 1
@@ -504,7 +508,7 @@ async def test_a_tare_of_a_fingertip_that_is_not_there_is_not_taken_at_the_load_
 
 async def test_a_tare_that_lost_its_board_on_the_way_gives_no_estimate_until_the_next(log):
     clock, session, raw = FixedClock(), Taring(), list[RawEvent]()
-    task = estimates("right", RecordingPublisher(), session, clock, inputs=SimpleNamespace(record=raw.append))
+    task = estimates("right", RecordingPublisher(), session, clock, inputs=keeping(raw))
     task.tare()
     await task.process(frame(0, clock.t_ns + PERIOD_NS + 80 * MS))
     assert session.tared_before == [0]
@@ -521,7 +525,7 @@ async def test_no_idle_frame_is_of_a_gripped_tool(complete, said, log):
     """The daemon was started again with a tool in the fingers: the paper's method takes its first frames for idle."""
     session, raw = Taring(), list[RawEvent]()
     gripper = resting_gripper()
-    task = estimates("right", RecordingPublisher(), session, gripper=gripper, inputs=SimpleNamespace(record=raw.append))
+    task = estimates("right", RecordingPublisher(), session, gripper=gripper, inputs=keeping(raw))
     for number, gripper.is_holding in enumerate([*said, True]):
         await task.process(frame(number))
         # It may have been completed before the gripper was connected.
@@ -571,7 +575,7 @@ async def test_a_frame_is_of_moving_fingers_if_they_moved_during_any_part_of_its
 
     gripper = resting_gripper()
     gripper.is_holding, gripper.moved_between = False, motion.moved_between
-    inputs = SimpleNamespace(record=raw.append)
+    inputs = keeping(raw)
     task = estimates(COMBINED, RecordingPublisher(), Seeing(), clock, gripper=gripper, inputs=inputs)
     await task.process(frame(7, arrives_ns), frame(7, arrives_ns))
     assert seen == [moved]

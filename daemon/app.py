@@ -87,7 +87,8 @@ class Daemon:
             if self.recorder is not None:
                 self.publisher.add_listener(self.recorder.record_message)
                 opened.callback(self.recorder.close)
-            self.health = HealthReporter(self.publisher, self.supervisor, clock, config.emulated, config.name)
+            running_rig = RunningRig.of(config, robot[0].host if robot is not None else None)
+            self.health = HealthReporter(self.publisher, self.supervisor, clock, running_rig)
             self.rig: Rig | None = None
             self._experiment: ConfiguredExperiment | None = None
             torques = LatestTorques()
@@ -98,7 +99,6 @@ class Daemon:
             tare_refusal = torques.tare_refusal if self.rig is None else self.rig.tare_refusal
             self.health.refusals["tare"] = tare_refusal
             report = partial(self._report, clock)
-            running_rig = RunningRig.of(config, robot[0].host if robot is not None else None)
             self.commands = Commands(
                 self.rig, self.sensors, self._experiment, self.health, self.ending, tare_refusal, report, running_rig
             )
@@ -132,8 +132,9 @@ class Daemon:
         from shearloop.daemon.rig import build_rig
 
         self.sensors, self.rig = build_rig(
-            config, settings, files, sessions, self.publisher, clock, self.recorder, self.supervisor
-        )
+            config, settings, files, sessions, self.publisher, clock, self.recorder, self.supervisor,
+            self.health.running_rig.instance,
+        )  # fmt: skip
         if self.rig.commissioning is not None:
             self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
         self.health.refusals |= {"start": self.rig.start_refusal, "release": self.rig.runner.release_refusal}

@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-import secrets
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -80,8 +79,6 @@ class Commands:
     report: Callable[["Answered"], None] = lambda _: None
     running_rig: RunningRig = field(default_factory=RunningRig)
     now_ns: Callable[[], int] = boot_ns
-    # Random for each process, because every process in a container has the same number.
-    instance: str = field(default_factory=lambda: secrets.token_hex(8))
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
@@ -113,7 +110,7 @@ class Commands:
         refusal: str | None = f"{name} was ended before it was done"
         try:
             check_arguments(name, request)
-            if name != STOP and request.get("instance", self.instance) != self.instance:
+            if name != STOP and not self._is_for_this_one(request):
                 raise CommandRefusedError(_ANOTHER_DAEMON)
             if name not in MAY_BE_UNBOUND and not request.get("ask"):
                 _refuse_if(_why_unbound(name, request))
@@ -131,6 +128,10 @@ class Commands:
             if not request.get("ask"):
                 self.report(Answered(name, request, refusal))
         return reply
+
+    def _is_for_this_one(self, request: Request) -> bool:
+        """Return whether a request is meant for this daemon, and not for one before it."""
+        return bool(request.get("instance", self.running_rig.instance) == self.running_rig.instance)
 
     def _deadline(self, request: Request) -> Deadline:
         return Deadline(request.get("until_ns"), self.now_ns(), self.now_ns)
@@ -252,20 +253,14 @@ class Commands:
 
     async def _status(self, _request: Request) -> Reply:
         tasks = self.health.tasks()
-        daemon = {
-            "process": os.getpid(),
-            "instance": self.instance,
-            "folder": os.getcwd(),
-            "now_ns": self.now_ns(),
-            **asdict(self.running_rig),
-        }
+        daemon = {"process": os.getpid(), "folder": os.getcwd(), "now_ns": self.now_ns(), **asdict(self.running_rig)}
         if self.rig is None:
             return {"tasks": tasks, "daemon": daemon}
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}
 
     async def _stop(self, request: Request) -> Reply:
-        # The number of the process shows a page that it displayed another daemon.
-        return {**self._stopped(request), "process": os.getpid()}
+        # The instance shows a page that it displayed another daemon.
+        return {**self._stopped(request), "process": os.getpid(), "instance": self.running_rig.instance}
 
     def _stopped(self, request: Request) -> Reply:
         """Stop a motion or the beginning of one, else the daemon; return what was stopped."""
@@ -288,7 +283,11 @@ class Commands:
         if self.rig is not None and (ended := self.rig.runner.ended_unseen()) is not None:
             return {"stopped": "", "ended_by_itself": ended}
         if not self._may_end_daemon(request):
-            return {"stopped": "", "idle": True, "daemon": {"instance": self.instance, "now_ns": self.now_ns()}}
+            return {
+                "stopped": "",
+                "idle": True,
+                "daemon": {"instance": self.running_rig.instance, "now_ns": self.now_ns()},
+            }
         # Nothing moves, so the daemon itself stops, once the reply is sent.
         asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
         return {"ended": True}
@@ -298,9 +297,8 @@ class Commands:
 
         An older one may have waited on its way, and the daemon may be in use again.
         """
-        for_this_one = request.get("instance", self.instance) == self.instance
         is_dated = type(request.get("until_ns")) is int
-        return for_this_one and is_dated and self._deadline(request).why_passed() is None
+        return self._is_for_this_one(request) and is_dated and self._deadline(request).why_passed() is None
 
 
 def check_arguments(name: str, request: Request) -> None:

@@ -1,6 +1,5 @@
 """The rig: builds robot, gripper and control loop from the configuration."""
 
-import secrets
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -221,13 +220,13 @@ class Rig:
     tasks: Mapping[str, Task]
     experiments: ExperimentFiles
     recorder: "Recorder | None"
+    # The daemon's own, so that a question of an earlier one asks for another moment.
+    instance: str
     # None where the emulated devices end with the daemon.
     memory: RigMemory | None = None
     commissioning: Commissioning | None = None
     # The file of the experiment that is about to begin.
     starting: str = field(default="", init=False)
-    # Of this process: in a container, each has the same number.
-    token: str = field(default_factory=lambda: secrets.token_hex(8))
 
     def start_refusal(self) -> str | None:
         """Return why no experiment can begin, or None."""
@@ -322,7 +321,7 @@ class Rig:
         """Return what changes with each process, stop and run: a question from before it asks for another moment."""
         loop = self.control_loop
         stops = f"{self.runner.stop_count} stops, {loop.safety.acknowledgements} acknowledged"
-        return self.token, stops, f"{loop.runs} runs"
+        return self.instance, stops, f"{loop.runs} runs"
 
     def state(self) -> Mapping[str, Any]:
         """Return what `status` shows of the control loop."""
@@ -340,10 +339,11 @@ def build_rig(
     clock: Clock,
     recorder: "Recorder | None",
     supervisor: Supervisor,
+    instance: str,
 ) -> tuple[Sensors, Rig]:
     """Return robot, gripper and control loop, and all sensors, which drive it.
 
-    `settings` and `files` are the robot's.
+    `settings` and `files` are the robot's, `instance` is the daemon's.
     """
     sources = torque_sources(config, sessions.fingertips, sessions.combined)
     commissioning = commissioning_of(config, settings)
@@ -364,4 +364,4 @@ def build_rig(
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
     if memory is not None:
         tasks["memory"] = memory
-    return sensors, Rig(loop, runner, tasks, experiments, recorder, memory, commissioning)
+    return sensors, Rig(loop, runner, tasks, experiments, recorder, instance, memory, commissioning)

@@ -1,5 +1,6 @@
-"""Which rig a daemon drives, as it says in its reply to `status`."""
+"""Which daemon this is, and which rig it drives, as it says in `health` and in its reply to `status`."""
 
+import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Self
@@ -14,13 +15,18 @@ EMULATED_HEADING: Final = f"{EMULATED}: every device of this rig is emulated."
 
 @dataclass(frozen=True, slots=True)
 class RunningRig:
-    """The rig of a daemon: its name, whether it is emulated, its address of messages, and its devices."""
+    """The rig of a daemon: its name, whether it is emulated, its address of messages, and its devices.
+
+    `instance` is the daemon's own.
+    """
 
     rig: str = ""
     emulated: bool = False
     publish: str = ""
     # The address of each device, by its key in the configuration.
     devices: Mapping[str, str] = field(default_factory=dict)
+    # Random for each daemon: in a container, each process has the same number.
+    instance: str = field(default_factory=lambda: secrets.token_hex(8))
 
     @classmethod
     def of(cls, config: "DaemonConfig", robot_host: str | None) -> Self:

@@ -14,6 +14,7 @@ import structlog
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import DaemonEnd, Health, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sd_notify import notify
 from shearloop.words import counted
 
@@ -103,9 +104,7 @@ class HealthReporter:
     publisher: Publisher
     supervisor: Supervisor
     clock: Clock
-    # Every device is emulated.
-    emulated: bool = False
-    rig: str = ""
+    running_rig: RunningRig = field(default_factory=RunningRig)
     # Why each of some commands is refused now, or None.
     refusals: dict[str, Callable[[], str | None]] = field(default_factory=dict)
     reporters: dict[str, Reporter] = field(default_factory=dict)
@@ -154,8 +153,9 @@ class HealthReporter:
                 tasks=self.tasks(),
                 host=platform.node(),
                 process=os.getpid(),
-                rig=self.rig,
-                emulated=self.emulated,
+                instance=self.running_rig.instance,
+                rig=self.running_rig.rig,
+                emulated=self.running_rig.emulated,
                 cap=self.cap(),
                 tare_refusal=self._refusal("tare"),
                 start_refusal=self._refusal("start"),

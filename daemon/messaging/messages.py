@@ -302,6 +302,7 @@ class Health(Message):
     )
     host: str = column("", "name of the computer that the daemon runs on")
     process: int = column("", "number of the daemon's process; `status` has it too")
+    instance: str = column("", "random text of the daemon's own, another one after a restart; `status` has it too")
     rig: str = column("", "name of the rig: the configuration's `name`, else the name of its file")
     emulated: bool = column("", "whether every device is emulated, by `emulated: true` in the configuration")
     cap: str = column("", "cap on a robot's speeds and torque, and its reason; empty without a cap")

@@ -99,23 +99,24 @@ class Bridge:
         """
         content = {"command": name, "by": caller(PROGRAM), **arguments}
         status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
-        self._check_shown(status.get("daemon", {}).get("process"), "nothing was sent to it")
+        self._check_shown(status.get("daemon", {}), "nothing was sent to it")
         # The daemon, or this process, may have stood still since the click.
         age_s = self.moments.since_s(clicked_ns) if clicked_ns is not None else 0.0
         content |= meant_for(status, age_s, CLICK_WITHIN_S)
         return await self._request(content, UNLOCK_TIMEOUT_S if name in SLOW else COMMAND_TIMEOUT_S)
 
-    def _check_shown(self, process: int | None, done: str) -> None:
-        """Raise UserError if the page shows another daemon than this process; `done` says what that one did.
+    def _check_shown(self, daemon: Mapping[str, Any], done: str) -> None:
+        """Raise UserError if the page shows another daemon than this one; `done` says what that one did.
 
-        After a restart of the daemon they differ for a second.
+        After a restart of the daemon they differ for a second. Daemons in containers may have the same number of
+        process, so their instances decide.
         """
-        shown = self.latest.process
-        if shown is not None and process not in (None, shown):
+        shown = self.latest.instance
+        if shown is not None and daemon.get("instance") != shown:
             raise UserError(
-                f"the page shows the daemon at {self.address.publish}, process {shown}, and the one at "
-                f"{self.address.commands} is process {process}: {done}. After a restart of the daemon try again; else "
-                "start the page with the addresses of one daemon"
+                f"the page shows the daemon at {self.address.publish}, process {self.latest.process}, and the one at "
+                f"{self.address.commands} is another one, process {daemon.get('process')}: {done}. After a restart of "
+                "the daemon try again; else start the page with the addresses of one daemon"
             )
 
     async def stop(self) -> dict[str, Any]:
@@ -136,7 +137,7 @@ class Bridge:
             with contextlib.suppress(TimeoutError, StopSocketTakenError):
                 reply = await asyncio.to_thread(send_to_stop_socket, address, content, COMMAND_TIMEOUT_S)
         reply = reply or await self._request(content, COMMAND_TIMEOUT_S)
-        self._check_shown(reply.get("process"), "that one was stopped")
+        self._check_shown(reply, "that one was stopped")
         return reply
 
     async def _request(self, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:

@@ -69,8 +69,9 @@ class MessageStore:
         self.number = 0
         # Whether the latest message says that the daemon has ended.
         self._ended = False
-        # The daemon's process, by its latest `health`.
+        # The daemon's process and instance, by its latest `health`.
         self.process: int | None = None
+        self.instance: str | None = None
         self.refused: Counter[str] = Counter()
         self._log = EventLog()
 
@@ -92,7 +93,7 @@ class MessageStore:
             self.number += 1
             self._ended = topic == DaemonEnd.topic
             if topic == Health.topic:
-                self.process = content.get("process")
+                self.process, self.instance = content.get("process"), content.get("instance")
             self._stored[topic, source] = StoredMessage(self.number, now_s, text.removeprefix("{"))
             self._log.add(topic, content, self.number)
             if topic in CHARTED:

@@ -243,7 +243,7 @@ class Runner:
         self.started.append((file.name, stops_before))
 
 
-def rig(folder: Path, runner: Runner) -> Rig:
+def rig(folder: Path, runner: Runner, instance: str = "a1") -> Rig:
     return Rig(
         SimpleNamespace(
             warm_up_s=0.0,
@@ -261,6 +261,7 @@ def rig(folder: Path, runner: Runner) -> Rig:
         {},
         ExperimentFiles((folder,)),
         None,
+        instance,
     )
 
 
@@ -424,6 +425,9 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
     with pytest.raises(CommandRefusedError, match="since its plan was shown, the file or the effect"):
         await start({"experiment": str(path), "digest": asked["digest"]})
     runner.stop_count = 0
+    after_restart = answers_of(rig(folder, runner, instance="b2"))["start"]
+    with pytest.raises(CommandRefusedError, match="since its plan was shown, the file or the effect"):
+        await after_restart({"experiment": str(path), "digest": asked["digest"]})
     await start({"experiment": str(path), "digest": asked["digest"]})
     # Who asks nothing names the file as it is.
     await start({"experiment": str(path)})

@@ -26,6 +26,7 @@ from shearloop.daemon.experiment_files import ReadExperiment
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.rig import Rig as RigOfDaemon
+from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.torques import LARGEST_DRIFT_NM, WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import MODELS
@@ -36,6 +37,8 @@ from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 from tests.fixtures.daemons import bound_handlers, of_now
 
 WAIT = {"do": "wait", "wait_s": 60}
+RUNNING_RIG = RunningRig(instance="a1")
+THIS_DAEMON = {"process": os.getpid(), "instance": "a1"}
 
 
 @asynccontextmanager
@@ -120,7 +123,7 @@ async def test_a_release_of_another_moment_than_its_question_opens_nothing(betwe
             cell.control_loop.safety.stop(Fault(FaultCode.PROTECTIVE_STOP, "it met something"))
         await cell.cycles(5)
         cell.control_loop.acknowledge()
-        answering = commands_of(cell)["release"] if between == "another process" else asking
+        answering = commands_of(cell, "b2")["release"] if between == "another process" else asking
         with pytest.raises(CommandRefusedError, match="changed since the question") as refused:
             await answering({"confirmed": True, "digest": asked["digest"]})
         assert cell.gripper.asked == []
@@ -130,14 +133,15 @@ async def test_a_release_of_another_moment_than_its_question_opens_nothing(betwe
         assert await answered == {}
 
 
-def commands_of(cell: Cell) -> Any:
-    return commands_with(RigOfDaemon(cell.control_loop, cell.runner, {}, None, None))
+def commands_of(cell: Cell, instance: str = "a1") -> Any:
+    return commands_with(RigOfDaemon(cell.control_loop, cell.runner, {}, None, None, instance))
 
 
 def commands_with(rig: RigOfDaemon, sensors: dict[str, Any] | None = None) -> Any:
     health = SimpleNamespace(tasks=dict)
+    sensed = SimpleNamespace(tareable=sensors)
     return bound_handlers(
-        Commands(rig, SimpleNamespace(tareable=sensors), None, health, asyncio.Event(), rig.tare_refusal)
+        Commands(rig, sensed, None, health, asyncio.Event(), rig.tare_refusal, running_rig=RUNNING_RIG)
     )
 
 
@@ -187,7 +191,7 @@ async def unlocked(cell: Cell, unlock: Any, **arguments: Any) -> dict[str, Any]:
 async def test_an_unlock_acknowledges_the_stop_that_was_shown_and_no_other():
     """A second person presses STOP just before the unlock of the first one arrives, and a third one after that."""
     async with with_gripper() as cell:
-        rig = RigOfDaemon(cell.control_loop, cell.runner, {}, None, None)
+        rig = RigOfDaemon(cell.control_loop, cell.runner, {}, None, None, "a1")
         unlock = commands_with(rig)["unlock"]
         cell.runner.stop(also_idle=True)
         await cell.cycles(3)
@@ -422,7 +426,7 @@ async def test_no_zero_is_taken_while_an_experiment_starts():
         cell.holding = False
         await cell.cycles(5)
         files, cell.sensors["load_cell"] = OneFile(), Tared()
-        commands = commands_with(RigOfDaemon(cell.control_loop, cell.runner, {}, files, None), cell.sensors)
+        commands = commands_with(RigOfDaemon(cell.control_loop, cell.runner, {}, files, None, "a1"), cell.sensors)
         starting = asyncio.create_task(commands["start"]({"experiment": "/rig/grip.yaml"}))
         await files.asked.wait()
         for confirmed in (False, True):
@@ -634,7 +638,7 @@ async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
         await cell.cycles(1)
         ends = asyncio.Event()
         rig = SimpleNamespace(control_loop=cell.control_loop, runner=cell.runner)
-        commands = Commands(rig, SimpleNamespace(), None, SimpleNamespace(), ends, None)
+        commands = Commands(rig, SimpleNamespace(), None, SimpleNamespace(), ends, None, running_rig=RUNNING_RIG)
         stop_command = commands.handlers()["stop"]
         for _ in range(2):
             reply = await stop_command(of_now())
@@ -647,7 +651,7 @@ async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():
         assert "ended" not in await stop_command({"command": "stop", "spare_deamon": True}), (
             "a misspelt word ends nothing"
         )
-        assert await stop_command(of_now()) == {"ended": True, "process": os.getpid()}
+        assert await stop_command(of_now()) == {"ended": True, **THIS_DAEMON}
 
 
 async def test_a_stop_just_after_an_experiment_has_ended_by_itself_does_not_end_the_daemon():
@@ -655,9 +659,9 @@ async def test_a_stop_just_after_an_experiment_has_ended_by_itself_does_not_end_
     async with driven({"do": "wait", "wait_s": 0.1}) as cell:
         await cell.until_done()
         stop_command = commands_of(cell)["stop"]
-        assert await stop_command(of_now()) == {"stopped": "", "ended_by_itself": "test", "process": os.getpid()}
+        assert await stop_command(of_now()) == {"stopped": "", "ended_by_itself": "test", **THIS_DAEMON}
         await cell.cycles(round(UNSEEN_S * 1e9 / CYCLE_NS) + 1)
-        assert await stop_command(of_now()) == {"ended": True, "process": os.getpid()}
+        assert await stop_command(of_now()) == {"ended": True, **THIS_DAEMON}
 
 
 @pytest.mark.parametrize("acknowledged", [False, True])
@@ -669,7 +673,7 @@ async def test_a_second_stop_of_an_operator_ends_the_daemon_at_once(acknowledged
         await cell.cycles(5)
         if acknowledged:
             cell.control_loop.acknowledge()
-        assert await stop_command(of_now()) == {"ended": True, "process": os.getpid()}
+        assert await stop_command(of_now()) == {"ended": True, **THIS_DAEMON}
 
 
 def test_a_stated_diameter_that_an_uncalibrated_gripper_does_not_fit_is_noted_while_its_tool_is_held():

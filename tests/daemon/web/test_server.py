@@ -298,15 +298,16 @@ async def test_a_command_is_meant_for_the_daemon_that_answered_just_before(tmp_p
 
 async def test_a_page_that_shows_one_daemon_moves_no_other_one_and_says_which_it_stopped(tmp_path):
     async def status(_request: Mapping[str, Any]) -> dict[str, Any]:
-        return {"tasks": {}, "daemon": {"process": 22, "rig": "other", "folder": "/"}}
+        return {"tasks": {}, "daemon": {"process": 22, "instance": "a1", "rig": "other", "folder": "/"}}
 
     async def stop(_request: Mapping[str, Any]) -> dict[str, Any]:
-        return {"stopped": "hold", "process": 22}
+        return {"stopped": "hold", "process": 22, "instance": "a1"}
 
     async with served(tmp_path, status=status, stop=stop) as page:
         shown = {"source": "daemon", "timestamp": 0.0, "t_mono_ns": 0, "seq": 0, "topic": "health"}
-        for process, answers in ((22, 200), (11, 503)):
-            page.bridge.latest.add("health", {**shown, "process": process}, 0.0)
+        # Each process in a container may have the same number.
+        for instance, answers in (("a1", 200), ("b2", 503)):
+            page.bridge.latest.add("health", {**shown, "process": 22, "instance": instance}, 0.0)
             for name in NEEDS_TOKEN:
                 digest = "?digest=d" if name in ASKED else ""
                 code, _ = await post(page, f"/commands/{name}{digest}", **BEARER)

@@ -16,7 +16,6 @@ from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
 from shearloop.daemon.control.state_publisher import loop_state
-from shearloop.daemon.control.step_motions import first_motion
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment, check_experiment
 from shearloop.daemon.loaded_files import LoadedFiles
@@ -298,16 +297,15 @@ class Rig:
 
     def _question_of(self, experiment: ReadExperiment) -> Question:
         # Nothing runs while somebody asks, and nothing else needs the plan.
-        from shearloop.daemon.control.plan import plan_of, speeds_of
+        from shearloop.daemon.control.plan import plan_of
 
         file = experiment.file
         robot = self.experiments.robot
         limits = robot.settings.limits if robot is not None else None
-        motion = first_motion(file, self.experiments.gripper, speeds_of(limits))
         operator, tool = self.control_loop.operator, self.control_loop.tool
         start, warm_up_s = operator.known_at_start(), self.control_loop.warm_up_s
         plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=warm_up_s, start=start)
-        note = operator.activation_note(file)
+        motion, note = plan.first_motion, operator.activation_note(file)
         text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
         if tool_note := self.experiments.tool_note(file):
             sentences = (*sentences, f"  {tool_note}")

@@ -10,10 +10,10 @@ from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
 from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool, either_way, ways_between
 from shearloop.daemon.control.step_demands import Demand, demands
-from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare, opens_to
+from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare
 from shearloop.daemon.control.turns import Turn, reversals, turns
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
-from shearloop.drivers.robotiq.models import GripperModel
+from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM, GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
 # A gripper feels a tool that is wider than its target by this much: by the manual it takes some millimetres.
@@ -26,7 +26,8 @@ class StepPlan:
 
     `torque_nm` is None if the step turns the tool by an angle, because its torque is not known before. `reverses` says
     whether the step turns a held tool against the previous turn, `may_reverse` whether it may do so, `turns_back`
-    whether it turns both ways, `way_unknown` whether it turns a tool in a direction that is not known before.
+    whether it turns both ways, `way_unknown` whether it turns a tool in a direction that is not known before. `moves`
+    says whether arm or fingers move.
     """
 
     number: int
@@ -42,6 +43,7 @@ class StepPlan:
     may_reverse: bool = False
     turns_back: bool = False
     way_unknown: bool = False
+    moves: bool = True
     notes: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
 
@@ -93,6 +95,14 @@ class Plan:
     def force_n(self) -> float:
         """The largest force of the fingers."""
         return max(step.force_n for step in self.steps)
+
+    @property
+    def first_motion(self) -> str:
+        """The first motion, as a sentence for the operator who starts the experiment."""
+        first = next((step for step in self.steps if step.moves), None)
+        if first is None:
+            return "no step moves anything"
+        return f"the first motion is step {first.number} of {len(self.steps)} ({first.do}), which {first.text}"
 
     def as_json(self) -> dict[str, Any]:
         """Return the plan for a script."""
@@ -185,7 +195,7 @@ def plan_of(
             StepPlan(
                 number=number,
                 do=step.do,
-                text=_words(step, turn, gripper),
+                text=_words(step, turn, gripper, speeds),
                 duration_s=duration_s,
                 direction=turn.direction or "",
                 torque_nm=None if turn.by_angle else needs.torque_nm,
@@ -196,6 +206,7 @@ def plan_of(
                 may_reverse=number in ways.possible,
                 turns_back=_turns_back(step, turn.direction),
                 way_unknown=turn.way_unknown,
+                moves=not isinstance(step, steps.TareStep | steps.AdaptStep | steps.WaitStep),
                 notes=tuple(notes),
                 refused=(refused or {}).get(number - 1, ()),
             )
@@ -287,41 +298,57 @@ def _assumed(file: ExperimentFile) -> str:
     return ""
 
 
-def _words(step: Step, turn: Turn, gripper: GripperModel | None) -> str:
+def _words(step: Step, turn: Turn, gripper: GripperModel | None, speeds: Speeds) -> str:
     match step:
         case steps.ApproachStep(pose_m_rad=pose) if pose is not None:
             x, y, z = pose[:3]
-            return f"moves in a straight line to x {x:g}, y {y:g}, z {z:g} m at {step.speed_m_per_s:g} m/s"
+            return (
+                f"moves the arm in a straight line to x {x:g}, y {y:g}, z {z:g} m {speeds.moving(step.speed_m_per_s)}"
+            )
         case steps.ApproachStep(along_tool_m=distance_m):
             way = "away from the robot" if (distance_m or 0.0) >= 0 else "towards the robot"
-            return f"moves {1e3 * abs(distance_m or 0.0):g} mm along the tool, {way}, at {step.speed_m_per_s:g} m/s"
+            along_mm = 1e3 * abs(distance_m or 0.0)
+            return f"moves the arm {along_mm:g} mm along the tool, {way}, {speeds.moving(step.speed_m_per_s)}"
         case steps.GripStep():
             empty = "stops the experiment if it meets nothing" if step.expect_object else "may meet nothing"
             to = f"closes the fingers to {step.width_mm:g} mm, or onto a tool, at {step.speed_mm_per_s:g} mm/s"
             return f"{to} with up to {step.force_n:g} N; {empty}"
         case steps.ReleaseStep():
-            return f"opens the fingers {opens_to(step, gripper)}: a held tool drops"
+            return f"opens the fingers {_opens_to(step, gripper)}: a held tool drops"
         case steps.TareStep():
             return "takes the zero of every torque sensor; nothing turns"
         case steps.IdentifyStep():
-            return f"measures the tool with small twists of up to {_angle(step.amplitude_rad)}"
+            return f"turns the wrist to and fro by up to {_angle(step.amplitude_rad)}, to measure the tool"
         case steps.AdaptStep():
             return f"corrects the gain of {step.fingertip} by the {step.reference.replace('_', ' ')}; nothing turns"
         case steps.TurnToStep():
-            return f"turns wrist 3 to {_angle(step.angle_rad)} at {step.speed_rad_per_s:g} rad/s"
+            return f"turns wrist 3 to {_angle(step.angle_rad)} {speeds.turning(step.speed_rad_per_s)}"
         case steps.TwistStep():
-            return _twist(step, turn)
+            return _twist(step, turn, speeds)
         case steps.HoldTorqueStep():
-            way = steps.direction_of(step.signed_torque_nm) or "to rest"
-            return f"brings the torque to {abs(step.torque_nm):g} N·m {way} and holds it for {step.hold_s:g} s"
+            direction = steps.direction_of(step.signed_torque_nm)
+            way = f" {direction}" if direction is not None else ""
+            until = f"until the torque is {abs(step.torque_nm):g} N·m{way}"
+            return f"turns the wrist {until}, and holds it for {step.hold_s:g} s"
         case steps.TightenStep():
             until = f"until {step.until_torque_nm:g} N·m or {_angle(step.until_angle_rad)}"
-            return f"turns {step.direction} at {step.speed_rad_per_s:g} rad/s {until}"
+            return f"turns the wrist {step.direction} {speeds.turning(step.speed_rad_per_s)} {until}"
         case steps.WaitStep():
             return f"stands still for {step.wait_s:g} s"
 
 
-def _twist(step: steps.TwistStep, turn: Turn) -> str:
+def _opens_to(step: steps.ReleaseStep, gripper: GripperModel | None) -> str:
+    """Return how far a step opens the fingers of a gripper, in words; as it is written where none is known.
+
+    A width that would not let a held tool go opens them fully.
+    """
+    stroke_mm = LARGEST_STROKE_MM if gripper is None else gripper.stroke_mm
+    if step.width_mm >= stroke_mm:
+        return f"to {stroke_mm:g} mm"
+    return f"to {step.width_mm:g} mm, or fully where they hold something about as wide or wider"
+
+
+def _twist(step: steps.TwistStep, turn: Turn, speeds: Speeds) -> str:
     angles_rad = step.angles_rad
     count = len(angles_rad)
     if count == 1:
@@ -336,7 +363,7 @@ def _twist(step: steps.TwistStep, turn: Turn) -> str:
         first = f", {way}" if turns_once else f", first {way}"
     then = f"holds each for {step.hold_s:g} s" + (" and returns" if step.return_to_start else "")
     times = f", {step.repeats} times" if step.repeats > 1 else ""
-    return f"twists to {places} {since}{first}, {then}{times}, at {step.speed_rad_per_s:g} rad/s"
+    return f"twists the wrist to {places} {since}{first}, {then}{times}, {speeds.turning(step.speed_rad_per_s)}"
 
 
 def _turns_back(step: Step, begins: steps.Direction | None) -> bool:
@@ -375,13 +402,14 @@ def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None)
         case steps.ApproachStep():
             largest_m_per_s = robot.linear_speed_m_per_s.inner
             if step.speed_m_per_s > largest_m_per_s:
-                yield f"the robot's limit allows {largest_m_per_s:g} m/s"
+                yield f"it asks for {step.speed_m_per_s:g} m/s, and the robot's limit allows {largest_m_per_s:g} m/s"
             if step.pose_m_rad is None:
                 yield "its end is checked against the workspace as it begins: it depends on where the tool is"
         case steps.TwistStep() | steps.TurnToStep() | steps.TightenStep():
             largest_rad_per_s = robot.wrist_speed_rad_per_s.inner
             if step.speed_rad_per_s > largest_rad_per_s:
-                yield f"the robot's limit allows {largest_rad_per_s:g} rad/s"
+                asks = f"it asks for {step.speed_rad_per_s:g} rad/s"
+                yield f"{asks}, and the robot's limit allows {largest_rad_per_s:g} rad/s"
 
 
 def _largest_angle(step: Step, needs: Demand) -> float:

@@ -18,9 +18,8 @@ from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.loop_runner import UNSEEN_S
-from shearloop.daemon.control.plan import plan_of, speeds_of
+from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.state_publisher import loop_state
-from shearloop.daemon.control.step_motions import first_motion
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ReadExperiment
 from shearloop.daemon.loop_config import LoopConfig
@@ -565,19 +564,19 @@ def test_no_straight_move_begins_with_a_tool_that_is_or_may_be_gripped(sense):
     ("steps", "said"),
     [
         ([WAIT], "no step moves anything"),
-        ([{"do": "tare"}, {"do": "release"}], "step 2 of 2 (release): the fingers open to"),
-        ([{"do": "approach", "along_tool_m": 0.03}], "the arm moves +30 mm along the tool's axis, at 0.05 m/s"),
-        ([{"do": "retreat", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0]}], "the arm moves to x 400, y 0, z 300 mm"),
-        ([{"do": "turn_to", "angle_rad": 1.5}], "the wrist turns to 1.5 rad"),
-        ([{"do": "identify"}], "the wrist turns to and fro"),
-        ([TWIST], "the wrist twists to 1 rad, at 0.3 rad/s"),
-        ([GRIP], "the fingers close to 10 mm, or onto a tool with at most 60 N"),
-        ([{"do": "hold_torque", "torque_nm": 0.1}], "until the torque is +0.1 N·m"),
-        ([{"do": "hold_torque", "torque_nm": 0.1, "direction": "clockwise"}], "until the torque is -0.1 N·m"),
+        ([{"do": "tare"}, {"do": "release"}], "step 2 of 2 (release), which opens the fingers to"),
+        ([{"do": "approach", "along_tool_m": 0.03}], "the arm 30 mm along the tool, away from the robot, at 0.05 m/s"),
+        ([{"do": "retreat", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0]}], "straight line to x 0.4, y 0, z 0.3 m at"),
+        ([{"do": "turn_to", "angle_rad": 1.5}], "turns wrist 3 to 1.5 rad"),
+        ([{"do": "identify"}], "turns the wrist to and fro by up to"),
+        ([TWIST], "twists the wrist to 1 rad (57°) from the grip, first counterclockwise, holds each for 2 s"),
+        ([GRIP], "closes the fingers to 10 mm, or onto a tool, at 60 mm/s with up to 60 N"),
+        ([{"do": "hold_torque", "torque_nm": 0.1}], "turns the wrist until the torque is 0.1 N·m counterclockwise"),
+        ([{"do": "hold_torque", "torque_nm": 0.1, "direction": "clockwise"}], "until the torque is 0.1 N·m clockwise"),
     ],
 )
 def test_first_motion_describes_the_first_step_that_moves_something(steps, said):
-    assert said in first_motion(ExperimentFile.model_validate({"name": "test", "steps": steps}))
+    assert said in plan_of(ExperimentFile.model_validate({"name": "test", "steps": steps})).first_motion
 
 
 @pytest.mark.parametrize(
@@ -593,8 +592,7 @@ def test_first_motion_describes_the_first_step_that_moves_something(steps, said)
 def test_the_first_motion_opens_no_further_than_the_configured_gripper(step, model, opens):
     file = ExperimentFile.model_validate({"name": "test", "steps": [{"do": "release", **step}]})
     gripper = MODELS[model] if model is not None else None
-    assert f"the fingers open to {opens}, and" in first_motion(file, gripper)
-    assert f"opens the fingers to {opens}:" in "\n".join(plan_of(file, gripper=gripper).sentences())
+    assert plan_of(file, gripper=gripper).first_motion.endswith(f"opens the fingers to {opens}: a held tool drops")
 
 
 @pytest.mark.parametrize(
@@ -607,7 +605,7 @@ def test_the_first_motion_opens_no_further_than_the_configured_gripper(step, mod
 )
 def test_the_first_motion_has_the_speed_that_the_robots_limits_leave(step, said):
     file = ExperimentFile.model_validate({"name": "test", "steps": [step]})
-    assert first_motion(file, None, speeds_of(SETTINGS.limits)).endswith(said)
+    assert plan_of(file, SETTINGS.limits).first_motion.endswith(said)
 
 
 def test_a_noisy_source_supervises_beyond_its_noise_and_drives_nothing_gentle():

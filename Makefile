@@ -11,7 +11,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CONSTRAINTS ?=
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check $(if $(CONSTRAINTS),--constraint $(CONSTRAINTS))
 
-.PHONY: lock coverage notebook install install-dev system-packages demo demo-python docs docs-site test test-long test-computing test-the-rest test-fast lint format clean
+.PHONY: lock coverage notebook install install-dev system-packages demo demo-python docs docs-site test test-long test-computing test-waiting test-fast lint format clean
 
 # Before anything is installed.
 demo-python:
@@ -50,28 +50,31 @@ demo: demo-python $(VENV)/.installed
 # Test files run in parallel, the longest first (tests/conftest.py). Three parts:
 #   Tests that drive a robot in real time run by themselves, because a robot stops when its computer is busy. They mostly
 #   wait, so that more of them fit on two cores.
-#   Tests that only compute run beside the rest, at a low priority: they take the time that it leaves of the cores, and
-#   disturb it less than a fourth worker would. On a busy computer they get little time, so that their timeout is long.
+#   Then the rest runs, which waits less.
+#   Tests that only compute run beside both. The scheduler gives them what time the others leave of the cores, and takes
+#   it away at once (SCHED_IDLE). On a busy computer they get little time, so that their timeout is long.
 # Status 5: no test was selected.
 # `make test` takes four to six minutes. `make test-long` runs what takes half as long again: endurance, a newcomer's first hour, and
 # figures (LONG in tests/conftest.py). `.ci/run` calls both.
-PYTEST := $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+PYTEST := $(BIN)/pytest --dist loadfile --no-loadscope-reorder
 LENGTH := not long
+# Not every container allows it.
+IN_IDLE_TIME := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 test: install-dev
-	$(PYTEST) -n 5 -m 'real_time and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
-	+$(MAKE) --no-print-directory --jobs=2 --keep-going test-computing test-the-rest
+	+$(MAKE) --no-print-directory --jobs=2 --keep-going test-computing test-waiting
 
 test-long: install-dev
 	+$(MAKE) --no-print-directory test LENGTH=long
 
 test-computing: install-dev
 	mkdir -p build
-	nice -n 10 $(BIN)/pytest -m 'computes and $(LENGTH)' --timeout=600 $(PYTEST_ARGS) >build/test-computing.log 2>&1 || \
+	$(IN_IDLE_TIME) $(PYTEST) -n 2 -m 'computes and $(LENGTH)' --timeout=600 $(PYTEST_ARGS) >build/test-computing.log 2>&1 || \
 		[ $$? -eq 5 ] || { cat build/test-computing.log; exit 1; }
 	tail -n 1 build/test-computing.log
 
-test-the-rest: install-dev
-	$(PYTEST) -m 'not real_time and not computes and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
+test-waiting: install-dev
+	$(PYTEST) -n 5 -m 'real_time and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -n 3 -m 'not real_time and not computes and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \
@@ -83,11 +86,11 @@ FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.
 	$(addprefix tests/cli/test_cli.py::test_,bash_completes_commands_and_options every_shell_has_its_script) \
 	$(addprefix tests/daemon/test_,config_file.py process.py settings.py)
 test-fast: install-dev
-	$(PYTEST) -m 'not real_time' $(PYTEST_ARGS) $(FAST)
+	$(PYTEST) -n 3 -m 'not real_time' $(PYTEST_ARGS) $(FAST)
 
 # Lines and branches that the tests run in their own process; what runs in processes of its own is not seen.
 coverage: install-dev
-	$(PYTEST) -m 'not real_time' --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(PYTEST_ARGS)
+	$(PYTEST) -n 3 -m 'not real_time' --cov --cov-report=term:skip-covered --cov-report=html:build/coverage $(PYTEST_ARGS)
 
 lock: install-dev
 	{ echo '# The versions that the checks run with. `make lock` writes this file from the environment.'; \

@@ -1,6 +1,7 @@
 """What every test is held to: no task, thread, child process or file handle is left over."""
 
 import asyncio
+import functools
 import gc
 import inspect
 import io
@@ -41,23 +42,47 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 hypothesis.settings.register_profile("shearloop", deadline=None)
 hypothesis.settings.load_profile("shearloop")
 
-# Files of more than some five seconds, the longest first (`make test PYTEST_ARGS=--durations=60` shows them), and those
-# with tests in real time.
+# Files of more than some five seconds, the longest first (`make test PYTEST_ARGS=--durations=60` shows them). First
+# those of the tests in real time, then those of the others, then the long ones.
 LONGEST = (
-    "test_run.py", "test_page_controls.py", "test_shared_recordings.py", "test_page.py", "test_calibrate.py",
-    "test_procedure.py", "test_boards.py", "test_other_fingertips.py", "test_replay.py", "test_demo.py",
-    "test_docs.py", "test_parallel.py", "test_runner_any_order.py", "test_under_systemd.py", "test_server.py",
-    "test_flood.py", "test_finite_strain.py", "test_leave_out.py", "test_skin_run.py", "test_adapt.py",
-    "test_cli_reproduce.py", "test_plane_strain.py", "test_session.py", "test_dead_channels.py",
-    "test_pruned_matching.py", "test_control_loop.py", "test_recorder.py", "test_set_clock.py", "test_mad_client.py",
-    "test_walk.py", "test_skin_replay.py", "test_emulate.py", "test_speed_accuracy_chart.py", "test_every_way_out.py",
-    "test_own_calibration.py", "test_restarts.py", "test_client.py", "test_soak.py", "test_replay_rig.py",
-    "test_stops_and_unlocking.py", "test_twist_and_hold.py", "test_adapt_in_loop.py", "test_rehearsal.py",
-    "test_doctor.py", "test_stop_times.py", "test_ends.py", "test_recorded_rig.py",
+    "test_client.py", "test_restarts.py", "test_commission.py", "test_every_way_out.py", "test_adapt_in_loop.py",
+    "test_twist_and_hold.py", "test_rehearsal.py", "test_stops_and_unlocking.py", "test_measurements.py",
+    "test_doctor.py", "test_ends.py", "test_recorded_rig.py",
+    "test_page_controls.py", "test_run.py", "test_procedure.py", "test_calibrate.py", "test_session.py",
+    "test_page.py", "test_sign.py", "test_grips.py", "test_replay.py", "test_parallel.py", "test_docs.py",
+    "test_boards.py", "test_skin_run.py", "test_other_fingertips.py", "test_calibration.py", "test_archive.py",
+    "test_under_systemd.py", "test_set_clock.py", "test_load_delay.py", "test_server.py", "test_refused_exports.py",
+    "test_flood.py", "test_pruned_matching.py", "test_skin_drift.py", "test_mad_client.py", "test_control_loop.py",
+    "test_printable.py", "test_cli_recordings.py", "test_emulate.py", "test_skin_replay.py", "test_recorder.py",
+    "test_cylinders.py", "test_wrist_controller.py", "test_bank_design.py", "test_cli.py", "test_turns.py",
+    "test_skin_estimator.py", "test_line_clock.py", "test_design.py", "test_keys.py", "test_live_ways_out.py",
+    "test_shared_recordings.py", "test_skin.py", "test_demo.py", "test_runner_any_order.py", "test_finite_strain.py",
+    "test_leave_out.py", "test_adapt.py", "test_cli_reproduce.py", "test_plane_strain.py", "test_dead_channels.py",
+    "test_walk.py", "test_speed_accuracy_chart.py", "test_own_calibration.py", "test_soak.py", "test_replay_rig.py",
+    "test_stop_times.py",
 )  # fmt: skip
 _TESTS = _ROOT / "tests"
-# What only computes: nothing there waits, or depends on how long it takes. As much as the rest leaves time for.
-COMPUTING = (_TESTS / "estimation",)
+# What only computes: nothing there waits, or depends on how long it takes.
+COMPUTING = tuple(
+    _TESTS / path
+    for path in (
+        "bank", "estimation", "test_structure.py",
+        *("benchmarks/test_grip_strength.py", "benchmarks/test_stability_map.py"),
+        *("daemon/test_config_file.py", "daemon/test_settings.py"),
+        *(f"daemon/control/test_{name}.py" for name in (
+            "control_loop", "experiment", "identify", "margins", "runner", "safety", "torque_controller", "turns",
+            "wrist_controller",
+        )),
+        *(f"daemon/sensing/test_{name}.py" for name in ("frame_pairing", "sessions", "skin_drift", "skin_estimator")),
+        *(f"drivers/test_{name}.py" for name in ("frame_clock", "frame_parser", "line_clock", "load_cell")),
+        *(f"drivers/ur/test_{name}.py" for name in ("handler_any_order", "layers", "limits", "mad_client", "script")),
+        *("tools/commission/test_judgement.py", "tools/commission/test_procedure.py"),
+        *(f"tools/test_{name}.py" for name in ("bank_config", "bank_design", "creep", "evaluate")),
+        *(f"tools/recordings/test_{name}.py" for name in (
+            "cli_recordings", "matlab_recordings", "message_content", "set_clock",
+        )),
+    )
+)  # fmt: skip
 # `make test-long` runs these files and folders, `make test` all others.
 LONG = tuple(
     _TESTS / path
@@ -142,6 +167,8 @@ def _has_real_time(path: Path) -> bool:
     return path.match("test_*.py") and "real_time" in path.read_text(encoding="utf-8")
 
 
+# Asked once for each test; a worker has thousands of them.
+@functools.cache
 def _is_in(path: Path, part: tuple[Path, ...]) -> bool:
     return any(path.is_relative_to(one) for one in part)
 

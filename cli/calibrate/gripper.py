@@ -89,6 +89,8 @@ def run(args: argparse.Namespace) -> int:
 async def _grip(
     gripper: "RobotiqGripper", diameters_mm: list[float], operator: Operator, left: "Remembered"
 ) -> list[tuple[float, float]]:
+    from shearloop.tools.halted_fingers import halted_if_interrupted
+
     with operator:
         try:
             await gripper.connect()
@@ -97,13 +99,13 @@ async def _grip(
                     await operator.ask(f"From the last program: {sentence}. Look at the rig, then press Enter.")
             warning = "The fingers will open and close. Empty them, keep your hands clear, then press Enter."
             await operator.ask(warning)
-            async with gripper.halted_if_interrupted():
+            async with halted_if_interrupted(gripper):
                 await gripper.activate(operator_confirmed=True)
             gauges: list[tuple[float, float]] = []
             while len(gauges) < len(diameters_mm):
                 diameter_mm = diameters_mm[len(gauges)]
                 await operator.ask(f"Hold the object of {diameter_mm:g} mm between the fingertips, then press Enter.")
-                async with gripper.halted_if_interrupted():
+                async with halted_if_interrupted(gripper):
                     counts = await _contact(gripper)
                 if counts is None:
                     print("Refused: the fingers closed without meeting anything.", file=sys.stderr, flush=True)

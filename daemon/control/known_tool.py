@@ -11,10 +11,8 @@ An angle or a torque is known exactly, within an interval, or not at all. Of the
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
-from itertools import pairwise
 from typing import Final, NamedTuple, TypeAlias
 
 from shearloop.daemon.control.experiment_schema import (
@@ -49,26 +47,9 @@ STILL: Final[Ways] = frozenset({None})
 _OPPOSITE: Final[dict[Direction, Direction]] = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
 
 
-def only_way(ways: Ways) -> Direction | None:
-    """Return the one direction of a turn, if there is a turn; None if both are possible, or none is."""
-    directions = ways - STILL
-    return next(iter(directions)) if len(directions) == 1 else None
-
-
-def either_way(ways: Ways) -> bool:
-    """Return whether both directions are possible."""
-    return len(ways - STILL) > 1
-
-
 def way_from(start: float, end: float) -> Direction | None:
     """Return the direction from an angle or a torque to another; None if they differ by rounding only."""
     return None if abs(end - start) <= _ROUNDING else direction_of(end - start)
-
-
-def ways_between(values: Iterable[float]) -> list[Direction]:
-    """Return the directions of the turns from each angle to the next, in order; equal angles have no turn between."""
-    ways = (way_from(earlier, later) for earlier, later in pairwise(values))
-    return [way for way in ways if way is not None]
 
 
 def opposite(ways: Ways) -> Ways:

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
-from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool, either_way, ways_between
+from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool
 from shearloop.daemon.control.step_demands import Demand, demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare
-from shearloop.daemon.control.turns import Turn, reversals, turns
+from shearloop.daemon.control.turns import Turn, either_way, reversals, turns, ways_between
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM, GripperModel
 from shearloop.drivers.ur.settings import UrLimits

@@ -1,6 +1,7 @@
 """Which way each step of an experiment turns the tool, and which steps turn it back."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 from shearloop.daemon.control.experiment_schema import (
@@ -16,18 +17,24 @@ from shearloop.daemon.control.experiment_schema import (
     TwistStep,
     direction_of,
 )
-from shearloop.daemon.control.known_tool import (
-    AT_REST,
-    STILL,
-    Held,
-    Interval,
-    KnownTool,
-    Ways,
-    either_way,
-    known_after,
-    only_way,
-    ways_between,
-)
+from shearloop.daemon.control.known_tool import AT_REST, STILL, Held, Interval, KnownTool, Ways, known_after, way_from
+
+
+def only_way(ways: Ways) -> Direction | None:
+    """Return the one direction of a turn, if there is a turn; None if both are possible, or none is."""
+    directions = ways - STILL
+    return next(iter(directions)) if len(directions) == 1 else None
+
+
+def either_way(ways: Ways) -> bool:
+    """Return whether both directions are possible."""
+    return len(ways - STILL) > 1
+
+
+def ways_between(values: Iterable[float]) -> list[Direction]:
+    """Return the directions of the turns from each angle to the next, in order; equal angles have no turn between."""
+    ways = (way_from(earlier, later) for earlier, later in pairwise(values))
+    return [way for way in ways if way is not None]
 
 
 class Turn(NamedTuple):

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
@@ -215,16 +215,6 @@ class RobotiqGripper:
         active = readout.sta is messages.ActivationStatus.ACTIVE
         if not (active or messages.fault_of(readout.flt).needs_activation):
             await self._write(messages.GripperAction.RESET)
-
-    @contextlib.asynccontextmanager
-    async def halted_if_interrupted(self) -> AsyncIterator[None]:
-        """Halt the fingers if a motion in this context is interrupted: they would finish it without this program."""
-        try:
-            yield
-        except (asyncio.CancelledError, KeyboardInterrupt):
-            with contextlib.suppress(DriverError):
-                await self.halt()
-            raise
 
     async def states(self) -> AsyncGenerator[messages.GripperState]:
         """Yield a state every poll period and reconnect after losses, for ever.

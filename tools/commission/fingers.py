@@ -9,6 +9,7 @@ from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.tools.commission.opened import Opened
+from shearloop.tools.halted_fingers import halted_if_interrupted
 
 FINGERS_MM_PER_S: Final = 60.0
 # For gauges and objects that are held by hand, and for a tool.
@@ -76,11 +77,11 @@ class ConnectedGripper(Opened):
         return self._runner.run(self._move(command))
 
     async def _activate(self, *, operator_confirmed: bool) -> None:
-        async with self._gripper.halted_if_interrupted():
+        async with halted_if_interrupted(self._gripper):
             await self._gripper.activate(operator_confirmed=operator_confirmed)
 
     async def _move(self, command: GripperCommand) -> GripperState:
-        async with self._gripper.halted_if_interrupted():
+        async with halted_if_interrupted(self._gripper):
             return await self._gripper.finish(await self._gripper.move(command))
 
 

@@ -249,7 +249,7 @@ def _take_robot(config: DaemonConfig, opened: contextlib.ExitStack) -> "tuple[Ur
     settings = open_settings(config)
     if settings is None:
         return None
-    files = RobotFiles.of(settings.host)
+    files = RobotFiles(settings.host)
     opened.enter_context(lock_robot(files, config.commands, config.gripper_address))
     return settings, files
 

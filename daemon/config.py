@@ -33,7 +33,7 @@ from shearloop.drivers.defaults import (
     SOURCE_CURRENT_MA,
     URCAP_PORT,
 )
-from shearloop.drivers.hosts import is_loopback_host, one_spelling, why_no_host
+from shearloop.drivers.hosts import is_loopback_host, one_spelling, why_no_address, why_no_host
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
@@ -72,6 +72,12 @@ def _valid_host(host: str) -> str:
     return host
 
 
+def _valid_address(host: str) -> str:
+    if reason := why_no_address(host):
+        raise ValueError(f"{shown(host)} {reason}")
+    return host
+
+
 def _valid_name(name: str) -> str:
     if not re.fullmatch(_NAME, name):
         near = re.sub(r"[^a-z0-9_-]", "_", name.lower())
@@ -86,6 +92,7 @@ Address = Annotated[str, AfterValidator(_known_transport)]
 Channel = Annotated[int, Field(ge=1, le=9999)]
 FingertipName = Annotated[str, AfterValidator(_valid_name), WithJsonSchema({"type": "string", "pattern": _NAME})]
 Host = Annotated[str, AfterValidator(_valid_host)]
+DeviceAddress = Annotated[str, AfterValidator(_valid_address)]
 
 
 class CurveConfig(ConfigModel):
@@ -230,7 +237,7 @@ class SkinConfig(ConfigModel):
 class GripperSocket(ConfigModel):
     """The gripper behind the URCap's socket."""
 
-    host: Host = Field(description="the robot's name or address")
+    host: DeviceAddress = Field(description="the robot's address")
     port: int = Field(URCAP_PORT, ge=1, le=65535, description="TCP port of the URCap")
 
 

@@ -35,8 +35,6 @@ RELEASE_AND_TARE = "run an experiment that begins with the steps `release` and `
 CLAMPED_ANOTHER = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
 # A state takes some hundred bytes.
 _MAX_BYTES = 1 << 16
-# A name that had no address at the start is looked up again at this interval.
-LOOK_UP_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,10 +126,7 @@ class Remembered:
 
 @dataclass(slots=True)
 class RigMemory:
-    """Writes the state of loop, load cell and robot to a file, which is replaced as a whole.
-
-    A robot with several addresses has a file for each address, with the same content.
-    """
+    """Writes the state of loop, load cell and robot to a file, which is replaced as a whole."""
 
     files: RobotFiles
     loop: ControlLoop
@@ -140,7 +135,7 @@ class RigMemory:
     error: str = ""
     # The experiment that is about to begin.
     starting: str = ""
-    # The state in the files; None: the files have to be written in any case.
+    # The state in the file.
     _written: Remembered | None = None
     # The load cell's zero in its calibration, and the restored zero.
     _calibrated_zero: float | None = None
@@ -160,10 +155,7 @@ class RigMemory:
         """Restore the state that the last daemon of this robot has left."""
         remembered = read_memories(self.files)
         remembered.restore(self.loop, self._on_judged)
-        files = self.files
-        elsewhere = (*files.other_states, *files.lapsed_states)
-        if len(files.states) == 1 and not any(path.exists() for path in elsewhere):
-            self._written = remembered
+        self._written = remembered
         clamped = not self.loop.tool.has_gripper
         if clamped and remembered.force_n is not None:
             # They are of a grip, and the configuration does not name that gripper any more.
@@ -223,19 +215,10 @@ class RigMemory:
             self.robot.forget_wrench_zero()
 
     async def run(self) -> None:
-        """Write every change until cancelled; look up the addresses of a name that had none."""
-        async with asyncio.TaskGroup() as group:
-            if not self.files.known:
-                group.create_task(self._look_up())
-            while True:
-                await self.save_present()
-                await asyncio.sleep(FOLLOWS_S)
-
-    async def _look_up(self) -> None:
+        """Write every change until cancelled."""
         while True:
-            await asyncio.sleep(LOOK_UP_S)
-            if await asyncio.to_thread(self.files.note_addresses):
-                return
+            await self.save_present()
+            await asyncio.sleep(FOLLOWS_S)
 
     async def begins(self, experiment: str) -> str | None:
         """Write that an experiment begins, before anything moves; return why it cannot be written, or None."""
@@ -309,12 +292,12 @@ class RigMemory:
             if state == self._written and not self.error:
                 return
             try:
-                await asyncio.to_thread(write_memories, self.files, state)
+                await asyncio.to_thread(write_memory, self.files.state, state)
             except OSError as error:
                 if not self.error:
                     structlog.get_logger().warning("the rig's state cannot be kept", reason=str(error))
                 self.error = (
-                    f"the rig's state cannot be kept in {self.files.states[0]} ({error.strerror}), and a stop would be "
+                    f"the rig's state cannot be kept in {self.files.state} ({error.strerror}), and a stop would be "
                     "forgotten with this process: make room, or make the folder writable"
                 )
             else:
@@ -340,65 +323,15 @@ def read_memory(path: Path) -> Remembered:
 
 
 def read_memories(files: RobotFiles) -> Remembered:
-    """Return the state in the files of one robot: all of its stops, and its latest grip.
-
-    If a name has no known address, the state under that address cannot be found, and this counts as a stop. A new
-    address counts as a stop too, because the robot there may be another one. Then the grip in the name's own file
-    counts before a grip in the file of the new address.
-    """
-    newest_first = _newest_first(files)
-    stops = [fault for state in newest_first for fault in state.stop]
-    if why := _why_unsure(files):
-        stops.append((FaultCode.DAEMON_ENDED.name, why))
-    running = next((state.running for state in newest_first if state.running), "")
-    grip = newest_first[0]
-    if files.earlier:
-        own = read_memory(files.own_state)
-        grip = next((state for state in (own, *newest_first) if state.grips), grip)
-    return replace(grip, running=running, stop=tuple(dict.fromkeys(stops)))
-
-
-def _newest_first(files: RobotFiles) -> list[Remembered]:
-    """Return the states that count for one robot."""
-    paths = [*files.states, *files.other_states]
-    if not files.own_state.exists():
-        paths.extend(files.earlier_states)
-    latest_ns = max(map(_written_ns, paths))
-    paths.extend(path for path in files.lapsed_states if _written_ns(path) > latest_ns)
-    return [read_memory(path) for path in sorted(paths, key=_written_ns, reverse=True)]
-
-
-def _why_unsure(files: RobotFiles) -> str:
-    """Return why it is not certain which robot a name means, or an empty string."""
-    if not files.known:
-        return (
-            f"its state is stored under the robot's address, and the name {files.host!r} has no address at present: "
-            "check the name and the network"
-        )
-    if files.earlier:
-        before, present = (", ".join(addresses) for addresses in (files.earlier, files.keys))
-        return (
-            f"the name {files.host!r} had the address {before} then and has {present} at present: make sure that this "
-            "is the same robot"
-        )
-    return ""
-
-
-def _written_ns(path: Path) -> int:
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return 0
-
-
-def write_memories(files: RobotFiles, state: Remembered) -> None:
-    """Replace the files of one robot, and remove those under its other spellings; raises OSError."""
-    for path in files.states:
-        write_memory(path, state)
-    for path in files.other_states:
-        path.unlink(missing_ok=True)
-    if files.earlier:
-        files.note_addresses()
+    """Return the state in the file of one robot, and every stop that is kept under a name, which may be its own."""
+    stops = []
+    for path in files.states_by_name:
+        if faults := read_memory(path).faults:
+            causes = "; ".join(fault.cause for fault in faults)
+            kept = f"{path} keeps a stop of a robot by its name, which may be this one ({causes})"
+            stops.append((FaultCode.DAEMON_ENDED.name, f"{kept}: remove the file once this robot is as it should be"))
+    own = read_memory(files.state)
+    return replace(own, stop=(*own.stop, *stops))
 
 
 def write_memory(path: Path, state: Remembered) -> None:

@@ -4,10 +4,8 @@ import contextlib
 import ipaddress
 import socket
 import threading
-import time
-from collections.abc import Iterable, Mapping
 
-# All names of one question together may take this long: a name server that is out of reach must not delay a start.
+# A name server that is out of reach must not delay the message for longer.
 RESOLVED_WITHIN_S = 2.0
 
 
@@ -35,9 +33,11 @@ def why_no_host(host: str) -> str:
 def one_spelling(host: str) -> str:
     """Return one spelling for all spellings of an address, or of a name; no name is looked up.
 
-    The loopback address of IPv6, and the address of no interface, reach the same computer as 127.0.0.1.
+    `localhost`, the loopback address of IPv6 and the address of no interface reach the same computer as 127.0.0.1.
     """
     name = host.strip().lower().removesuffix(".")
+    if name == "localhost":
+        return "127.0.0.1"
     try:
         # It reads every number that a connection accepts, such as 0x7f.1.
         address: ipaddress.IPv4Address | ipaddress.IPv6Address = ipaddress.IPv4Address(socket.inet_aton(name))
@@ -69,28 +69,36 @@ def is_address(host: str) -> bool:
 def is_loopback_host(host: str) -> bool:
     """Return whether a host's name or address is this computer itself, by its text alone."""
     spelt = one_spelling(host)
-    return spelt == "localhost" or (is_address(spelt) and ipaddress.ip_address(spelt).is_loopback)
+    return is_address(spelt) and ipaddress.ip_address(spelt).is_loopback
 
 
-def addresses_of(hosts: Iterable[str]) -> Mapping[str, frozenset[str]]:
-    """Return the addresses of each host in their `one_spelling`; none of a name that is not found in time."""
-    found: dict[str, frozenset[str]] = {}
+def why_no_address(host: str) -> str:
+    """Return why a text is no address of a device, with the cure, as the end of a sentence; empty for an address.
 
-    def look_up(name: str) -> None:
+    A name can mean another device tomorrow, except `localhost`. It is looked up only to tell its present address, which
+    takes at most 2 s.
+    """
+    if reason := why_no_host(host):
+        return f"{reason}; give the device's address"
+    if is_address(one_spelling(host)):
+        return ""
+    name = "is a name, which can mean another device tomorrow"
+    if present := _present_addresses(host):
+        return f"{name}: write {' or '.join(present)}, which {host!r} means now"
+    return f"{name}, and it cannot be looked up now: write the device's address"
+
+
+def _present_addresses(name: str) -> list[str]:
+    """Return the addresses of a name in their `one_spelling`; none if it is not found in time."""
+    found: list[str] = []
+
+    def look_up() -> None:
         with contextlib.suppress(OSError, UnicodeError):
             answers = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
-            found[name] = frozenset(one_spelling(str(answer[4][0])) for answer in answers)
+            found.extend(one_spelling(str(answer[4][0])) for answer in answers)
 
-    spelt = {host: one_spelling(host) for host in hosts}
-    names = {name for name in spelt.values() if not is_address(name)}
     # A look-up cannot be broken off, and must not keep the process from ending either.
-    asking = [threading.Thread(target=look_up, args=(name,), name="look-up", daemon=True) for name in names]
-    for thread in asking:
-        thread.start()
-    until_s = time.monotonic() + RESOLVED_WITHIN_S
-    for thread in asking:
-        thread.join(max(0.0, until_s - time.monotonic()))
-    known = dict(found)
-    return {
-        host: frozenset({name}) if is_address(name) else known.get(name, frozenset()) for host, name in spelt.items()
-    }
+    asking = threading.Thread(target=look_up, name="look-up", daemon=True)
+    asking.start()
+    asking.join(RESOLVED_WITHIN_S)
+    return list(dict.fromkeys(found))

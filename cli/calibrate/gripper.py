@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.rig_memory import Remembered, read_memories
     from shearloop.daemon.robot_files import RobotFiles, lock_gripper
     from shearloop.drivers.calibration_files import save_calibration
+    from shearloop.drivers.hosts import why_no_address
     from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
     from shearloop.drivers.robotiq.socket_client import SocketClient
@@ -55,13 +56,15 @@ def run(args: argparse.Namespace) -> int:
     if len(set(args.diameter_mm)) < 2:
         raise UserError("give at least two different --diameter-mm")
     check_calibration_file(args.out)
+    if args.host is not None and (reason := why_no_address(args.host)):
+        raise UserError(f"--host: {args.host!r} {reason}")
     client: RobotiqClient
     left = Remembered()
     with ExitStack() as opened:
         if args.host is not None:
             # The URCap's socket serves a daemon at the same time; a serial port has one program.
             opened.enter_context(lock_gripper(args.host, args.socket_port))
-            left = read_memories(RobotFiles.of(args.host))
+            left = read_memories(RobotFiles(args.host))
             client = SocketClient(args.host, args.socket_port)
         else:
             path = str(args.port) if args.port is not None else None

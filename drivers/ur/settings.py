@@ -13,7 +13,7 @@ from pydantic import Field
 
 from shearloop.drivers import ranges
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.hosts import is_loopback_host, why_no_host
+from shearloop.drivers.hosts import is_loopback_host, why_no_address
 from shearloop.drivers.ur.poses import tool_axis
 
 Six = tuple[float, float, float, float, float, float]
@@ -312,7 +312,7 @@ class UrSettings(_Checked):
     """The robot's address, its limits, and the deadlines of the driver."""
 
     host: str
-    """The robot's name or address."""
+    """The robot's address."""
     limits: UrLimits
     """Limits on commands and on measured states."""
     generation: Generation = "e-series"
@@ -341,8 +341,8 @@ class UrSettings(_Checked):
 
     def __post_init__(self) -> None:
         """Refuse an invalid host."""
-        if reason := why_no_host(self.host):
-            raise ValueError(f"host {reason}; give the robot's address")
+        if reason := why_no_address(self.host):
+            raise ValueError(f"host {reason}")
         if self.state_timeout_s > _LONGEST_STATE_S and not is_loopback_host(self.host):
             raise ValueError(
                 f"state_timeout_s: {self.state_timeout_s:g} s is above {_LONGEST_STATE_S:g} s, and {self.host} is not "

@@ -1,12 +1,20 @@
 """What people write in a configuration is answered in its own words: quotes, names, addresses, hosts and paths."""
 
+import re
+import socket
+import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from shearloop.daemon.config import load_daemon_config
-from shearloop.drivers.hosts import why_no_host
+from shearloop.drivers import hosts
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.hosts import why_no_address, why_no_host
+from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
 
 PORT = "{path: port}"
@@ -90,6 +98,62 @@ def test_a_host_that_is_no_address_is_refused_everywhere(host, tmp_path):
 @pytest.mark.parametrize("host", ["192.168.1.30", "robot", "robot-2.lab.example", "3com", "10.0.0.1", "::1"])
 def test_names_and_addresses_are_hosts(host):
     assert why_no_host(host) == ""
+
+
+@pytest.mark.parametrize("host", ["192.168.1.30", "localhost", "LocalHost.", "::1", "fe80::1%eth0"])
+def test_an_address_names_one_device(host):
+    assert why_no_address(host) == ""
+
+
+def answer_with(*addresses: str) -> Callable[..., list[tuple[Any, ...]]]:
+    """Return a look-up whose every name has these addresses."""
+
+    def answer(*_: object, **__: object) -> list[tuple[Any, ...]]:
+        if not addresses:
+            raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, 0)) for address in addresses]
+
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("addresses", "cure"),
+    [
+        (["192.168.0.10", "192.168.0.10"], "tomorrow: write 192.168.0.10, which 'ur5.lab' means now"),
+        (["192.168.0.10", "::1"], "tomorrow: write 192.168.0.10 or 127.0.0.1, which 'ur5.lab' means now"),
+        ([], "tomorrow, and it cannot be looked up now: write the device's address"),
+    ],
+)
+def test_a_robot_and_its_gripper_are_not_given_by_a_name(addresses, cure, tmp_path, monkeypatch, ran):
+    monkeypatch.setattr(hosts.socket, "getaddrinfo", answer_with(*addresses))
+    name = "is a name, which can mean another device"
+    content = yaml.safe_dump({"gripper": {"socket": {"host": "ur5.lab"}}, "robot": "ur.yaml"})
+    assert f"gripper.socket.host: 'ur5.lab' {name} {cure}" in refusal(tmp_path, content)
+    robot = tmp_path / "ur.yaml"
+    robot.write_text(Path("config/ur.yaml").read_text().replace("host: 192.168.1.10", "host: ur5.lab"))
+    with pytest.raises(DriverError, match=re.escape(f"host {name} {cure}")):
+        read_settings(robot)
+    options = ("--diameter-mm", 10, "--diameter-mm", 20, "--out", tmp_path / "g.cal")
+    said = ran("calibrate", "gripper", "--host", "ur5.lab", *options, status=2).err
+    assert f"--host: 'ur5.lab' {name} {cure}" in said
+
+
+def test_a_name_server_that_does_not_answer_delays_the_message_for_a_moment(monkeypatch):
+    answered = threading.Event()
+
+    def answer_late(*_: object, **__: object) -> list[tuple[object, ...]]:
+        answered.wait()
+        return []
+
+    monkeypatch.setattr(hosts.socket, "getaddrinfo", answer_late)
+    monkeypatch.setattr(hosts, "RESOLVED_WITHIN_S", 0.05)
+    try:
+        assert why_no_address("ur5.lab").endswith("it cannot be looked up now: write the device's address")
+    finally:
+        answered.set()
+        # Nobody waits for a late answer.
+        for asking in [one for one in threading.enumerate() if one.name == "look-up"]:
+            asking.join()
 
 
 def test_check_names_paths_that_are_no_ports_and_no_folders(tmp_path, ran):

@@ -71,7 +71,7 @@ def commission(
     _open_files(config)
     with ExitStack() as opened:
         # A daemon would drive the robot at the same time.
-        files = RobotFiles.of(settings.host)
+        files = RobotFiles(settings.host)
         opened.enter_context(lock_robot(files, gripper=config.gripper_address))
         left = LeftRobot.acknowledged(config, files, operator)
         devices = rig or ConnectedRig(config, settings)

@@ -8,7 +8,7 @@ from typing import Final, Self
 
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.rig import keeps_memory
-from shearloop.daemon.rig_memory import Remembered, read_memories, write_memories
+from shearloop.daemon.rig_memory import Remembered, read_memories, write_memory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.errors import UserError
 from shearloop.tools.commission import boards, gripper, identity, tool
@@ -99,9 +99,9 @@ class LeftRobot:
 
     def _keep(self, state: Remembered) -> None:
         try:
-            write_memories(self.files, state)
+            write_memory(self.files.state, state)
         except OSError as error:
-            at: Path = self.files.states[0]
+            at: Path = self.files.state
             raise UserError(
                 f"the robot's state cannot be kept in {at} ({error.strerror}), and a stop would be forgotten with this "
                 "process: make room, or make the folder writable"

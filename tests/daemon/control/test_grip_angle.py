@@ -124,7 +124,7 @@ def test_the_question_before_a_tighter_grip_says_that_the_angle_is_not_known():
     assert twisted().control_loop.operator.held_note(tighter) == "", "its angle goes on"
 
 
-FILES = RobotFiles("192.168.1.10", ("192.168.1.10",))
+FILES = RobotFiles("192.168.1.10")
 
 
 def clamped_rig() -> Rig:

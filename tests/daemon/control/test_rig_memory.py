@@ -41,7 +41,7 @@ def logged() -> Iterator[list[MutableMapping[str, Any]]]:
 
 WAIT = {"do": "wait", "wait_s": 60}
 # Its file is in the state folder of each test.
-FILES = RobotFiles("192.168.1.10", ("192.168.1.10",))
+FILES = RobotFiles("192.168.1.10")
 
 
 def refusal(rig: Rig) -> str:
@@ -51,7 +51,7 @@ def refusal(rig: Rig) -> str:
 
 def after_restart(before: Rig) -> Rig:
     """Return the rig with the loop of a new process, which finds what the old one has written."""
-    write_memory(FILES.states[0], Remembered.of(before.control_loop))
+    write_memory(FILES.state, Remembered.of(before.control_loop))
     after = Rig(new_loop())
     RigMemory(FILES, after.control_loop)
     after.wrist_rad, after.force_n, after.width_mm = before.wrist_rad, before.force_n, before.width_mm
@@ -161,7 +161,7 @@ class Restarted:
     def __init__(self, before: Rig) -> None:
         grip = before.control_loop.tool.grip
         state = Remembered(load_zero=8321.5, load_nm_per_count=load_cell().calibration.nm_per_count)
-        write_memory(FILES.states[0], replace(state, **asdict(grip), wrench_zero=self.WRENCH_ZERO))
+        write_memory(FILES.state, replace(state, **asdict(grip), wrench_zero=self.WRENCH_ZERO))
         self.rig = after = Rig(new_loop())
         self.cell, self.robot = load_cell(), UrRobot(SETTINGS)
         self.memory = RigMemory(FILES, after.control_loop, self.cell, self.robot)
@@ -206,8 +206,8 @@ def exchange(rig: Rig, how: str) -> None:
 
 @pytest.mark.parametrize("tared", [True, False])
 def test_the_log_calls_a_zero_kept_only_where_it_was_taken(tared, restarted, logged):
-    stored = read_memory(FILES.states[0])
-    write_memory(FILES.states[0], replace(stored, wrench_tared=tared))
+    stored = read_memory(FILES.state)
+    write_memory(FILES.state, replace(stored, wrench_tared=tared))
     rig = restarted.rig
     again = Rig(new_loop())
     again.wrist_rad, again.force_n, again.width_mm, again.hand = rig.wrist_rad, rig.force_n, rig.width_mm, rig.hand
@@ -346,7 +346,7 @@ async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_on
     assert calibrated_anew.calibration.tare_counts == 8000.0
     # Until the gripper answers, nobody knows of another zero.
     await again.save_present()
-    assert read_memory(FILES.states[0]).load_zero == 8321.5
+    assert read_memory(FILES.state).load_zero == 8321.5
 
     rig.force_n = 0.0
     stop(rig)
@@ -415,7 +415,7 @@ async def test_nothing_starts_where_a_stop_could_not_be_remembered(tmp_path, mon
     assert "cannot be kept" in (await memory.begins("test") or "")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert await memory.begins("test") is None
-    assert json.loads(FILES.states[0].read_text())["running"] == "test"
+    assert json.loads(FILES.state.read_text())["running"] == "test"
 
 
 async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it(monkeypatch):
@@ -437,7 +437,7 @@ async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it
     await twice.wait()
     following.cancel()
     await asyncio.gather(following, return_exceptions=True)
-    assert read_memory(FILES.states[0]).running == "test"
+    assert read_memory(FILES.state).running == "test"
 
 
 def test_an_unknown_grip_is_still_unknown_after_a_restart():
@@ -504,7 +504,7 @@ async def test_a_restored_zero_that_was_lost_since_is_none(befalls):
     after.run(0.6)
     assert (why_no_turn(after) == "") is (befalls == "nothing")
     await memory.save_present()
-    assert (read_memory(FILES.states[0]).load_zero == 8321.5) is (befalls == "nothing")
+    assert (read_memory(FILES.state).load_zero == 8321.5) is (befalls == "nothing")
 
 
 async def test_a_zero_of_the_wrench_that_goes_with_the_robots_process_is_logged_once_and_named_after_a_restart(logged):
@@ -608,7 +608,7 @@ def test_an_unfelt_grip_is_another_one_after_another_request():
 async def test_a_write_that_is_cut_off_is_no_other_programs_for_the_next_one(monkeypatch):
     """A stop in the middle of the write of a new grip."""
     begun, may_end = threading.Event(), threading.Event()
-    write = rig_memory.write_memories
+    write = rig_memory.write_memory
 
     def slowly(*arguments: Any) -> None:
         begun.set()
@@ -616,7 +616,7 @@ async def test_a_write_that_is_cut_off_is_no_other_programs_for_the_next_one(mon
         write(*arguments)
 
     memory = RigMemory(FILES, new_loop())
-    monkeypatch.setattr(rig_memory, "write_memories", slowly)
+    monkeypatch.setattr(rig_memory, "write_memory", slowly)
     first = asyncio.create_task(memory.save(Remembered(running="one")))
     await asyncio.to_thread(begun.wait, DEADLINE_S)
     first.cancel()
@@ -626,4 +626,4 @@ async def test_a_write_that_is_cut_off_is_no_other_programs_for_the_next_one(mon
     may_end.set()
     await second
     assert memory.error == ""
-    assert read_memory(FILES.states[0]) == Remembered()
+    assert read_memory(FILES.state) == Remembered()

@@ -59,7 +59,7 @@ def test_all_mistakes_are_reported_together(tmp_path):
         ("margin_m: 0.02", "margin_m: 0", "limits.workspace.margin_m: 0 is too small; allowed: above 0"),
         ("host: 192.168.1.10", "host: 192.168.1.10\ngeneration: cb3", "wrench of a CB3, ± 5 N·m"),
         ("host: 192.168.1.10\n", "", r"ur.yaml:\d+: host: is missing"),
-        ("host: 192.168.1.10", "host: ' '", r"ur.yaml:1: host is empty; give the robot's address"),
+        ("host: 192.168.1.10", "host: ' '", r"ur.yaml:1: host is empty; give the device's address"),
         ("host: 192.168.1.10", "host: 192.168.1.10\nhots: 1", "hots: is not a known key; did you mean host"),
         ("margin_rad: 0.1", "margin_rad: -1", "limits.joints.margin_rad: -1 is too small"),
     ],

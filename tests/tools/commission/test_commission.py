@@ -185,7 +185,7 @@ def test_a_report_of_another_rig_is_not_continued(tmp_path, changed):
 @pytest.mark.usefixtures("ur_rtde")
 def test_a_robot_that_a_daemon_drives_is_not_commissioned(tmp_path, mistake):
     path = write_rig(tmp_path, "127.0.0.9")
-    with lock_robot(RobotFiles.of("127.0.0.9")):
+    with lock_robot(RobotFiles("127.0.0.9")):
         assert "driven by another program" in mistake("commission", path, "--out", tmp_path / "report.yaml")
 
 

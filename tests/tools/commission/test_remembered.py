@@ -78,7 +78,7 @@ def test_the_fingers_open_once_a_tool_that_may_be_held_is_secured_and_the_grip_i
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_commissioning_that_is_killed_in_a_stage_leaves_a_stop(fails):
-    files = RobotFiles.of(HOST)
+    files = RobotFiles(HOST)
     left = LeftRobot(files, Operator(pytest.fail, pytest.fail), opens=True, keeps=True, state=Remembered())
     with pytest.raises(UserError) if fails else nullcontext(), left.during("3 empty gripper"):
         # As another process finds it after a kill at this moment.
@@ -91,7 +91,7 @@ def test_a_commissioning_that_is_killed_in_a_stage_leaves_a_stop(fails):
 
 def test_a_commissioning_leaves_no_zero_of_the_wrench_under_a_held_tool():
     """Its programs have let the controller zero it with the load."""
-    files, zero = RobotFiles.of(HOST), (0.0, 0.0, 0.0, 0.0, 0.0, 0.4)
+    files, zero = RobotFiles(HOST), (0.0, 0.0, 0.0, 0.0, 0.0, 0.4)
     tared = replace(GRIP, wrench_zero=zero, wrench_tared=True, load_zero=8321.0, load_nm_per_count=0.001)
     left = LeftRobot(files, Operator(pytest.fail, pytest.fail), opens=True, keeps=True, state=tared)
     with left.during("0 identity"):
@@ -115,7 +115,7 @@ def test_devices_that_end_with_the_rehearsal_have_no_past(lab):
     write_memory(memory_path(HOST), LEFT)
     config = load_daemon_config(lab.path).model_copy(update={"autostart": True})
     operator = Operator(pytest.fail, lambda _: None)
-    left = LeftRobot.acknowledged(config, RobotFiles.of(HOST), operator)
+    left = LeftRobot.acknowledged(config, RobotFiles(HOST), operator)
     with left.during("2 gripper") as asked:
         assert asked is operator
     assert read_memory(memory_path(HOST)) == LEFT

@@ -108,6 +108,11 @@ def new_folder(folder: Path) -> Iterator[None]:
 
     Raises OSError where it cannot be made.
     """
+    for one in (folder, *folder.parents):
+        if one.is_symlink() and not one.exists():
+            raise FileNotFoundError(
+                errno.ENOENT, f"it is a link to {one.readlink()}, which leads to no folder", str(one)
+            )
     new = [one for one in (folder, *folder.parents) if not one.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

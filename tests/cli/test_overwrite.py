@@ -211,6 +211,15 @@ def test_no_command_writes_through_a_link_to_nothing(slip, way, tmp_path, mistak
     assert {path.name for path in tmp_path.iterdir()} == {"source", "link"}
 
 
+@pytest.mark.parametrize("words", [("init", "{}"), ("init", "{}/rig"), ("demo", "--folder", "{}")])
+def test_a_folder_that_is_a_link_to_nothing_is_named(words, tmp_path, mistake):
+    link = tmp_path / "link"
+    link.symlink_to("missing")
+    said = mistake(*(word.format(link) for word in words))
+    assert f"{link}: the file cannot be written: it is a link to missing, which leads to no folder" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["link"]
+
+
 @pytest.mark.parametrize("form", ["csv", "mat", "rrd", "lerobot"])
 def test_a_file_of_an_export_is_no_link_to_nothing_nor_to_the_recording(form, imported, tmp_path, mistake):
     out, content = tmp_path / "out", imported.read_bytes()

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
@@ -119,6 +120,9 @@ def _age_s(args: argparse.Namespace) -> float:
 def _request(args: argparse.Namespace) -> dict[str, Any]:
     """Return the request that the arguments stand for."""
     request: dict[str, Any] = {"command": args.name, "by": caller("shearloop command")}
+    if args.name == "stop":
+        # It may be sent again, for want of an answer or with its time, and is one stop.
+        request["request_id"] = f"{os.getpid()}-{args.began_ns}"
     if args.source is not None:
         request["source"] = args.source
     if args.yes:
@@ -234,16 +238,16 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
             return ["stop: nothing was moving; the daemon has ended"]
         if reply.get("held"):
             return [
-                f"stop: nothing was moving, and {reply['held']}. The daemon continues, so that "
+                f"stop: {stop_client.nothing_moved(reply)}, and {reply['held']}. The daemon continues, so that "
                 "`shearloop command release` can open them. Ctrl-C in its terminal ends the daemon, or "
                 "`systemctl stop shearloop`."
             ]
         if reply.get("ended_by_itself"):
-            ended = f"{reply['ended_by_itself']!r} had just ended by itself"
-            return [f"stop: nothing was moving, because {ended}; after 5 s, a further stop ends the daemon"]
+            return [f"stop: {stop_client.nothing_moved(reply)}; after 5 s, a further stop ends the daemon"]
         if reply.get("idle"):
             continues = "the daemon continues, because the stop came too late to end it"
             return [f"stop: nothing was moving; {continues}. Send it again to end the daemon"]
-        return [f"stop: stopped {reply['stopped']}" if reply.get("stopped") else "stop: nothing was moving"]
+        stopped = f"stopped {reply['stopped']}" if reply.get("stopped") else stop_client.nothing_moved(reply)
+        return [f"stop: {stopped}"]
     values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}
     return [f"{name}: {', '.join(f'{key} {value}' for key, value in values.items() if value) or 'done'}"]

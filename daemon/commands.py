@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -79,6 +80,8 @@ class Commands:
     report: Callable[["Answered"], None] = lambda _: None
     running_rig: RunningRig = field(default_factory=RunningRig)
     now_ns: Callable[[], int] = boot_ns
+    # Sender, `request_id` and refusal of the latest stops that have one.
+    _latest_stops: deque[tuple[Any, Any, str | None]] = field(default_factory=lambda: deque(maxlen=16), init=False)
 
     def handlers(self) -> Mapping[str, Handler]:
         """Return the handler of every command."""
@@ -125,13 +128,22 @@ class Commands:
             refusal = f"{name} failed ({error_text(error)}); see the daemon's log"
             raise
         finally:
-            if not request.get("ask"):
+            if not request.get("ask") and not self._is_told_again(name, request, refusal):
                 self.report(Answered(name, request, refusal))
         return reply
 
     def _is_for_this_one(self, request: Request) -> bool:
         """Return whether a request is meant for this daemon, and not for one before it."""
         return bool(request.get("instance", self.running_rig.instance) == self.running_rig.instance)
+
+    def _is_told_again(self, name: str, request: Request, refusal: str | None) -> bool:
+        """Return whether this is one more request of the same stop, which a client sends again where it has to."""
+        if name != STOP or "request_id" not in request:
+            return False
+        act = request.get("by"), request["request_id"], refusal
+        again = act in self._latest_stops
+        self._latest_stops.append(act)
+        return again
 
     def _deadline(self, request: Request) -> Deadline:
         return Deadline(request.get("until_ns"), self.now_ns(), self.now_ns)
@@ -267,8 +279,9 @@ class Commands:
         # An unknown argument may be a misspelt `spare_daemon`.
         spare_daemon = bool(request.get("spare_daemon") or request.keys() - {"command", "by", "spare_daemon", *_OF_ALL})
         held = self.rig.control_loop.tool.held_or_unknown if self.rig is not None else None
-        stopped = None
+        stopped, ended = None, {}
         if self.rig is not None:
+            ended = self.rig.runner.just_ended()
             # If the gripper may hold something, a stop keeps the daemon, and the next start waits.
             stopped = self.rig.runner.stop(also_idle=spare_daemon or held is not None)
         waiting = self.experiment.call_off() if self.experiment is not None else None
@@ -276,12 +289,12 @@ class Commands:
             return {"stopped": stopped}
         if spare_daemon:
             # The live page's stop button stops motion, but not the daemon.
-            return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
+            return {"stopped": "", **ended} if waiting is None else {"stopped": f"the start of {waiting.name}"}
         if held is not None:
             # An operator who stops twice must still be able to open the gripper.
-            return {"stopped": "", "held": held}
-        if self.rig is not None and (ended := self.rig.runner.ended_unseen()) is not None:
-            return {"stopped": "", "ended_by_itself": ended}
+            return {"stopped": "", "held": held, **ended}
+        if "ended_by_itself" in ended:
+            return {"stopped": "", **ended}
         if not self._may_end_daemon(request):
             return {
                 "stopped": "",

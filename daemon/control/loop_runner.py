@@ -129,15 +129,20 @@ class ControlLoopRunner:
             self._request_stop("the operator stopped it", Fault(FaultCode.OPERATOR_STOP, what))
         return stopped
 
-    def ended_unseen(self) -> str | None:
-        """Return the experiment that has ended by itself so lately that a stop is meant for it, or None."""
+    def just_ended(self) -> dict[str, str]:
+        """Return the experiment that ended so lately that a person may not have seen it, for the reply to a stop.
+
+        It is `stopped_before`, by a person, or `ended_by_itself`; `because` is what stopped it. Empty without one.
+        """
         experiment, ended_ns = self._control_loop.experiment, self._ended_ns
         if experiment is None or ended_ns is None or self._clock.now_ns() - ended_ns > UNSEEN_S * 1e9:
-            return None
-        safety, was_stopped = self._control_loop.safety, experiment.phase is ExperimentPhase.STOPPED
-        stop = safety.waiting or (safety.acknowledged if was_stopped else None)
-        asked = stop is not None and any(fault.code is FaultCode.OPERATOR_STOP for fault in stop.faults)
-        return None if asked else experiment.file.name
+            return {}
+        safety, name = self._control_loop.safety, experiment.file.name
+        stop = safety.waiting or safety.acknowledged
+        if experiment.phase is not ExperimentPhase.STOPPED or stop is None:
+            return {"ended_by_itself": name}
+        asked = any(fault.code is FaultCode.OPERATOR_STOP for fault in stop.faults)
+        return {"stopped_before" if asked else "ended_by_itself": name, "because": stop.faults[0].cause}
 
     def close(self) -> None:
         """Stop the running experiment at the daemon's end, and start nothing more."""

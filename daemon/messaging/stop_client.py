@@ -140,6 +140,15 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
     return None if reply.get(ELSEWHERE) else reply
 
 
+def nothing_moved(reply: Mapping[str, Any]) -> str:
+    """Return in words that a stop has found nothing that moved, and what may have moved when the person asked."""
+    name, because = reply.get("ended_by_itself") or reply.get("stopped_before"), reply.get("because")
+    if not name:
+        return "nothing was moving"
+    how = f"had just been stopped, because {because}" if because else "had just ended by itself"
+    return f"nothing moves any more: {name!r} {how}"
+
+
 def foreign_reply(address: str, error: Exception) -> UserError:
     """Return the error for a reply of another program."""
     return UserError(

@@ -14,7 +14,7 @@ from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, SLOW, UNLOCK_TIMEOUT_S, needs_keys
 from shearloop.daemon.messaging.bound_requests import CLICK_WITHIN_S, meant_for
 from shearloop.daemon.messaging.callers import caller
-from shearloop.daemon.messaging.client import ask, connect
+from shearloop.daemon.messaging.client import UnansweredError, ask, connect
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.stop_client import StopSocketTakenError, send_to_stop_socket
 from shearloop.daemon.web.message_store import MessageStore
@@ -98,7 +98,10 @@ class Bridge:
         UserError if no daemon answers.
         """
         content = {"command": name, "by": caller(PROGRAM), **arguments}
-        status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
+        try:
+            status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
+        except UserError as error:
+            raise UserError(f"{error}. `{name}` was not sent") from error
         self._check_shown(status.get("daemon", {}), "nothing was sent to it")
         # The daemon, or this process, may have stood still since the click.
         age_s = self.moments.since_s(clicked_ns) if clicked_ns is not None else 0.0
@@ -130,13 +133,23 @@ class Bridge:
         return await asyncio.shield(self._stopping)
 
     async def _request_stop(self) -> dict[str, Any]:
-        content, address = {"command": "stop", "by": caller(PROGRAM), "spare_daemon": True}, self.address.commands
-        reply = None
+        content: dict[str, Any] = {"command": "stop", "by": caller(PROGRAM), "spare_daemon": True}
+        # It may be sent twice, and is one stop.
+        content["request_id"] = self.moments.present()
+        reply, waits, address = None, False, self.address.commands
         if not needs_keys(address):
             # A local daemon accepts it even without valid keys.
-            with contextlib.suppress(TimeoutError, StopSocketTakenError):
-                reply = await asyncio.to_thread(send_to_stop_socket, address, content, COMMAND_TIMEOUT_S)
-        reply = reply or await self._request(content, COMMAND_TIMEOUT_S)
+            with contextlib.suppress(StopSocketTakenError):
+                try:
+                    reply = await asyncio.to_thread(send_to_stop_socket, address, content, COMMAND_TIMEOUT_S)
+                except TimeoutError:
+                    waits = True
+        try:
+            reply = reply or await self._request(content, COMMAND_TIMEOUT_S)
+        except UserError as error:
+            if waits:
+                raise UnansweredError(str(error)) from error
+            raise
         self._check_shown(reply, "that one was stopped")
         return reply
 

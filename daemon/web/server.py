@@ -27,6 +27,7 @@ from shearloop.daemon.messaging.bound_requests import LateRequestError
 from shearloop.daemon.messaging.client import UnansweredError
 from shearloop.daemon.messaging.deadlines import NEVER_LATE
 from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.daemon.messaging.stop_client import nothing_moved
 from shearloop.daemon.process import ending_signals
 from shearloop.daemon.web.bridge import Bridge, DaemonAddress
 from shearloop.daemon.web.message_store import MessageStore
@@ -267,6 +268,8 @@ class _Page:
             return self._refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
         content = {key: reply[key] for key in _SHOWN_KEYS if key in reply}
+        if "ended_by_itself" in reply or "stopped_before" in reply:
+            content["moved"] = nothing_moved(reply)
         return web.json_response(content, status=200 if reply.get("ok") else 409)
 
     async def stream(self, request: web.Request) -> web.StreamResponse:

@@ -154,7 +154,7 @@ export class Controls {
     this.tell("stopping …");
     const reply = await this.ask("stop", {}, STOP_LATE_MS);
     if (click !== this.clicks) return;
-    if (reply.ok) this.tell(reply.stopped ? `stopped: ${reply.stopped}` : "stop: nothing was moving");
+    if (reply.ok) this.tell(reply.stopped ? `stopped: ${reply.stopped}` : `stop: ${reply.moved ?? "nothing was moving"}`);
     else this.tell(`STOP NOT CONFIRMED: ${reply.reason}. Use the emergency stop of the robot.`, "bad", true);
   }
 

@@ -307,7 +307,7 @@ async def test_a_release_is_on_the_disk_before_it_is_answered():
 
 async def second_stop(rig: Rig) -> dict[str, Any]:
     """Return the reply to a stop while nothing runs."""
-    runner = SimpleNamespace(stop=lambda **_: None, ended_unseen=lambda: None)
+    runner = SimpleNamespace(stop=lambda **_: None, just_ended=dict)
     subject, ending = SimpleNamespace(control_loop=rig.control_loop, runner=runner), asyncio.Event()
     return await Commands(subject, None, None, None, ending, None, now_ns=lambda: 0).handlers()["stop"]({"until_ns": 1})
 

@@ -24,6 +24,7 @@ from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.experiment_files import ReadExperiment
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
+from shearloop.daemon.messaging.stop_client import nothing_moved
 from shearloop.daemon.rig import Rig as RigOfDaemon
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.torques import LARGEST_DRIFT_NM, WRENCH, TorqueSample
@@ -660,6 +661,30 @@ async def test_a_stop_just_after_an_experiment_has_ended_by_itself_does_not_end_
         assert await stop_command(of_now()) == {"stopped": "", "ended_by_itself": "test", **THIS_DAEMON}
         await cell.cycles(round(UNSEEN_S * 1e9 / CYCLE_NS) + 1)
         assert await stop_command(of_now()) == {"ended": True, **THIS_DAEMON}
+
+
+async def test_a_stop_that_was_sent_while_the_daemon_stood_still_is_told_what_moved_then():
+    """It was told that nothing was moving. A client without an answer sends it again."""
+    async with driven(TWIST, cycles=50) as cell:
+        for _ in range(3_000_000_000 // CYCLE_NS):
+            cell.robot.cycle(read=False)
+        await cell.cycles(1)
+        stop_command = commands_of(cell)["stop"]
+        for key in ("ended_by_itself", "stopped_before"):
+            reply = await stop_command({"spare_daemon": True})
+            assert (reply["stopped"], reply[key]) == ("", "test")
+            paused = "'test' had just been stopped, because the daemon itself was not running: it stood still for 3.0 s"
+            assert f"nothing moves any more: {paused}" in nothing_moved(reply)
+
+
+async def test_a_stop_that_is_sent_again_is_told_what_the_first_one_stopped():
+    async with driven(TWIST, cycles=50) as cell:
+        stop_command = commands_of(cell)["stop"]
+        assert (await stop_command({}))["stopped"] == "test"
+        await cell.cycles(5)
+        reply = await stop_command({"spare_daemon": True})
+        assert (reply["stopped"], reply["stopped_before"]) == ("", "test")
+        assert "because the operator stopped it: 'test' was under way" in nothing_moved(reply)
 
 
 @pytest.mark.parametrize("acknowledged", [False, True])

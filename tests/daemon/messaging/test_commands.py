@@ -14,7 +14,7 @@ import zmq.asyncio
 
 from shearloop.cli.command import DAEMON_COMMANDS, OPTIONS
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commands import ARGUMENTS, Commands
+from shearloop.daemon.commands import ARGUMENTS, Answered, Commands
 from shearloop.daemon.messaging.bound_requests import LateRequestError, meant_for
 from shearloop.daemon.messaging.callers import UNKNOWN, caller, caller_of
 from shearloop.daemon.messaging.client import ask, receive_messages, send_command
@@ -146,6 +146,22 @@ async def test_what_is_asked_for_too_long_ago_is_refused_unless_it_lets_nothing_
     with pytest.raises(CommandRefusedError) as refused:
         await commands.handlers()[name](request)
     assert ("it came 0.1 s too late" in str(refused.value)) is (name != "pause")
+
+
+async def test_a_stop_that_is_sent_again_is_reported_once():
+    """The one that ends an idle daemon is sent again with its time, and was recorded twice."""
+    told: list[Answered] = []
+    commands = Commands(None, None, None, None, asyncio.Event(), None, told.append, now_ns=lambda: 7)
+    stop = commands.handlers()[STOP]
+    for number in (1, 2):
+        request = {"command": STOP, "by": "ann", "request_id": f"a{number}"}
+        first = await stop(request)
+        await stop(request | meant_for(first, 0.5, 2.0))
+        assert [one.request["request_id"] for one in told] == ["a1", "a2"][:number]
+    # Of stops without a name each is one of its own.
+    for _ in range(2):
+        await stop({"command": STOP, "by": "ann"})
+    assert len(told) == 4
 
 
 async def test_only_a_stop_that_is_known_to_be_fresh_ends_a_daemon_in_which_nothing_moves():

@@ -440,6 +440,40 @@ async def test_a_stop_without_a_daemon_is_reported(tmp_path, monkeypatch):
         assert "no daemon answered" in reply["reason"]
 
 
+async def test_a_stop_that_may_still_arrive_is_told_to_be_in_doubt(tmp_path, monkeypatch):
+    """The daemon stands still, and takes it from its socket when it goes on."""
+    monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 0.05)
+
+    def waits(*_: Any) -> None:
+        raise TimeoutError
+
+    monkeypatch.setattr(bridge_module, "send_to_stop_socket", waits)
+    async with served(tmp_path) as page:
+        page.bridge.address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
+        status, reply = await post(page, "/stop")
+        assert (status, reply["ok"], reply["unconfirmed"]) == (504, False, True)
+
+
+async def test_a_command_that_never_left_says_so(tmp_path, monkeypatch):
+    """The viewer asks for the daemon's state first: nothing moves later."""
+    monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 0.05)
+    async with served(tmp_path) as page:
+        page.bridge.address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
+        status, reply = await post(page, "/commands/start?digest=d", **BEARER)
+        assert (status, reply["ok"], "unconfirmed" in reply) == (503, False, False)
+        assert reply["reason"].endswith("`start` was not sent")
+
+
+async def test_a_stop_that_found_nothing_moving_says_what_moved_before(tmp_path):
+    async def stop(_request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"stopped": "", "ended_by_itself": "hold", "because": "the daemon itself was not running"}
+
+    async with served(tmp_path, stop=stop) as page:
+        _, reply = await post(page, "/stop")
+        stopped = "'hold' had just been stopped, because the daemon itself was not running"
+        assert reply["moved"] == f"nothing moves any more: {stopped}"
+
+
 async def test_half_open_requests_do_not_keep_a_stop(tmp_path):
     async with served(tmp_path) as page, AsyncExitStack() as stack:
         port = int(page.base.rpartition(":")[2])

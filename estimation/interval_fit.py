@@ -4,12 +4,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
+from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
+from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
 from shearloop.estimation.gain import GainSpread
 from shearloop.estimation.interval_regressor import IntervalRegressor, Regressor, reported_values
-from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals, ValueRange, student_inflation
+from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals, ValueRange
 from shearloop.estimation.left_out import LeftOut, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.ridge import STRENGTHS, CensoredRidge, Predictor
 from shearloop.estimation.twists import LOADED_FRACTION, find_twists, first_twists, loaded_log_gain, log_gain
@@ -25,6 +27,11 @@ _MIN_IN_HALF = 3
 
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
+
+
+def student_inflation(n: int) -> float:
+    """Return the factor on a 95 % interval's width if n values determine it (Student 1908)."""
+    return float(stdtrit(n - 1, (1 + LEVEL) / 2)) / TWO_SIDED_95
 
 
 def check_values(values: FloatArray) -> None:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.special import stdtrit
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
@@ -64,11 +63,6 @@ class Intervals:
     def half_width(self, predicted: float) -> float:
         """Return half of the 95 % interval's width at this prediction."""
         return float(self.half_widths[self.edges.searchsorted(predicted)])
-
-
-def student_inflation(n: int) -> float:
-    """Return the factor on a 95 % interval's width if n values determine it (Student 1908)."""
-    return float(stdtrit(n - 1, (1 + LEVEL) / 2)) / TWO_SIDED_95
 
 
 def _conformal_quantile(absolute: FloatArray) -> float:

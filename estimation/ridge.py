@@ -40,10 +40,14 @@ class Ridge:
     def fit(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
         """Fit to (n, d) features of one unit and (n,) values; strength is in units of the features' sum of squares."""
         mean, offset = features.mean(axis=0), float(values.mean())
-        u, s, vt = np.linalg.svd(features - mean, full_matrices=False)
-        penalty = strength * float((s**2).sum())
-        weights = vt.T @ (s / (s**2 + penalty) * (u.T @ (values - offset)))
-        return cls(mean, weights, offset, strength)
+        centred, errors = features - mean, values - offset
+        penalty = strength * float((centred**2).sum())
+        if len(features) < features.shape[1]:
+            # The n × n products of n frames give the same weights, for a tenth of the work.
+            within = centred @ centred.T + penalty * np.eye(len(features))
+            return cls(mean, centred.T @ np.linalg.solve(within, errors), offset, strength)
+        u, s, vt = np.linalg.svd(centred, full_matrices=False)
+        return cls(mean, vt.T @ (s / (s**2 + penalty) * (u.T @ errors)), offset, strength)
 
     @classmethod
     def fit_scaled(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:

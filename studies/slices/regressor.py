@@ -12,8 +12,8 @@ from typing import TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.estimation.interval_fit import INFLATION, best_strength, check_values
-from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals, student_inflation
+from shearloop.estimation.interval_fit import INFLATION, best_strength, check_values, student_inflation
+from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals
 from shearloop.estimation.left_out import LeftOut, left_out_blocks
 from shearloop.estimation.values import INLINE
 from shearloop.studies.slices.curve import CurveMean

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.interval_fit import best_strength, fit_interval_regressor
-from shearloop.estimation.intervals import Intervals, student_inflation
+from shearloop.estimation.interval_fit import best_strength, fit_interval_regressor, student_inflation
+from shearloop.estimation.intervals import Intervals
 from shearloop.estimation.left_out import later_origins, later_splits, left_out_blocks
 from shearloop.estimation.ridge import CensoredRidge, Ridge
 from shearloop.studies.slices.curve import InverseCalibration
@@ -21,6 +21,17 @@ def test_a_ridge_without_strength_is_least_squares():
     expected = np.linalg.lstsq(np.column_stack([np.ones(60), x]), y, rcond=None)[0]
     np.testing.assert_allclose(ridge.weights, expected[1:], rtol=1e-7)
     np.testing.assert_allclose(ridge.predict(np.zeros((1, 5))), expected[:1], rtol=1e-7)
+
+
+@pytest.mark.parametrize("shape", [(30, 200), (200, 30)])
+def test_a_ridge_has_the_least_sum_of_squared_errors_and_penalty(shape):
+    """There the gradient is 0, of more features than frames too."""
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=shape), rng.normal(size=shape[0])
+    ridge = Ridge.fit(x, y, 1e-3)
+    penalty = 1e-3 * ((x - x.mean(axis=0)) ** 2).sum()
+    gradient = (x - x.mean(axis=0)).T @ (ridge.predict(x) - y) + penalty * ridge.weights
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-11)
 
 
 def test_a_scaled_ridge_does_not_care_for_units():

@@ -28,8 +28,9 @@ from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sd_notify import notify
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.sensors import Sessions, build_sensors, open_sessions
-from shearloop.daemon.supervisor import MAX_ERROR_LENGTH, HealthReporter, Reporter, Supervisor, Task, TaskFacts
+from shearloop.daemon.supervisor import MAX_ERROR_LENGTH, HealthReporter, Reporter, Supervisor, Task
 from shearloop.daemon.torques import LatestTorques
+from shearloop.drivers.connection import Diagnostics
 from shearloop.printable import printable
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ class RecordingTask:
             if self.rig is not None:
                 self.rig.control_loop.on_recording_error(failure)
 
-    def diagnostics(self) -> TaskFacts:
+    def diagnostics(self) -> Diagnostics:
         """Return the recorder's state for `health`."""
         return self.recorder.diagnostics()
 

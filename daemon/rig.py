@@ -352,8 +352,9 @@ def build_rig(
     if config.gripper is not None:
         gripper = make_gripper(config.gripper, loop, publisher, clock, patience_of(config), supplied)
     sensors = build_sensors(config, publisher, clock, recorder, sessions, loop, gripper)
-    robot = UrRobot(settings, LinkMonitor(LinkReporter("robot", loop)), settings_for=commissioning.on_controller)
-    robot.holds = loop.tool.may_be_loaded
+    link = LinkMonitor(LinkReporter("robot", loop))
+    settings_for, holds = commissioning.on_controller, loop.tool.may_be_loaded
+    robot = UrRobot(settings, link, settings_for=settings_for, holds=holds)
     memory = RigMemory(files, loop, sensors.load_cell, robot) if keeps_memory(config) else None
     write_state = memory.save_present if memory is not None else no_state
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock, write_state)

@@ -4,7 +4,7 @@ import asyncio
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -12,10 +12,11 @@ from typing import Protocol, runtime_checkable
 import structlog
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.messaging.messages import DaemonEnd, Health, Scalar
+from shearloop.daemon.messaging.messages import DaemonEnd, Health
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sd_notify import notify
+from shearloop.drivers.connection import Diagnostics
 from shearloop.words import counted
 
 FIRST_PAUSE_S = 0.5
@@ -25,7 +26,6 @@ RECOVERED_AFTER_S = 60.0
 # Characters of an error in messages; the log has the whole text.
 MAX_ERROR_LENGTH = 300
 HEALTH_PERIOD_S = 1.0
-TaskFacts = Mapping[str, Scalar | Mapping[str, int]]
 
 
 def restart_pause_s(deaths_in_a_row: int) -> float:
@@ -93,7 +93,7 @@ class Supervisor:
 class Reporter(Protocol):
     """A part of the daemon with values for `health`."""
 
-    def diagnostics(self) -> TaskFacts:
+    def diagnostics(self) -> Diagnostics:
         """Return the present counters: frames, errors by kind, rate."""
 
 
@@ -111,9 +111,9 @@ class HealthReporter:
     # The cap on the robot's speeds and torque, in a sentence; empty where none holds.
     cap: Callable[[], str] = str
 
-    def tasks(self) -> dict[str, TaskFacts]:
+    def tasks(self) -> dict[str, Diagnostics]:
         """Return the present state of each task."""
-        gathered: dict[str, TaskFacts] = {name: asdict(record) for name, record in self.supervisor.records.items()}
+        gathered: dict[str, Diagnostics] = {name: asdict(record) for name, record in self.supervisor.records.items()}
         for name, reporter in self.reporters.items():
             gathered[name] = {**gathered.get(name, {}), **_facts(reporter)}
         return gathered
@@ -167,7 +167,7 @@ class HealthReporter:
             self.publisher.publish(health)
 
 
-def _facts(reporter: Reporter) -> TaskFacts:
+def _facts(reporter: Reporter) -> Diagnostics:
     """Return the values of one part; an error in one hides no other, and the service stays alive."""
     try:
         return reporter.diagnostics()

@@ -36,7 +36,7 @@ CONNECT_TIMEOUT_S = 2.0
 # afterwards.
 LOOK_INTERVAL_S, AWAY_NS = 0.1, 200_000_000
 
-# The values that a device reports in `health`, by name.
+# The values that a device or a task reports in `health`, by name.
 Diagnostics: TypeAlias = Mapping[str, bool | int | float | str | Mapping[str, int] | None]
 
 

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 
 from shearloop.daemon.clock import Clock
@@ -13,8 +13,9 @@ from shearloop.daemon.control.finger_motion import FingerMotion
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.operator_view import activation_sentence
-from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
+from shearloop.daemon.messaging.messages import GripperStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import (
@@ -172,7 +173,7 @@ class GripperTask:
         """Return whether the fingers moved at any time of an interval, as far as is known."""
         return self._motion.moved_between(from_ns, to_ns)
 
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> Diagnostics:
         """Return the gripper's part of `health`."""
         return self.gripper.diagnostics()
 

@@ -27,13 +27,14 @@ from pydantic_core import PydanticSerializationError
 
 from shearloop.daemon.clock import Clock, ClockReading
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.messaging.messages import LoopState, Scalar
+from shearloop.daemon.messaging.messages import LoopState
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL, McapFile
 from shearloop.daemon.sensing.fingertip_task import SessionRecorder
 from shearloop.daemon.sensing.session_inputs import session_inputs
 from shearloop.daemon.sensing.sessions import channel_table
 from shearloop.daemon.sensing.snapshots import SnapshotError, snapshot
+from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.estimation import BeforeFrame, Session
@@ -277,7 +278,7 @@ class Recorder:
             await asyncio.to_thread(self.write)
             yield self.failure
 
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> Diagnostics:
         """Return the recorder's state for `health`."""
         counts, file = self._counts, self._current.file
         return {

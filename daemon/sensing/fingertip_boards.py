@@ -14,7 +14,7 @@ from shearloop.daemon.messaging.messages import EitHeatmap
 from shearloop.daemon.sensing.fingertip_messages import frame_message, heatmap_message
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
-from shearloop.daemon.supervisor import TaskFacts
+from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.words import counted
@@ -83,7 +83,7 @@ class CombinedTask(FingertipTask):
         if self.wants_state and not any(side is not None and side.wants_state for side in self.sides):
             self.record_state({"pairing": self.pairing, "pairs": self._pairs})
 
-    def diagnostics(self) -> TaskFacts:
+    def diagnostics(self) -> Diagnostics:
         """Return the values for the health message."""
         return {
             "expected_hz": 1.0 / self.period_s,
@@ -150,7 +150,7 @@ class BoardTask(FingertipTask):
             if heatmap is not None:
                 self.publisher.publish(heatmap)
 
-    def diagnostics(self) -> TaskFacts:
+    def diagnostics(self) -> Diagnostics:
         """Return the values for the health message."""
         board = self.board.diagnostics()
         errors = (self.dead_electrodes.sentence, str(board["last_refusal"]))

@@ -1,15 +1,16 @@
 """The load cell's task: reads it, publishes its torque, takes its zero."""
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import structlog
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.messaging.messages import LoadTorque, Scalar
+from shearloop.daemon.messaging.messages import LoadTorque
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest
 from shearloop.daemon.torques import LARGEST_DRIFT_NM, LOAD_CELL, SensorListener, TorqueSample, load_of
+from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 
 # Two seconds at 10.9 Hz.
@@ -94,7 +95,7 @@ class LoadCellTask:
         self._raw, self._confirmed = [], confirmed
         return self._zero
 
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`."""
         found = self._board.diagnostics()
         other_unit = self._latest.other_unit if self._latest is not None else ""

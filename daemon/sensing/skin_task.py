@@ -10,12 +10,12 @@ import structlog
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.logs import LinkReporter
-from shearloop.daemon.messaging.messages import Scalar, SkinShear
+from shearloop.daemon.messaging.messages import SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest, ZeroState
 from shearloop.daemon.torques import SensorListener, TorqueSample, TorqueSource
-from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkMonitor, LinkObserver, SerialLink
+from shearloop.drivers.connection import DEFAULT_BAUD, Diagnostics, Link, LinkMonitor, LinkObserver, SerialLink
 from shearloop.drivers.serial_sensor import InputKind, InputRecorder, RawEvent
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinSample
@@ -48,7 +48,7 @@ class SkinCurrentTask:
         """Read until cancelled."""
         await self.skin.watch_source()
 
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> Diagnostics:
         """Return the values of the current source for `health`."""
         return self.skin.source_diagnostics()
 
@@ -160,7 +160,7 @@ class SkinTask:
         if self._inputs is not None:
             self._inputs.record(RawEvent(InputKind.TARE, now_ns, data))
 
-    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> Diagnostics:
         """Return the values of voltages, zero and force for `health`."""
         zero, voltages = self._estimator.zero, self._skin.diagnostics()
         return {

@@ -68,11 +68,13 @@ class UrRobot:
         monitor: LinkMonitor | None = None,
         *,
         settings_for: SettingsFor | None = None,
+        holds: Callable[[], bool] = lambda: False,
         worker: str = WORKER,
     ) -> None:
         """`settings_for` returns the settings for a controller of a version and serial number; without it, these count.
 
-        It raises RobotLostError for a controller that must not be driven. `worker` is the module of the worker.
+        It raises RobotLostError for a controller that must not be driven. `holds` says whether a tool may load the
+        wrench; then a new program keeps the zero of the wrench. `worker` is the module of the worker.
         """
         self._worker = worker
         self.settings = settings
@@ -84,8 +86,7 @@ class UrRobot:
         self.losses: Counter[str] = Counter()
         # The number of states that have arrived.
         self.states = 0
-        # Whether a tool may load the wrench. Then a new program keeps the zero of the wrench.
-        self.holds: Callable[[], bool] = lambda: False
+        self._holds = holds
         self._told_held = False
         self._wrench_zero: Six = (0.0,) * 6
         self._restored_zero: Six = (0.0,) * 6
@@ -93,8 +94,7 @@ class UrRobot:
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
         self._warning = ""
-        # Tasks that wait for the next state.
-        # In the order of their calls: who waits first decides first.
+        # Tasks that wait for the next state, in the order of their calls: who waits first decides first.
         self._waiting: list[asyncio.Future[messages.RobotState]] = []
 
     @property
@@ -114,7 +114,7 @@ class UrRobot:
         zero = cast(Six, tuple(now - restored for now, restored in pairs))
         self._wrench_zero, self._restored_zero = zero, (0.0,) * 6
         if self._connection is not None:
-            self._told_held = self.holds()
+            self._told_held = self._holds()
             self._connection.send(messages.Held(self._told_held, zero))
 
     def diagnostics(self) -> Diagnostics:
@@ -156,8 +156,8 @@ class UrRobot:
             self._restored_zero = (0.0,) * 6
 
     def _tell_held(self, connection: "WorkerConnection") -> None:
-        """Send the worker a change of `holds`, before any command that follows from it."""
-        held = self.holds()
+        """Send the worker a change of what `holds` says, before any command that follows from it."""
+        held = self._holds()
         if held is not self._told_held:
             self._told_held = held
             connection.send(messages.Held(held))
@@ -181,7 +181,7 @@ class UrRobot:
         connection = WorkerConnection(self.settings, self)
         await asyncio.get_running_loop().subprocess_exec(lambda: connection, sys.executable, "-m", self._worker)
         connection.send(self.settings)
-        self._told_held = self.holds()
+        self._told_held = self._holds()
         connection.send(messages.Held(self._told_held, self._wrench_zero))
         self._connection = connection
         try:

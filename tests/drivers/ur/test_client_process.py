@@ -178,9 +178,8 @@ async def worker_told(told: list[Held]) -> None:
 async def test_a_worker_gets_what_is_held_at_its_start_and_at_each_change(play, told):
     play("exec cat")
     holds = [True]
-    robot = UrRobot(settings_for("127.0.0.254"))
+    robot = UrRobot(settings_for("127.0.0.254"), holds=lambda: holds[0])
     robot.restore_wrench_zero(RESTORED)
-    robot.holds = lambda: holds[0]
     bench = HandlerBench()
     async with tasks.running(robot.run()):
         await worker_told(told)
@@ -193,9 +192,8 @@ async def test_a_worker_gets_what_is_held_at_its_start_and_at_each_change(play, 
 
 async def test_a_restored_zero_that_is_taken_back_leaves_what_the_program_has_added(play, told):
     play("exec cat")
-    robot = UrRobot(settings_for("127.0.0.254"))
+    robot = UrRobot(settings_for("127.0.0.254"), holds=lambda: True)
     robot.restore_wrench_zero(RESTORED)
-    robot.holds = lambda: True
     async with tasks.running(robot.run()):
         await worker_told(told)
         # The start of its program made it another one.
@@ -210,9 +208,8 @@ async def test_a_restored_zero_that_has_ended_is_not_taken_back(play, told, tare
     play("exec cat")
     # After a tare, the zero of a controller that cannot zero its own wrench is any value.
     new_zero = (0.0, 0.0, 0.0, 0.0, 0.0, 1.5 if tared else 0.0)
-    robot = UrRobot(settings_for("127.0.0.254"))
+    robot = UrRobot(settings_for("127.0.0.254"), holds=lambda: True)
     robot.restore_wrench_zero(RESTORED)
-    robot.holds = lambda: True
     async with tasks.running(robot.run()):
         await worker_told(told)
         robot.handle_message(0, replace(HandlerBench().state, wrench_zero=RESTORED))

@@ -149,7 +149,7 @@ class Daemon:
         """Run until `stop`, then end every task and close the sockets; `on_ready` is called once the tasks run."""
         try:
             await self._run_tasks(on_ready)
-            if self.rig is not None and self.rig.memory is not None:
+            if self.rig is not None:
                 await self.rig.memory.save_present()
             self.health.publish_end(finished=self.finished, summary=self._summary.text)
         finally:

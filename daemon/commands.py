@@ -239,9 +239,8 @@ class Commands:
             raise CommandRefusedError(f"{sentence}; confirm it with `shearloop command release --yes`")
         _refuse_if_changed(question, sentence, request)
         _refuse_if(await rig.runner.release())
-        if rig.memory is not None:
-            # A daemon that is killed after the answer must not leave the grip that is gone.
-            await rig.memory.save_present()
+        # A daemon that is killed after the answer must not leave the grip that is gone.
+        await rig.memory.save_present()
         return {}
 
     async def _tare(self, request: Request) -> Reply:

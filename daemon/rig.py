@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, commissioning_of, measured_widths
 from shearloop.daemon.config import DaemonConfig, GripperConfig
-from shearloop.daemon.control.action_executor import no_state
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
@@ -24,7 +23,7 @@ from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
 from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
-from shearloop.daemon.rig_memory import RigMemory
+from shearloop.daemon.rig_memory import NoMemory, RigMemory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.sensing.sessions import COMBINED, torque_sources
 from shearloop.daemon.sensors import Sensors, Sessions, build_sensors
@@ -221,16 +220,14 @@ class Rig:
     recorder: "Recorder | None"
     # The daemon's own, so that a question of an earlier one asks for another moment.
     instance: str
-    # None where the emulated devices end with the daemon.
-    memory: RigMemory | None = None
+    memory: RigMemory | NoMemory = field(default_factory=NoMemory)
     commissioning: Commissioning | None = None
     # The file of the experiment that is about to begin.
     starting: str = field(default="", init=False)
 
     def start_refusal(self) -> str | None:
         """Return why no experiment can begin, or None."""
-        unkept = self.memory.error if self.memory is not None else ""
-        return self._start_under_way() or self.runner.start_refusal() or unkept or None
+        return self._start_under_way() or self.runner.start_refusal() or self.memory.error or None
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken at present, or None; `confirmed`: by the operator, nothing is loaded.
@@ -276,12 +273,11 @@ class Rig:
         if (reason := deadline.why_passed("reading its file", _SLOW_FILE)) is not None:
             return reason
         try:
-            if self.memory is not None and (reason := await self.memory.begins(experiment.file.name)) is not None:
+            if (reason := await self.memory.begins(experiment.file.name)) is not None:
                 return reason
             reason = await self.runner.start(experiment.file, stops_before, deadline)
         finally:
-            if self.memory is not None:
-                self.memory.starting = ""
+            self.memory.begun()
         if reason is None and self.recorder is not None:
             self.recorder.record_experiment(experiment.file.name, path, experiment.data, experiment.file.tool_mm)
         return reason
@@ -355,12 +351,11 @@ def build_rig(
     link = LinkMonitor(LinkReporter("robot", loop))
     settings_for, holds = commissioning.on_controller, loop.tool.may_be_loaded
     robot = UrRobot(settings, link, settings_for=settings_for, holds=holds)
-    memory = RigMemory(files, loop, sensors.load_cell, robot) if keeps_memory(config) else None
-    write_state = memory.save_present if memory is not None else no_state
-    runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock, write_state)
+    memory = RigMemory(files, loop, sensors.load_cell, robot) if keeps_memory(config) else NoMemory()
+    runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock, memory.save_present)
     experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning, LoadedFiles.of(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}
-    if memory is not None:
+    if isinstance(memory, RigMemory):
         tasks["memory"] = memory
     return sensors, Rig(loop, runner, tasks, experiments, recorder, instance, memory, commissioning)

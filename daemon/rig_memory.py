@@ -124,6 +124,23 @@ class Remembered:
             loop.stated_tool_mm = self.stated_tool_mm
 
 
+class NoMemory:
+    """Keeps nothing, for emulated devices that end with the daemon: with them end every grip and stop."""
+
+    error = ""
+
+    async def begins(self, _experiment: str) -> str | None:
+        """Begin an experiment: it needs no memory."""
+        return None
+
+    def begun(self) -> None:
+        """End the beginning of an experiment, or its refusal."""
+
+    async def save_present(self) -> str | None:
+        """Write nothing."""
+        return None
+
+
 @dataclass(slots=True)
 class RigMemory:
     """Writes the state of loop, load cell and robot to a file, which is replaced as a whole."""
@@ -134,7 +151,7 @@ class RigMemory:
     robot: UrRobot | None = None
     error: str = ""
     # The experiment that is about to begin.
-    starting: str = ""
+    _starting: str = ""
     # The state in the file.
     _written: Remembered | None = None
     # The load cell's zero in its calibration, and the restored zero.
@@ -222,15 +239,19 @@ class RigMemory:
 
     async def begins(self, experiment: str) -> str | None:
         """Write that an experiment begins, before anything moves; return why it cannot be written, or None."""
-        self.starting = experiment
+        self._starting = experiment
         return await self.save_present()
+
+    def begun(self) -> None:
+        """Leave it to the loop from now on to say which experiment runs, also where its start was refused."""
+        self._starting = ""
 
     async def save_present(self) -> str | None:
         """Write the present state, unless the file has it already; return why it cannot be written, or None."""
         self._watch_wrench()
         self._note_lost_zero()
         state = Remembered.of(self.loop)
-        state = replace(state, running=state.running or self.starting)
+        state = replace(state, running=state.running or self._starting)
         if self.load_cell is not None and self.loop.tool.may_be_loaded() and self._knows_load_zero:
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)

@@ -38,10 +38,6 @@ GIVES_UP_BEFORE_S = 0.1
 WriteState = Callable[[], Awaitable[str | None]]
 
 
-async def no_state() -> None:
-    """Write nothing: the state of a rig that ends with its daemon."""
-
-
 @dataclass(slots=True)
 class ActionExecutor:
     """Carries out one action at a time; the final action of a stop takes its place."""
@@ -52,7 +48,7 @@ class ActionExecutor:
     sender: CommandSender
     straight_moves: StraightMoves
     control_loop: ControlLoop
-    write_state: WriteState = no_state
+    write_state: WriteState
     _task: asyncio.Task[None] | None = None
     # The last action of a stop: to open the gripper, or to halt its fingers.
     _final_task: asyncio.Task[None] | None = None

@@ -6,7 +6,7 @@ from contextlib import suppress
 import structlog
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.action_executor import ActionExecutor, WriteState, no_state
+from shearloop.daemon.control.action_executor import ActionExecutor, WriteState
 from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.control_output import Drive, End, StandStill
@@ -58,7 +58,7 @@ class ControlLoopRunner:
         sensors: Mapping[str, Tareable],
         publisher: Publisher,
         clock: Clock,
-        write_state: WriteState = no_state,
+        write_state: WriteState,
     ) -> None:
         """`sensors` are those that an experiment tares or adapts; `write_state` is as in `ActionExecutor`."""
         self._control_loop = control_loop

@@ -19,6 +19,7 @@ from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
 from shearloop.daemon.control.wrench import publish_every, wrench_source
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.torques import WRENCH, TorqueSample
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, MoveLinear, RobotState, WristSpeed
@@ -219,7 +220,7 @@ class Cell:
         clock = StepClock(self.robot.bench)
         self.sensors: dict[str, Any] = {}
         self.runner = ControlLoopRunner(
-            self.control_loop, self.robot, self.gripper, self.sensors, self.published, clock
+            self.control_loop, self.robot, self.gripper, self.sensors, self.published, clock, NoMemory().save_present
         )
         self.task: asyncio.Task[None] | None = None
         self.holding = True

@@ -29,6 +29,7 @@ from shearloop.daemon.messaging.command_server import (
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.errors import UserError
 from tests.fixtures.daemons import bound_handlers
@@ -293,9 +294,8 @@ async def test_a_command_that_crashes_or_is_cut_off_is_reported_as_not_carried_o
             await never.wait()
 
     operator = SimpleNamespace(release_question=lambda: "the fingers open", release_stakes=tuple)
-    rig = SimpleNamespace(
-        runner=Runner(), control_loop=SimpleNamespace(operator=operator, pause=crash), occasion=tuple, memory=None
-    )
+    loop = SimpleNamespace(operator=operator, pause=crash)
+    rig = SimpleNamespace(runner=Runner(), control_loop=loop, occasion=tuple, memory=NoMemory())
     handlers = bound_handlers(
         Commands(
             rig=rig,

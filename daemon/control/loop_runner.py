@@ -173,11 +173,13 @@ class ControlLoopRunner:
 
     def start_refusal(self) -> str | None:
         """Return why no experiment at all can begin, or None."""
+        return self.busy() or self._control_loop.start_refusal() or self._taring()
+
+    def busy(self) -> str | None:
+        """Return what is under way and refuses every command but `stop`, or None."""
         if self._closed:
             return ENDING
-        if self.operator_action.under_way:
-            return UNLOCKING
-        return self._control_loop.start_refusal() or self._taring()
+        return UNLOCKING if self.operator_action.under_way else None
 
     def _taring(self) -> str | None:
         """Return why no experiment can begin with the zeros of now, or None."""
@@ -217,12 +219,8 @@ class ControlLoopRunner:
             if not self._closed:
                 self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
             return STOPPED_AT_START
-        if refusal:
-            return refusal
-        if self.operator_action.under_way:
-            return UNLOCKING
         # The first step could grip a tool, and the tool's torque would become the zero.
-        if (refusal := self._taring()) is not None:
+        if (refusal := refusal or self.busy() or self._taring()) is not None:
             return refusal
         now_ns = self._clock.now_ns()
         refusal = self._control_loop.start(file, now_ns)
@@ -266,11 +264,7 @@ class ControlLoopRunner:
 
     def unlock_refusal(self) -> str | None:
         """Return why robot and gripper cannot be unlocked now, or None."""
-        if self._closed:
-            return ENDING
-        if (experiment := self._control_loop.running) is not None:
-            return f"the experiment {experiment.file.name!r} is running; stop it first"
-        return UNLOCKING if self.operator_action.under_way else None
+        return self.busy() or self._control_loop.operator.running_refusal()
 
     async def unlock(self, *, confirmed: bool = False) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not.
@@ -296,10 +290,8 @@ class ControlLoopRunner:
 
         The emergency stop, a torque beyond its limit and a stop that waits for `unlock` do not prevent it.
         """
-        if self._closed:
-            return ENDING
-        if self.operator_action.under_way:
-            return UNLOCKING
+        if (reason := self.busy()) is not None:
+            return reason
         state = self._robot.state
         if state is not None and not (state.rests and state.motion == "idle"):
             return "the arm is moving; wait until it stands still, or stop it"

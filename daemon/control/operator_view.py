@@ -46,13 +46,18 @@ class OperatorView:
 
     def start_refusal(self) -> str | None:
         """Return why no experiment can begin, or None."""
-        if (running := self.running()) is not None:
-            return f"the experiment {running.file.name!r} is still running; stop it first"
+        if (reason := self.running_refusal()) is not None:
+            return reason
         if (stop := self.safety.waiting) is not None:
             first, *others = stop.faults
             also = f" Also: {'; '.join(fault.cause for fault in others)}." if others else ""
             return f"{first.sentence}{also}"
         return None
+
+    def running_refusal(self) -> str | None:
+        """Return the running experiment as the reason of a refusal, or None."""
+        running = self.running()
+        return f"the experiment {running.file.name!r} is running; stop it first" if running is not None else None
 
     def file_refusal(self, file: ExperimentFile) -> str | None:
         """Return why this experiment cannot begin with the present tool and zeros, or None."""
@@ -120,8 +125,8 @@ class OperatorView:
 
     def release_refusal(self) -> str | None:
         """Return why the operator cannot open the gripper at present, or None; the state of the arm does not count."""
-        if (running := self.running()) is not None:
-            return f"the experiment {running.file.name!r} is running; stop it first"
+        if (reason := self.running_refusal()) is not None:
+            return reason
         if not self.tool.has_gripper:
             return None
         gripper = self.inputs.gripper

@@ -248,7 +248,7 @@ async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refu
     async with driven(TWIST, cycles=10) as cell:
         before = len(cell.robot.commands)
         file = experiment(MOVE)
-        assert "is still running" in (await cell.runner.start(file) or "")
+        assert "is running; stop it first" in (await cell.runner.start(file) or "")
         assert all(isinstance(command, WristSpeed) for command in cell.robot.commands[before:])
 
 

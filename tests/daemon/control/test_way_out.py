@@ -386,7 +386,7 @@ async def test_no_start_while_a_zero_is_taken():
         # A step of the experiment that runs takes one too.
         await cell.start(WAIT)
         cell.sensors["right"].taring = True
-        assert cell.runner.start_refusal() == "the experiment 'test' is still running; stop it first"
+        assert cell.runner.start_refusal() == "the experiment 'test' is running; stop it first"
 
 
 async def test_a_full_disk_is_said_before_the_start():

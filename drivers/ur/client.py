@@ -142,7 +142,8 @@ class UrRobot:
         if self._connection is None or self.state is None:
             replied.set_result(messages.CommandReply(f"The robot is not connected. {self.monitor.latest.sentence}"))
         else:
-            self._tell_held(self._connection)
+            if isinstance(command, messages.Unlock):
+                self._tell_held(self._connection)
             self._number += 1
             self._replies[self._number] = replied
             self._connection.send(command, self._number)
@@ -156,7 +157,7 @@ class UrRobot:
             self._restored_zero = (0.0,) * 6
 
     def _tell_held(self, connection: "WorkerConnection") -> None:
-        """Send the worker a change of what `holds` says, before any command that follows from it."""
+        """Send the worker a change of what `holds` says; a program that starts keeps the wrench's zero by it."""
         held = self._holds()
         if held is not self._told_held:
             self._told_held = held

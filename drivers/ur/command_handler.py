@@ -1,7 +1,8 @@
 """Decides in the worker which commands are sent to the robot, and refuses the others with a reason.
 
-No clock, no pipe, no ur-rtde: the arm and the time are arguments. `tick` runs one cycle; `request` takes commands
-between cycles. After a motion has ended, only a new command begins one.
+No clock, no pipe, no ur-rtde: the arm and the time are arguments. `take` judges each of the robot's samples, once.
+`tick` runs one cycle; `request` takes commands between cycles. Both act on the sample that was taken last. After a
+motion has ended, only a new command begins one.
 """
 
 from typing import TYPE_CHECKING
@@ -35,12 +36,15 @@ LEAVING = "The daemon disconnects from the robot: start it again to continue."
 
 
 class CommandHandler:
-    """Applies the latest command within the limits."""
+    """Applies the latest command within the limits; each sample has to be taken first."""
 
     def __init__(self, settings: UrSettings, arm: "UrArm", now_ns: int) -> None:
         """Begin with motion disabled, and start the control program where the robot allows it."""
         self._settings = settings
         self._arm = arm
+        self._sample: RtdeSample
+        # Why the controller cannot take motion commands, by the sample; empty while it can.
+        self._unfit = ""
         self._executor = MotionExecutor(settings, arm, now_ns)
         self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s)
         self._disabled_reason = NOT_ENABLED
@@ -69,12 +73,15 @@ class CommandHandler:
         """
         return self._executor.take_rejection()
 
-    def request(
-        self, number: int, command: Command | Heartbeat, sample: RtdeSample, now_ns: int
-    ) -> CommandReply | None:
+    def take(self, sample: RtdeSample) -> None:
+        """Take and judge the robot's latest sample; `request`, `tick` and `state` are about it."""
+        self._sample, self._unfit = sample, why_unfit(sample, self._settings)
+        self._executor.take(sample)
+
+    def request(self, number: int, command: Command | Heartbeat, now_ns: int) -> CommandReply | None:
         """Return the reply to a command; None for a heartbeat, and when `tick` returns it later (`Unlock`)."""
         self._daemon_alive_ns = now_ns
-        unfit = self._why_unfit(sample)
+        sample, unfit = self._sample, self._why_unsent
         match command:
             case Heartbeat():
                 return None
@@ -85,11 +92,11 @@ class CommandHandler:
                 self._executor.stop_now(sample, now_ns, "the daemon disconnects")
                 return CommandReply()
             case Stop():
-                refusal = self._stop(number, command, sample, now_ns)
+                refusal = self._stop(number, command, now_ns)
             case _ if self.leaving:
                 refusal = LEAVING
             case WristSpeed() | MoveLinear():
-                refusal = self._why_blocked(sample) or self._executor.begin(number, command, sample, now_ns)
+                refusal = self._why_blocked or self._executor.begin(number, command, sample, now_ns)
             case Unlock() if self._recovery is not None and self._recovery.operator_asked:
                 refusal = "Unlocking is under way."
             case Unlock() if unfit:
@@ -101,12 +108,12 @@ class CommandHandler:
             case _ if self._recovery is not None:
                 refusal = BEING_MADE_READY
             case Enable() | Unlock():
-                refusal = unfit or self._executor.violation(sample)
+                refusal = unfit or self._executor.violation
                 if not refusal:
                     self._disabled_reason = ""
                 return CommandReply(refusal=refusal)
             case ZeroForceTorque():
-                return CommandReply(refusal=unfit or self._zero_wrench(sample))
+                return CommandReply(refusal=unfit or self._zero_wrench())
         if refusal:
             return CommandReply(refusal=refusal)
         return CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
@@ -121,30 +128,31 @@ class CommandHandler:
         if self._recovery is not None:
             self._recovery.held = message.held
 
-    def _stop(self, number: int, command: Stop, sample: RtdeSample, now_ns: int) -> str:
+    def _stop(self, number: int, command: Stop, now_ns: int) -> str:
         """Stop on command; return why not, or an empty string."""
         if self._recovery is not None and self._recovery.operator_asked:
             self._recovery.give_up("Unlocking was ended by a stop.")
         if command.deceleration_rad_per_s2 <= 0:
             return f"A deceleration of {command.deceleration_rad_per_s2:g} rad/s² is not above 0."
-        if unfit := self._why_unfit(sample):
+        if unfit := self._why_unsent:
             if not self.at_rest:
                 # The next sample may be fit again; a refused stop stops the arm all the same.
                 self._executor.leave_to_watchdog(unfit)
             return f"{unfit} Nothing can be sent, and the arm stops by itself."
-        return self._executor.stop_on_command(number, command, sample, now_ns)
+        return self._executor.stop_on_command(number, command, self._sample, now_ns)
 
-    def _zero_wrench(self, sample: RtdeSample) -> str:
+    def _zero_wrench(self) -> str:
         """Zero the wrench; return why not, or an empty string."""
         # A new zero would only hide a value beyond its limit.
-        if beyond := self._executor.violation(sample):
+        if beyond := self._executor.violation:
             return beyond
-        if not (self.at_rest and sample.rests):
+        if not (self.at_rest and self._sample.rests):
             return "The wrench is zeroed only at rest: stop the arm first."
         return "" if self._arm.zero_wrench() else "The robot did not zero its force-torque sensor."
 
-    def tick(self, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
-        """Run one cycle: check the sample and send the due command; return the reply to an `Unlock` that has ended."""
+    def tick(self, now_ns: int) -> tuple[int, CommandReply] | None:
+        """Run one cycle: send the due command, or stop; return the reply to an `Unlock` that has ended."""
+        sample = self._sample
         self._executor.watch(sample, now_ns)
         if sample.program_paused:
             # Resumed at the pendant, it would go on with its last motion until the deadline.
@@ -153,11 +161,11 @@ class CommandHandler:
         if recovery is not None:
             recent = is_recent(sample, self._settings)
             return self._end_recovery(recovery) if recovery.advance(sample, now_ns, recent=recent) else None
-        unfit = self._why_unfit(sample)
+        unfit = self._why_unsent
         if unfit:
             # Nothing can be sent. The arm stops by itself, or by its watchdog, which is not fed now.
             self._disabled_reason = unfit
-            if why_unfit(sample, self._settings):
+            if self._unfit:
                 self._disabled_late = may_be_late(sample, self._settings)
             if not self.at_rest:
                 # The program may turn the wrist on, also when it is resumed.
@@ -165,7 +173,7 @@ class CommandHandler:
             if not sample.program_running:
                 self._executor.disable(unfit)
             return None
-        beyond = self._executor.violation(sample)
+        beyond = self._executor.violation
         if beyond:
             self._disabled_reason = beyond
             self._disabled_late = False
@@ -176,14 +184,14 @@ class CommandHandler:
         self._executor.keep(sample, now_ns, self._daemon_alive_ns)
         return None
 
-    def state(self, sample: RtdeSample, cycle: int) -> RobotState:
+    def state(self, cycle: int) -> RobotState:
         """Return the sample with the state of the driver."""
-        executor, blocked = self._executor, self._why_blocked(sample)
+        executor, blocked = self._executor, self._why_blocked
         return RobotState(
-            **sample.__dict__,
+            **self._sample.__dict__,
             blocked=blocked,
             awaits_enable=blocked == NOT_ENABLED,
-            late=bool(blocked) and self._may_be_late(sample),
+            late=bool(blocked) and self._may_be_late,
             recovering=self.recovering,
             motion=executor.motion,
             motion_id=executor.motion_id,
@@ -194,21 +202,24 @@ class CommandHandler:
             wrench_zero=self._arm.wrench_zero,
         )
 
-    def _why_unfit(self, sample: RtdeSample) -> str:
-        """Return why nothing can be sent to the robot, or the empty string."""
-        return why_unfit(sample, self._settings) or self._executor.disabled_reason
+    @property
+    def _why_unsent(self) -> str:
+        """Why nothing can be sent to the robot, or the empty string."""
+        return self._unfit or self._executor.disabled_reason
 
-    def _why_blocked(self, sample: RtdeSample) -> str:
-        """Return why motion is refused, or the empty string."""
+    @property
+    def _why_blocked(self) -> str:
+        """Why motion is refused, or the empty string."""
         if self._recovery is not None:
             return BEING_MADE_READY
-        return self._why_unfit(sample) or self._executor.violation(sample) or self._disabled_reason
+        return self._why_unsent or self._executor.violation or self._disabled_reason
 
-    def _may_be_late(self, sample: RtdeSample) -> bool:
-        """Return whether messages that came late can be why motion is refused."""
-        if why_unfit(sample, self._settings):
-            return may_be_late(sample, self._settings)
-        is_beyond = not self._executor.disabled_reason and self._executor.violation(sample) != ""
+    @property
+    def _may_be_late(self) -> bool:
+        """Whether messages that came late can be why motion is refused."""
+        if self._unfit:
+            return may_be_late(self._sample, self._settings)
+        is_beyond = not self._executor.disabled_reason and self._executor.violation != ""
         return self._recovery is None and not is_beyond and self._disabled_late
 
     def _end_recovery(self, recovery: Recovery) -> tuple[int, CommandReply] | None:
@@ -222,7 +233,7 @@ class CommandHandler:
             self._disabled_reason = ""
         return recovery.unlock_number, CommandReply(refusal=recovery.refusal or "")
 
-    def end_program(self, sample: RtdeSample) -> None:
+    def end_program(self) -> None:
         """End our program. One that has no heartbeats now ends by its watchdog, also when it starts or is resumed."""
-        if sample.program_running and not self._executor.disabled_reason:
+        if self._sample.program_running and not self._executor.disabled_reason:
             self._arm.end_program()

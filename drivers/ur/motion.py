@@ -90,6 +90,8 @@ class MotionExecutor:
         # How many samples at rest came last.
         self._at_rest = 0
         self._accelerations = Accelerations()
+        # The limits that the latest sample exceeds, as sentences: in any case, and by the acceleration of a motion.
+        self._beyond = self._too_fast = ""
 
     @property
     def motion(self) -> MotionKind:
@@ -188,19 +190,24 @@ class MotionExecutor:
         self._motion, self._speed_thread = None, False
         self.disabled_reason = disabled_reason
 
+    def take(self, sample: RtdeSample) -> None:
+        """Compare the latest sample, and the accelerations up to it, with the limits."""
+        self._accelerations.add(sample)
+        self._beyond = violation(sample, self._settings)
+        self._too_fast = self._accelerations.violation(self._settings.limits)
+
     def watch(self, sample: RtdeSample, now_ns: int) -> None:
-        """Note the arm's accelerations, and whether an idle arm rests; call this in every cycle."""
+        """Note whether an idle arm rests; call this in every cycle."""
         if self._motion is not None or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
             self._rested_ns = now_ns
         self._at_rest = self._at_rest + 1 if sample.rests else 0
-        self._accelerations.add(sample)
 
-    def violation(self, sample: RtdeSample) -> str:
-        """Return a sentence that names the limit that the sample or the present motion exceeds, or the empty string."""
-        beyond = violation(sample, self._settings)
-        if not beyond and isinstance(self._motion, WristSpeed | _Move):
-            beyond = self._accelerations.violation(self._settings.limits)
-        return beyond
+    @property
+    def violation(self) -> str:
+        """A sentence that names the limit that the latest sample or the present motion exceeds, or an empty string."""
+        if not self._beyond and isinstance(self._motion, WristSpeed | _Move):
+            return self._too_fast
+        return self._beyond
 
     def keep(self, sample: RtdeSample, now_ns: int, daemon_alive_ns: int) -> None:
         """Send what this cycle needs; the daemon's last message came at `daemon_alive_ns`."""

@@ -182,24 +182,26 @@ def control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
             pipe.send(error)
         if not sample.connected or sample.age_ns > 3 * settings.state_timeout_s * 1e9:
             raise RobotLostError("lost", why_unfit(sample, settings))
-        handle_commands(pipe, handler, sample)
+        handler.take(sample)
+        handle_commands(pipe, handler)
         if not pipe.open and not handler.leaving:
-            handler.request(0, messages.Disconnect(), sample, time.monotonic_ns())
+            handler.request(0, messages.Disconnect(), time.monotonic_ns())
         if handler.leaving:
             leave_s = min(leave_s, time.monotonic() + BRAKE_S)
         if handler.recovering:
             # Announce a cycle that may take long.
-            pipe.send_latest(handler.state(sample, cycle))
+            pipe.send_latest(handler.state(cycle))
             _set_alarm(messages.RECOVERY_HANG_S)
-        ended = handler.tick(sample, time.monotonic_ns())
+        ended = handler.tick(time.monotonic_ns())
         if ended is not None:
             number, reply = ended
             pipe.send(reply, number)
         if not handler.take_rejection():
-            pipe.send_latest(handler.state(sample, cycle))
+            pipe.send_latest(handler.state(cycle))
         if (handler.leaving and handler.at_rest) or time.monotonic() > leave_s:
             _set_alarm(BRAKE_S + settings.hang_timeout_s)
-            handler.end_program(arm.read())
+            handler.take(arm.read())
+            handler.end_program()
             _exit(EXIT_DONE)
         # A late cycle begins at once; missed ones are skipped.
         due_s, cycle = max(due_s + period_s, time.monotonic()), cycle + 1
@@ -208,16 +210,17 @@ def control(pipe: Pipe, settings: UrSettings, arm: "UrArm") -> NoReturn:
                 time.sleep(left_s)
             elif pipe.wait(left_s):
                 # Carry a command out on arrival: waiting for the next cycle would delay the loop.
-                handle_commands(pipe, handler, arm.read())
+                handler.take(arm.read())
+                handle_commands(pipe, handler)
 
 
-def handle_commands(pipe: Pipe, handler: CommandHandler, sample: messages.RtdeSample) -> None:
+def handle_commands(pipe: Pipe, handler: CommandHandler) -> None:
     """Carry out the daemon's commands."""
     for number, message in pipe.receive():
         if isinstance(message, messages.Held):
             handler.take_held(message)
         elif isinstance(message, messages.Command | messages.Heartbeat):
-            reply = handler.request(number, message, sample, time.monotonic_ns())
+            reply = handler.request(number, message, time.monotonic_ns())
             if reply is not None:
                 pipe.send(reply, number)
 

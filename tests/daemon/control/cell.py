@@ -75,7 +75,7 @@ class Robot(UrRobot):
 
     def keep_moving(self) -> None:
         if self.state is not None and self.state.motion == "linear":
-            self.bench.handler.request(0, Heartbeat(), self.bench.arm.reading, self.bench.now_ns)
+            self.bench.handler.request(0, Heartbeat(), self.bench.now_ns)
 
     def die(self, gone_for: int) -> None:
         """End the process with all that it has not said; the next one is there after so many cycles."""

@@ -243,7 +243,8 @@ class HandlerBench:
     def ask(self, command: messages.Command) -> messages.CommandReply:
         """Send a command, run cycles until its reply comes, and return it."""
         self.number += 1
-        reply = self.handler.request(self.number, command, self.arm.reading, self.now_ns)
+        self.handler.take(self.arm.reading)
+        reply = self.handler.request(self.number, command, self.now_ns)
         for _ in range(6000):
             if reply is not None or self.number in self.decided:
                 break
@@ -252,15 +253,21 @@ class HandlerBench:
 
     def run(self, cycles: int, *, daemon_alive: bool = True) -> None:
         for _ in range(cycles):
+            self.handler.take(self.arm.reading)
             if daemon_alive:
-                self.handler.request(0, messages.Heartbeat(), self.arm.reading, self.now_ns)
-            decided = self.handler.tick(self.arm.reading, self.now_ns)
+                self.handler.request(0, messages.Heartbeat(), self.now_ns)
+            decided = self.handler.tick(self.now_ns)
             if decided is not None:
                 assert decided[0] not in self.decided
                 self.decided[decided[0]] = decided[1]
             self.arm.cycle()
             self.now_ns += CYCLE_NS
             self.cycle += 1
+
+    def tick(self) -> tuple[int, messages.CommandReply] | None:
+        """Run a cycle of the handler alone."""
+        self.handler.take(self.arm.reading)
+        return self.handler.tick(self.now_ns)
 
     def run_until(self, condition: Callable[[messages.RobotState], bool], cycles: int = 1000) -> messages.RobotState:
         for _ in range(cycles):
@@ -271,7 +278,8 @@ class HandlerBench:
 
     @property
     def state(self) -> messages.RobotState:
-        return self.handler.state(self.arm.reading, self.cycle)
+        self.handler.take(self.arm.reading)
+        return self.handler.state(self.cycle)
 
     @property
     def wrist_speed(self) -> float:

@@ -69,7 +69,9 @@ from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import Disconnect, MessageDecoder, encode
 from tests.drivers.ur.handler_bench import SETTINGS, FakeArm
 
-os.write(1, encode(CommandHandler(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
+handler = CommandHandler(SETTINGS, FakeArm(), 0)
+handler.take(FakeArm().reading)
+os.write(1, encode(handler.state(0)))
 decoder, last = MessageDecoder(), None
 while heard := os.read(0, 1 << 16):
     for _, last in decoder.feed(heard):

@@ -47,14 +47,14 @@ def test_noise_of_a_standing_arm_is_rest_and_one_slow_sample_is_not():
     bench.run_until(lambda state: abs(state.qd_rad_per_s[5]) < 0.2)
     turning_on = bench.wrist_speed
     bench.arm.be(qd_rad_per_s=(0.0,) * 6)
-    bench.handler.tick(bench.arm.reading, bench.now_ns)
+    bench.tick()
     assert bench.state.motion == "stopping", "one sample decides nothing"
     bench.arm.be(qd_rad_per_s=(0.0, 0.0, 0.0, 0.0, 0.0, turning_on))
     bench.run_until(lambda state: state.rests)
     # As a real arm reports it at rest.
     for joint in (0.003, -0.003) * 3:
         bench.arm.be(qd_rad_per_s=(joint,) * 6)
-        bench.handler.tick(bench.arm.reading, bench.now_ns)
+        bench.tick()
     assert bench.state.motion == "idle"
 
 
@@ -315,8 +315,8 @@ def test_unlocking_is_ended_by_disconnecting_and_by_a_stop(command):
     bench.arm.be(robot_mode=3, runtime_state=1)
     bench.run(1)
     bench.arm.calls.clear()
-    assert bench.handler.request(98, Unlock(), bench.arm.reading, bench.now_ns) is None
-    bench.handler.request(99, command, bench.arm.reading, bench.now_ns)
+    assert bench.handler.request(98, Unlock(), bench.now_ns) is None
+    bench.handler.request(99, command, bench.now_ns)
     bench.run(300)
     assert bench.arm.calls == []
     assert not bench.handler.recovering

@@ -102,7 +102,7 @@ def test_linear_move_gets_heartbeats_and_reports_its_arrival():
     assert set(bench.arm.calls) == {"move", "send_heartbeat"}
     assert "straight move is under way" in bench.ask(WristSpeed(0.1, 1.0)).refusal
     bench.arm.be(moving_linearly=False, qd_rad_per_s=(0.1, 0.0, 0.0, 0.0, 0.0, 0.0))
-    bench.handler.tick(bench.arm.reading, bench.now_ns)
+    bench.tick()
     assert bench.state.motion == "linear", "its joints still move"
     bench.run(1 + REST_SAMPLES)
     assert (bench.state.motion, bench.state.end_reason) == ("idle", "arrived")

@@ -83,7 +83,8 @@ def test_each_command_is_answered_at_once(daemon):
     bench = enabled()
     for acceleration, accepted in ((4.0, True), (-4.0, False)):
         daemon.send(WristSpeed(0.1, acceleration))
-        worker.handle_commands(daemon.pipe, bench.handler, bench.state)
+        bench.handler.take(bench.state)
+        worker.handle_commands(daemon.pipe, bench.handler)
         assert [message.accepted for _, message in daemon.receive() if isinstance(message, CommandReply)] == [accepted]
 
 

@@ -131,13 +131,15 @@ class SimulatedRobot:
         """Run a cycle; raises RobotLostError as a worker does."""
         self.arm.look()
         self._cycle += 1
-        ended = self._handler.tick(self.arm.reading, self._rig.now_ns())
+        self._handler.take(self.arm.reading)
+        ended = self._handler.tick(self._rig.now_ns())
         if ended is not None:
             self._replies[ended[0]] = ended[1]
 
     @property
     def state(self) -> RobotState:
-        return self._handler.state(self.arm.reading, self._cycle)
+        self._handler.take(self.arm.reading)
+        return self._handler.state(self._cycle)
 
     async def next_state(self) -> RobotState:
         await _NextCycle()
@@ -146,14 +148,15 @@ class SimulatedRobot:
     async def send(self, command: Command) -> CommandReply:
         self._number += 1
         number = self._number
-        reply = self._handler.request(number, command, self.arm.reading, self._rig.now_ns())
+        self._handler.take(self.arm.reading)
+        reply = self._handler.request(number, command, self._rig.now_ns())
         while reply is None:
             await _NextCycle()
             reply = self._replies.pop(number, None)
         return reply
 
     def keep_moving(self) -> None:
-        self._handler.request(0, Heartbeat(), self.arm.reading, self._rig.now_ns())
+        self._handler.request(0, Heartbeat(), self._rig.now_ns())
 
 
 class SimulatedMover(Mover):

@@ -15,8 +15,7 @@ import numpy as np
 
 from benchmarks.common import parser_of, table_head, table_row, write_figures
 from shearloop.daemon.control.margins import LoopModel, gain_limit, integral_gain
-from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController
-from shearloop.daemon.control.wrist_limit import WristLimit
+from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController, WristLimit
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.studies.charts import simulated_loop
 
@@ -55,16 +54,14 @@ class LoopCase:
         believed, ki = STIFFNESS / self.stiffness_ratio, integral_gain(kp)
         settings = ControllerSettings(
             stiffness_nm_per_rad=believed, sample_period_s=FRAME_PERIOD_S, window_s=FRAME_PERIOD_S, kp=kp, ki=ki,
-            wrist_bandwidth_per_s=BANDWIDTH_PER_S, ramp_nm_per_s=1e3, deadband_nm=0.0, torque_limit_nm=1e3,
+            wrist_bandwidth_per_s=BANDWIDTH_PER_S, ramp_nm_per_s=1e3, deadband_nm=0.0,
             wrist_limit=WristLimit(1e6, 1e9), travel_limit_rad=1e6, age_limit_s=10.0,
             fresh_s=np.inf,
         )  # fmt: skip
         if not self.compensated:
             return simulated_loop.UncompensatedController(settings)
         # Enough known measurements for a gain of kp from the start.
-        controller = TorqueController(settings, 0, 0.0, 0.0, 1e9)
-        controller.change_set_point(0.0)
-        return controller
+        return TorqueController(settings, 0, 0.0, 0.0, 1e9)
 
 
 CASES = (

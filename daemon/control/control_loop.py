@@ -3,11 +3,12 @@
 A plain object without I/O or clock: it takes inputs and events, and returns a `ControlOutput` at each tick.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import TypeAlias
 
-from shearloop.daemon.control.control_output import ControlOutput, Drive, End, StandStill
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, Hold, StepCommand, TrackTorque
 from shearloop.daemon.control.experiment_schema import (
@@ -32,8 +33,33 @@ from shearloop.daemon.torques import TorqueSample, TorqueSource, beyond_noise
 
 # An `adapt` step compares the fingertip with the torques of this time.
 ADAPTED_OVER_S = 600.0
+NO_ANGLE = "the controller reports no angle of the wrist"
 # Torques are reported as beyond these before the first experiment.
 DEFAULT_LIMITS = ExperimentLimits()
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """The wrist turns at a speed, and a straight move continues; `action` begins in this tick."""
+
+    rad_per_s: float
+    action: Action | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StandStill:
+    """The wrist stands, and a straight move is interrupted until the next `Drive`."""
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """Motion and action end; `release`: then the gripper opens, which one tick of a stop asks for."""
+
+    release: bool = False
+
+
+# What the control loop decides in a tick: to drive, to stand still, or to end all motion.
+ControlOutput: TypeAlias = Drive | StandStill | End
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +177,10 @@ class ControlLoop:
         return times_ns, beyond_noise(times_ns, torques_nm, noise_nm)
 
     def on_arm(self, arm: ArmStatus) -> None:
-        """Take a state of the robot."""
+        """Take a state of the robot; one without an angle stops the arm, and the last angle stays."""
+        if not math.isfinite(arm.wrist_rad):
+            known = self.inputs.arm or arm
+            arm = replace(arm, wrist_rad=known.wrist_rad, blocked=arm.blocked or NO_ANGLE)
         self.inputs.arm = arm
 
     def on_gripper(self, gripper: GripperStatus) -> None:
@@ -395,10 +424,10 @@ class ControlLoop:
 
         A command that cannot be done ends the experiment.
         """
-        command, limit_nm = experiment.command, experiment.limits.torque_nm
-        if isinstance(command.wrist, TrackTorque) and not self.wrist.tracks(command.wrist, limit_nm):
-            reason = self.wrist.close_loop(command.wrist, t_ns, wrist_rad, limit_nm)
-            if reason:
+        command = experiment.command
+        if isinstance(command.wrist, TrackTorque):
+            reason = self.wrist.close_loop(command.wrist, t_ns, wrist_rad)
+            if reason is not None:
                 self._fail(experiment, reason)
         if not experiment.running or command.action is None or not experiment.begin_action():
             return None
@@ -412,7 +441,7 @@ class ControlLoop:
             case GripStep() as grip:
                 self.tool.begin_grip(grip, origin_rad)
             case IdentifyStep() as identify:
-                self.wrist.begin_identification(identify, limit_nm)
+                self.wrist.begin_identification(identify, experiment.limits.torque_nm)
                 return None
         return command.action
 

@@ -7,7 +7,7 @@ from statistics import fmean
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.control.wrist_limit import WristLimit
+from shearloop.daemon.control.torque_controller import WristLimit
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
@@ -289,8 +289,8 @@ class StiffnessExcitation:
         return self.result is not None or self.failure is not None
 
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:
-        """Record a torque; missing, non-finite and out-of-order values are skipped."""
-        if torque_nm is None or not math.isfinite(torque_nm) or not self._angles:
+        """Record a torque; missing and out-of-order values are skipped."""
+        if torque_nm is None or not self._angles:
             return
         t_mid_s = (t_mid_ns - self._origin_ns) / 1e9
         if self._torques and t_mid_s <= self._torques[-1][0]:
@@ -305,8 +305,8 @@ class StiffnessExcitation:
             )
 
     def command(self, t_ns: int, wrist_angle_rad: float) -> float:
-        """Return the wrist speed for now in rad/s; 0 once done, or while the angle is not a number."""
-        if self.done or not math.isfinite(wrist_angle_rad):
+        """Return the wrist speed for now in rad/s; 0 once done."""
+        if self.done:
             self._speed = 0.0
             return 0.0
         if not self._angles:
@@ -324,7 +324,7 @@ class StiffnessExcitation:
 
     def sent(self, speed_rad_per_s: float) -> None:
         """Correct the speed that was sent for the last command, after clipping."""
-        if self._speeds and math.isfinite(speed_rad_per_s):
+        if self._speeds:
             self._speed = self._speeds[-1] = speed_rad_per_s
 
     def _goal_rad(self) -> float:

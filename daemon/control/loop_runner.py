@@ -8,8 +8,7 @@ import structlog
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.action_executor import ActionExecutor, WriteState
 from shearloop.daemon.control.command_sender import CommandSender
-from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.control_output import Drive, End, StandStill
+from shearloop.daemon.control.control_loop import ControlLoop, Drive, End, StandStill
 from shearloop.daemon.control.experiment import Experiment, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S

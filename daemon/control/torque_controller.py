@@ -30,12 +30,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from statistics import fmean
+from typing import Self
 
 import numpy as np
 
-from shearloop.daemon.control.wrist_limit import WristLimit
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample
-from shearloop.errors import UserError
 
 # The ramp does not catch up when the loop was late for longer than this.
 LONGEST_STEP_NS = 50_000_000
@@ -50,6 +50,32 @@ _MAX_SINCE_JUMP = 5
 _UNKNOWN = 1e-6
 # A drift is extrapolated over at most this many dropped measurements.
 _MAX_MISSED = 4
+
+
+@dataclass(frozen=True, slots=True)
+class WristLimit:
+    """The wrist's largest speed, and how fast it may speed up, for all speeds that the daemon forms.
+
+    The worker and the script on the robot check the speeds again.
+    """
+
+    speed_rad_per_s: float
+    acceleration_rad_per_s2: float
+
+    @classmethod
+    def of(cls, config: LoopConfig) -> Self:
+        """Return the limit that the loop plans with."""
+        return cls(config.wrist_speed_rad_per_s, config.planned_acceleration_rad_per_s2)
+
+    def clip(self, wanted_rad_per_s: float) -> float:
+        """Return the wanted speed, or the largest one in its direction."""
+        return max(-self.speed_rad_per_s, min(self.speed_rad_per_s, wanted_rad_per_s))
+
+    def speed_up(self, sent_rad_per_s: float, wanted_rad_per_s: float, elapsed_s: float) -> float:
+        """Return the speed after `elapsed_s` on the way from the sent to the wanted speed; braking is not limited."""
+        turning = abs(sent_rad_per_s) if wanted_rad_per_s * sent_rad_per_s > 0.0 else 0.0
+        fastest = turning + self.acceleration_rad_per_s2 * elapsed_s
+        return math.copysign(min(abs(wanted_rad_per_s), fastest), wanted_rad_per_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +106,6 @@ class ControllerSettings:
     creep_limit_nm_per_s: float = math.inf
     # The wrist is held when the torque at a fixed angle has moved by this much: slip, or a screw that broke loose.
     offset_limit_nm: float = math.inf
-    torque_limit_nm: float
     wrist_limit: WristLimit
     # From the angle at the start, either way.
     travel_limit_rad: float
@@ -93,10 +118,8 @@ class ControllerSettings:
 class ControllerReason(StrEnum):
     """Why the wrist does not follow the torque; the text is for the operator."""
 
-    NO_SET_POINT = "no torque set point has been given"
     NOT_MEASURED = "the controller has just begun and waits for its first torque"
     STALE = "the torque is stale: no valid measurement has come for too long"
-    NO_ANGLE = "the robot's wrist angle is missing or not a number"
     NOT_FOLLOWING = "the torque no longer follows the wrist: the grip slips, or the screw broke loose or stripped"
     TRAVEL = "the wrist has reached the limit of its travel"
     SPEED = "the wrist turns at its speed limit"
@@ -212,11 +235,11 @@ class TorqueFilter:
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int, *, integrates: bool = True) -> bool:
         """Use a torque of the time t_mid_ns that arrived at t_ns; return whether it can be used.
 
-        It cannot if it is no number, not later than the one before, stamped in the future, too old, or from a time at
+        It cannot if it is not valid, not later than the one before, stamped in the future, too old, or from a time at
         which the wrist angle is not known. The drift is learnt while the loop `integrates`.
         """
         settings = self._settings
-        if torque_nm is None or not math.isfinite(torque_nm) or not self._t_mid_ns < t_mid_ns <= t_ns:
+        if torque_nm is None or not self._t_mid_ns < t_mid_ns <= t_ns:
             return False
         if t_ns - t_mid_ns > settings.age_limit_s * 1e9:
             return False
@@ -277,19 +300,15 @@ class TorqueController:
     ) -> None:
         """Begin at a wrist angle and its torque, known as well as the mean of `known_measurements`.
 
-        The first measurements are averaged with that torque (gain 1/(n+1)) until kp is the greater gain. There is no
-        set point yet. Raises UserError for values that are not numbers.
+        The first measurements are averaged with that torque (gain 1/(n+1)) until kp is the greater gain. The torque is
+        kept until `change_set_point`.
         """
-        if not (math.isfinite(angle_rad) and math.isfinite(torque_nm) and known_measurements >= 0.0):
-            raise UserError("controller: it cannot start without a wrist angle and a torque that are numbers")
         self.settings = settings
         self.filter = TorqueFilter(settings, t_ns, angle_rad, torque_nm, known_measurements)
         # The filtered torque at the latest command.
         self.torque_nm = torque_nm
         self._moving = False
-        # None before the first set point.
-        self.set_point_nm: float | None = None
-        self.ramp_nm: float | None = None
+        self.set_point_nm = self.ramp_nm = torque_nm
         self._angle_rad = angle_rad
         self._t_ns = t_ns
         # The latest command before and after clipping; `sent` replaces the second by what was sent.
@@ -303,18 +322,9 @@ class TorqueController:
         return self.filter.std_nm(self._angle_rad)
 
     def change_set_point(self, torque_nm: float, settings: ControllerSettings | None = None) -> None:
-        """Change the set point; the ramp continues, or begins at the present torque.
-
-        `settings` count from this set point on, if its ramp or its limit differ. Raises UserError for a torque beyond
-        the limit.
-        """
+        """Change the set point; the ramp continues. `settings` count from this set point on, if its ramp differs."""
         self.settings = settings or self.settings
-        limit = self.settings.torque_limit_nm
-        if not abs(torque_nm) <= limit:
-            raise UserError(f"controller: a set point of {torque_nm:g} N·m is not within the limit of {limit:g} N·m")
         self.set_point_nm = torque_nm
-        if self.ramp_nm is None:
-            self.ramp_nm = self.filter.expected_nm(self._angle_rad)
 
     def resume(self) -> None:
         """Continue after a hold without commands; the ramp restarts at the present torque.
@@ -334,7 +344,7 @@ class TorqueController:
         return self.filter.measure(torque_nm, torque.t_mid_ns, torque.t_ns, integrates=not self._clipped)
 
     def command(self, t_ns: int, wrist_angle_rad: float, torques: Iterable[TorqueSample] = ()) -> WristCommand:
-        """Return the wrist speed for now, from the angle that the robot reports (NaN: unknown) and new torques.
+        """Return the wrist speed for now, from the angle that the robot reports and new torques.
 
         The torques come after the angle, which their windows need, and before the decision. The speed is 0 while
         anything forbids motion, and never exceeds the limit. It counts as sent until `sent` corrects it.
@@ -342,31 +352,26 @@ class TorqueController:
         tool = self.filter
         elapsed_s = min(max(t_ns - self._t_ns, 0), LONGEST_STEP_NS) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
-        reasons = []
-        if math.isfinite(wrist_angle_rad):
-            self._angle_rad = wrist_angle_rad
-            tool.angles.add(t_ns, wrist_angle_rad)
-        else:
-            reasons.append(ControllerReason.NO_ANGLE)
+        self._angle_rad = wrist_angle_rad
+        tool.angles.add(t_ns, wrist_angle_rad)
         for torque in torques:
             self.measure(torque)
         self.torque_nm = tool.expected_nm(self._angle_rad)
-        if self.set_point_nm is None:
-            reasons.append(ControllerReason.NO_SET_POINT)
+        reasons = []
         if tool.fresh_ns is None:
             reasons.append(ControllerReason.NOT_MEASURED)
         elif t_ns - tool.fresh_ns > self.settings.fresh_s * 1e9:
             reasons.append(ControllerReason.STALE)
         if tool.slipped:
             reasons.append(ControllerReason.NOT_FOLLOWING)
-        if reasons or self.set_point_nm is None:
+        if reasons:
             self._rest()
             return WristCommand(0.0, tuple(reasons))
-        return self._drive(self.set_point_nm, elapsed_s)
+        return self._drive(elapsed_s)
 
     def sent(self, speed_rad_per_s: float) -> None:
         """Correct the speed that was sent for the last command, after clipping by driver and safety."""
-        self._speed_rad_per_s = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
+        self._speed_rad_per_s = speed_rad_per_s
         is_slower = abs(self._speed_rad_per_s) < abs(self._wanted_rad_per_s)
         self._clipped = is_slower and abs(self._speed_rad_per_s - self._wanted_rad_per_s) > 1e-9
 
@@ -374,13 +379,12 @@ class TorqueController:
         """Stand still; the next ramp begins at the present torque."""
         self._moving = self._clipped = False
         self._wanted_rad_per_s = self._speed_rad_per_s = 0.0
-        if self.set_point_nm is not None:
-            self.ramp_nm = self.torque_nm
+        self.ramp_nm = self.torque_nm
 
-    def _drive(self, set_point_nm: float, elapsed_s: float) -> WristCommand:
+    def _drive(self, elapsed_s: float) -> WristCommand:
         settings = self.settings
-        before_nm = self.torque_nm if self.ramp_nm is None else self.ramp_nm
-        self.ramp_nm, slope_nm_per_s = self._advance_ramp(before_nm, set_point_nm, elapsed_s)
+        slope_nm_per_s = self._ramp_slope(elapsed_s)
+        self.ramp_nm += slope_nm_per_s * elapsed_s
         missing_nm = self.ramp_nm - self.torque_nm
         bound_nm = settings.deadband_nm * (_SETTLED_FRACTION if self._moving else 1.0)
         self._moving = slope_nm_per_s != 0.0 or abs(missing_nm) > bound_nm
@@ -402,18 +406,17 @@ class TorqueController:
         self._clipped = abs(wanted_rad_per_s) - abs(speed_rad_per_s) > 1e-9
         return WristCommand(speed_rad_per_s, tuple(reasons))
 
-    def _advance_ramp(self, ramp_nm: float, set_point_nm: float, elapsed_s: float) -> tuple[float, float]:
-        """Return the ramp, moved no further than the wrist was commanded to turn, and its slope in N·m/s."""
+    def _ramp_slope(self, elapsed_s: float) -> float:
+        """Return the ramp's slope in N·m/s: it moves no further than the wrist was commanded to turn."""
         settings = self.settings
         blocked = self._speed_rad_per_s == 0.0 and self._wanted_rad_per_s != 0.0
         if blocked or elapsed_s <= 0.0:
-            return ramp_nm, 0.0
-        towards = math.copysign(1.0, set_point_nm - ramp_nm)
+            return 0.0
+        missing_nm = self.set_point_nm - self.ramp_nm
+        towards = math.copysign(1.0, missing_nm)
         speed_up_rad_per_s = settings.wrist_limit.acceleration_rad_per_s2 * elapsed_s
         turning_rad_per_s = max(self._speed_rad_per_s * towards, 0.0) + speed_up_rad_per_s
         slope_nm_per_s = min(
-            settings.ramp_nm_per_s,
-            settings.stiffness_nm_per_rad * turning_rad_per_s,
-            abs(set_point_nm - ramp_nm) / elapsed_s,
+            settings.ramp_nm_per_s, settings.stiffness_nm_per_rad * turning_rad_per_s, abs(missing_nm) / elapsed_s
         )
-        return ramp_nm + towards * slope_nm_per_s * elapsed_s, towards * slope_nm_per_s
+        return towards * slope_nm_per_s

@@ -18,8 +18,8 @@ from shearloop.daemon.control.torque_controller import (
     ControllerSettings,
     TorqueController,
     WristCommand,
+    WristLimit,
 )
-from shearloop.daemon.control.wrist_limit import WristLimit
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample, TorqueSource
 
@@ -53,9 +53,8 @@ class WristController:
         self._judged: Future[JudgedGain] | None = None
         self.tool: ToolModel | None = None
         self.controller: TorqueController | None = None
-        # The torque set point of the closed loop, and the limit of its step.
+        # The torque set point of the closed loop.
         self.tracked: TrackTorque | None = None
-        self._torque_limit_nm = 0.0
         self._config = config
         self._limit = WristLimit.of(config)
         self._stands_still = False
@@ -106,19 +105,17 @@ class WristController:
                 self._pending.clear()
                 return command
 
-    def tracks(self, set_point: TrackTorque, torque_limit_nm: float) -> bool:
-        """Return whether the loop is closed on this set point, within this limit."""
-        return (self.tracked, self._torque_limit_nm) == (set_point, torque_limit_nm)
-
-    def close_loop(self, set_point: TrackTorque, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> str | None:
-        """Track a torque with the identified tool; return None, or why it cannot be tracked.
+    def close_loop(self, set_point: TrackTorque, t_ns: int, wrist_rad: float) -> str | None:
+        """Track a torque with the identified tool, unless it is tracked already; return None, or why it cannot be.
 
         Until the check of the gain has ended, the loop stays open and the wrist stands still.
         """
+        if self.tracked == set_point:
+            return None
         tool = self.tool
         if tool is None:
             return "the tool has not been identified; put an `identify` step before the first `hold_torque`"
-        settings = controller_settings(self._config, tool, self.source, set_point, torque_limit_nm)
+        settings = controller_settings(self._config, tool, self.source, set_point)
         if self._judged is None:
             self._judged = self._compute(partial(judged_gain, settings, tool, self._config))
         if not self._judged.done():
@@ -131,7 +128,7 @@ class WristController:
             here_nm = tool.torque_nm + tool.stiffness_nm_per_rad * (wrist_rad - tool.angle_rad)
             self.controller = TorqueController(settings, t_ns, wrist_rad, here_nm, tool.known_measurements)
         self.controller.change_set_point(set_point.torque_nm, settings)
-        self.tracked, self._torque_limit_nm = set_point, torque_limit_nm
+        self.tracked = set_point
         return None
 
     def begin_identification(self, action: IdentifyStep, torque_limit_nm: float) -> None:
@@ -180,7 +177,7 @@ class WristController:
 
 
 def controller_settings(
-    config: LoopConfig, found: ToolModel, source: TorqueSource, set_point: TrackTorque, torque_limit_nm: float
+    config: LoopConfig, found: ToolModel, source: TorqueSource, set_point: TrackTorque
 ) -> ControllerSettings:
     """Return the controller's settings for an identified tool."""
     kp = config.kp if config.kp is not None else gain_for_noise(found.noise_nm, config.allowed_noise_nm)
@@ -200,7 +197,6 @@ def controller_settings(
         innovation_limit_nm=max(3.0 * found.noise_nm, MIN_INNOVATION_LIMIT_NM),
         creep_limit_nm_per_s=CREEP_LIMIT_NM_PER_S,
         offset_limit_nm=config.max_offset_drift_nm,
-        torque_limit_nm=torque_limit_nm,
         wrist_limit=WristLimit.of(config),
         travel_limit_rad=TRAVEL_LIMIT_RAD,
         # As the fault `estimate stale`, so that the wrist does not rest before its reason is reported.

@@ -290,9 +290,7 @@ def settings_for(found: ToolModel, scenario: LoopScenario) -> ControllerSettings
         allowed_noise_nm=ALLOWED_NOISE_NM, torque_bandwidth_per_s=scenario.wrist_bandwidth_per_s,
         wrist_speed_rad_per_s=0.8, wrist_acceleration_rad_per_s2=6.0,
     )  # fmt: skip
-    return controller_settings(
-        config, found, scenario.source, TrackTorque(0.0, scenario.ramp_nm_per_s), torque_limit_nm=0.2
-    )
+    return controller_settings(config, found, scenario.source, TrackTorque(0.0, scenario.ramp_nm_per_s))
 
 
 def started_controller(plant: Plant, found: ToolModel, settings: ControllerSettings) -> TorqueController:

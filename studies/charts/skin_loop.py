@@ -16,8 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.control_output import Drive
+from shearloop.daemon.control.control_loop import ControlLoop, Drive
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.inputs import ArmStatus

@@ -125,7 +125,7 @@ def test_the_controller_uses_every_torque_that_is_no_fault(stale_after_s):
     """A torque that it refuses and no fault reports would let the wrist rest without a reason."""
     config, right = LoopConfig(stale_after_s=stale_after_s), TorqueSource(name="right", period_s=0.5, window_s=0.6)
     source = ControlLoop(config, {"right": right}, ("robot",)).wrist.source
-    tuned = controller_settings(config, FOUND, source, TrackTorque(0.1, 0.05), 0.5)
+    tuned = controller_settings(config, FOUND, source, TrackTorque(0.1, 0.05))
     fresh_s = max(1.25, stale_after_s)
     assert (tuned.fresh_s, tuned.age_limit_s) == (fresh_s, fresh_s + 0.3)
 
@@ -143,7 +143,7 @@ def test_the_wrists_acceleration_reaches_controller_identification_and_robot(whe
     config = DaemonConfig.model_construct(loop=loop_config)
     loop = make_loop(config, robot_settings(tmp_path / "ur.yaml"), {"right": source}, {})
     assert loop.config.wrist_acceleration_rad_per_s2 == 1.5, "sent to the robot"
-    tuned = controller_settings(loop.config, FOUND, source, TrackTorque(0.1, 0.05), 0.5)
+    tuned = controller_settings(loop.config, FOUND, source, TrackTorque(0.1, 0.05))
     assert tuned.wrist_limit.acceleration_rad_per_s2 == 0.75
     wrist = WristController(source, loop.config)
     wrist.begin_identification(IdentifyStep(do="identify"), 0.5)

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.control_output import ControlOutput
+from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.gripper_task import OPENING

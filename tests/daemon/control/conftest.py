@@ -3,8 +3,7 @@ from typing import Any
 
 import pytest
 
-from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController
-from shearloop.daemon.control.wrist_limit import WristLimit
+from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController, WristLimit
 from shearloop.daemon.torques import TorqueSample
 
 DEFAULTS: dict[str, Any] = {
@@ -20,7 +19,6 @@ DEFAULTS: dict[str, Any] = {
     "innovation_limit_nm": 0.036,
     "creep_limit_nm_per_s": 0.005,
     "offset_limit_nm": 0.06,
-    "torque_limit_nm": 0.2,
     "wrist_limit": WristLimit(speed_rad_per_s=0.6, acceleration_rad_per_s2=2.0),
     "travel_limit_rad": 1.0,
     "age_limit_s": 2.0,

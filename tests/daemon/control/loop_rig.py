@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.control_output import ControlOutput, Drive, End, StandStill
+from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput, Drive, End, StandStill
 from shearloop.daemon.control.experiment import Action, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.faults import Fault, FaultCode

@@ -1,5 +1,6 @@
 """The control loop when all is well: whole experiments, and what an operator may ask of one."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -7,13 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.control_output import End
+from shearloop.daemon.control.control_loop import ControlLoop, End
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, Opening, TareStep
 from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.grip import Grip
-from shearloop.daemon.control.inputs import GripperStatus
+from shearloop.daemon.control.inputs import ArmStatus, GripperStatus
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.torque_controller import ControllerReason
 from shearloop.daemon.control.wrench import wrench_source
@@ -196,20 +196,39 @@ def test_loop_state_has_the_filtered_torque_and_its_standard_deviation():
     assert 0.0 < state.filtered_torque_std_nm < 0.002
 
 
-def test_two_holds_that_differ_only_in_their_limit_have_each_its_own():
+@pytest.mark.parametrize("number", [3, 4, 5])
+def test_two_holds_that_differ_only_in_their_limit_have_each_its_own(number):
+    """A torque of 0.25 N·m is beyond the limit of the second hold alone."""
     hold = {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 5}
-    limits = [0.3, 0.2, 0.4]
-    holds = [{**hold, "limits": {"torque_nm": limit}} for limit in limits]
+    holds = [{**hold, "limits": {"torque_nm": limit}} for limit in (0.3, 0.2, 0.4)]
     rig = started(
         Rig(new_loop()), GRIP, {"do": "identify"}, *holds, torque_source="load_cell", limits={"torque_nm": 0.5}
     )
-    found = {}
-    while phase(rig) is ExperimentPhase.RUNNING:
-        rig.run(0.5)
-        if (controller := rig.control_loop.wrist.controller) is not None:
-            found[rig.control_loop.experiment.step_number] = controller.settings.torque_limit_nm
-    assert phase(rig) is ExperimentPhase.DONE
-    assert [found[number] for number in (3, 4, 5)] == limits
+    while rig.control_loop.experiment.step_number < number:
+        rig.step()
+    rig.step()
+    rig.control_loop.on_torque(TorqueSample("right", 0.25, "", rig.t_ns, rig.t_ns))
+    rig.step()
+    assert ("torque limit" in rig.control_loop.status.decision.codes) is (number == 4)
+
+
+def test_an_angle_that_is_not_a_number_stops_the_turn():
+    rig = twisting()
+    rig.control_loop.on_arm(ArmStatus(math.nan, rig.t_ns))
+    rig.control_loop.tick(rig.t_ns + 1)
+    assert rig.control_loop.status.decision.codes == "robot blocked"
+    assert phase(rig) is ExperimentPhase.STOPPED
+
+
+def test_an_angle_that_is_not_a_number_in_a_stale_state_begins_no_angle_of_the_tool():
+    """The state is held as stale before anything says that it blocks; the angle limit counts from a number."""
+    rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 1}, GRIP, TWIST)
+    rig.silent.add("arm")
+    rig.tick += 10
+    rig.control_loop.on_arm(ArmStatus(math.nan, rig.t_ns - 100_000_000))
+    rig.step()
+    assert rig.control_loop.status.decision.codes == "state stale"
+    assert rig.control_loop.tool.grip.origin_rad == pytest.approx(rig.wrist_rad)
 
 
 @pytest.mark.parametrize(

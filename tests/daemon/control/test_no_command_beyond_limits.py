@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.control_output import ControlOutput
+from shearloop.daemon.control.control_loop import ControlOutput
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.faults import Response

@@ -13,8 +13,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from shearloop.daemon import rig_memory
-from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.control_output import End
+from shearloop.daemon.control.control_loop import ControlLoop, End
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.faults import Fault, FaultCode, Response

@@ -93,25 +93,25 @@ def test_while_the_gain_is_checked_elsewhere_the_wrist_stands_and_then_the_loop_
     one.tool = TOOL
     for cycle in range(3):
         t_ns = 10**9 + cycle * CYCLE_NS
-        assert one.close_loop(goal, t_ns, 0.0, 0.3) is None
-        assert not one.tracks(goal, 0.3)
+        assert one.close_loop(goal, t_ns, 0.0) is None
+        assert one.tracked is None
         assert one.turn(goal, t_ns, 0.0, 0.0).speed_rad_per_s == 0.0
     ((job, checked),) = checks
     checked.set_result(job())
-    assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0, 0.3) is None
-    assert one.tracks(goal, 0.3)
+    assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0) is None
+    assert one.tracked == goal
     one.reset()
     one.tool = TOOL
-    assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0, 0.3) is None
+    assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0) is None
     checks[1][1].set_result(JudgedGain(0.5, 0.0, "controller refused"))
-    assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0, 0.3) == "controller refused"
+    assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0) == "controller refused"
 
 
-def test_each_torque_has_its_own_ramp_and_limit():
+def test_each_torque_has_its_own_ramp():
     one = wrist()
     one.tool = TOOL
-    assert one.close_loop(TrackTorque(0.1, 0.5), 10**9, 0.0, torque_limit_nm=0.15) is None
-    assert one.close_loop(TrackTorque(0.3, 0.01), 10**9, 0.0, torque_limit_nm=0.5) is None
+    assert one.close_loop(TrackTorque(0.1, 0.5), 10**9, 0.0) is None
+    assert one.close_loop(TrackTorque(0.3, 0.01), 10**9, 0.0) is None
     angle_rad = 0.0
     for cycle in range(1, 500):
         t_ns = 10**9 + cycle * CYCLE_NS
@@ -133,7 +133,7 @@ def test_the_automatic_gain_is_lowered_until_its_margins_pass_and_a_persons_is_r
     for kp in (None, 0.5):
         one = wrist(LoopConfig(kp=kp, gain_margin=4.0))
         one.tool = LAGGING
-        refusal = one.close_loop(TrackTorque(0.05, 0.04), 10**9, 0.0, torque_limit_nm=0.4)
+        refusal = one.close_loop(TrackTorque(0.05, 0.04), 10**9, 0.0)
         assert (refusal is None) == (kp is None), refusal
         if kp is None:
             assert one.controller.settings.kp == pytest.approx(0.4)

@@ -152,14 +152,11 @@ class ActionExecutor:
         try:
             if not isinstance(action, Opening):
                 await self._write_new_grip()
-            self.fingers.may_be_moving = True
-            await gripper.grip(action)
+            with self.fingers.moving():
+                await gripper.grip(action)
         except NotBegunError:
-            # A halt would only make the gripper forget that it holds something.
-            self.fingers.may_be_moving = False
             self.control_loop.tool.on_grip_refused()
             raise
-        self.fingers.may_be_moving = False
 
     async def _write_new_grip(self) -> None:
         """Write the grip that begins: a later daemon would go on with an earlier one; raises NotBegunError."""

@@ -259,8 +259,6 @@ class ControlLoop:
         if self.inputs.gripper is not None:
             # What other programs asked for before the start is no fault of this experiment.
             self.tool.judge(self.inputs.gripper)
-        if (reason := self.operator.why_no_source(file)) is not None:
-            return reason
         driving = self.sources[file.torque_source]
         watched = replace(self._watched, driving=driving, supervising=self._others(driving))
         faults = detect_faults(self.inputs, watched, file.limits, None, t_ns)

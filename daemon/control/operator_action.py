@@ -11,7 +11,7 @@ from shearloop.daemon.control.fingers import Fingers
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Unlock
-from shearloop.errors import ActionError, NotBegunError
+from shearloop.errors import ActionError
 
 UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
 
@@ -62,19 +62,16 @@ class OperatorAction:
         gripper = self.fingers.gripper
         if gripper is None:
             return
-        # An activation opens and closes the fingers.
-        self.fingers.may_be_moving = True
         try:
-            await gripper.unlock(confirmed=confirmed)
+            # An activation opens and closes the fingers.
+            with self.fingers.moving():
+                await gripper.unlock(confirmed=confirmed)
         except (ActionError, DriverError) as error:
-            self.fingers.may_be_moving = not isinstance(error, NotBegunError)
             raise ActionError(f"the robot is unlocked and may move again, and the gripper is not: {error}") from error
-        self.fingers.may_be_moving = False
 
     async def _release(self) -> None:
         gripper = self.fingers.gripper
         if gripper is None:
             return
-        self.fingers.may_be_moving = True
-        await gripper.open_by_operator()
-        self.fingers.may_be_moving = False
+        with self.fingers.moving():
+            await gripper.open_by_operator()

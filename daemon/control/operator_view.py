@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from shearloop.daemon.control.experiment import Experiment
-from shearloop.daemon.control.experiment_check import not_measured, too_noisy
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
@@ -61,7 +60,7 @@ class OperatorView:
 
     def file_refusal(self, file: ExperimentFile) -> str | None:
         """Return why this experiment cannot begin with the present tool and zeros, or None."""
-        if (reason := self.why_no_source(file) or self.why_not_with_tool(file)) is not None:
+        if (reason := self.why_not_with_tool(file)) is not None:
             return reason
         if isinstance(file.steps[0], TareStep) and (reason := self.why_no_tare_step()) is not None:
             return f"step 1 (tare): {reason}"
@@ -208,21 +207,6 @@ class OperatorView:
         if arm is None or origin_rad is None:
             return ""
         return f"it is turned by {arm.wrist_rad - origin_rad:+.3f} rad"
-
-    def why_no_source(self, file: ExperimentFile) -> str | None:
-        """Return why the experiment's torque source cannot drive it, or None."""
-        measured = [name for name, source in self.sources.items() if source.measures_torque]
-        if file.torque_source not in measured:
-            known = ", ".join(measured)
-            return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
-        driving = self.sources[file.torque_source]
-        if driving.noise_nm >= file.tightest_nm:
-            return too_noisy(driving.name, driving.noise_nm, file.tightest_nm)
-        unmeasured = next(not_measured(file, driving), None)
-        if unmeasured is not None:
-            place, why_not = unmeasured
-            return f"step {place + 1}: {why_not}"
-        return None
 
     def why_not_with_tool(self, file: ExperimentFile) -> str | None:
         """Return why a tool in the gripper, or an unknown zero of the torque, forbids an experiment, or None."""

@@ -84,6 +84,8 @@ class SafetyMonitor:
         if active or self._wrist_ns or self._holding:
             self._count(active, t_ns)
         self._judged_ns = t_ns
+        if not active and self.waiting is None:
+            return SafetyDecision(Response.NOTE)
         response = max(map(self._response, active), default=Response.NOTE)
         if response is Response.HOLD and self._wrist_ns > self._patience * LONGEST_HOLD_S * 1e9:
             active = (*active, Fault(FaultCode.HELD_TOO_LONG, self._hold_report()))

@@ -609,7 +609,7 @@ def test_the_first_motion_has_the_speed_that_the_robots_limits_leave(step, said)
     assert plan_of(file, SETTINGS.limits).first_motion.endswith(said)
 
 
-def test_a_noisy_source_supervises_beyond_its_noise_and_drives_nothing_gentle():
+def test_a_noisy_source_supervises_beyond_its_noise():
     """A CB3 estimates its wrench from the joints' currents."""
     noisy = wrench_source(125.0, noise_nm=5.0)
     loop = ControlLoop(CONFIG, {"right": EIT, WRENCH: noisy}, ("robot", "gripper"))
@@ -626,10 +626,6 @@ def test_a_noisy_source_supervises_beyond_its_noise_and_drives_nothing_gentle():
     assert "wrench measured +5.500 N·m, the limit is 0." in beyond.detail
     assert beyond.detail.endswith(" N·m and its noise 5 N·m")
     assert phase(rig) is ExperimentPhase.STOPPED
-    loop.acknowledge()
-    steps = [{"do": "wait", "wait_s": 1}]
-    driven = ExperimentFile.model_validate({"name": "one", "torque_source": WRENCH, "steps": steps})
-    assert "its torque is known to 5 N·m only, and the smallest limit is 0." in (loop.start(driven, rig.t_ns) or "")
 
 
 async def test_a_second_stop_keeps_the_daemon_that_can_open_the_gripper():

@@ -108,7 +108,7 @@ class Remembered:
     @classmethod
     def of(cls, loop: ControlLoop) -> "Remembered":
         """Return the present state of a control loop."""
-        running = loop.running.file.name if loop.running is not None else ""
+        running = loop.running_experiment.file.name if loop.running_experiment is not None else ""
         faults = loop.safety.waiting.faults if loop.safety.waiting is not None else ()
         stop = tuple((fault.code.name, fault.detail) for fault in faults)
         return cls(running, stop, **asdict(loop.tool.grip), stated_tool_mm=loop.stated_tool_mm)

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TypeAlias
 
 from shearloop.daemon.control.creep import Creep
-from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, Hold, StepCommand, TrackTorque
+from shearloop.daemon.control.experiment import Action, Experiment, ExperimentPhase, StepCommand, TrackTorque
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ExperimentFile,
@@ -60,6 +60,18 @@ class End:
 
 # What the control loop decides in a tick: to drive, to stand still, or to end all motion.
 ControlOutput: TypeAlias = Drive | StandStill | End
+
+
+@dataclass(frozen=True, slots=True)
+class _Tick:
+    """The facts of one tick while an experiment may move something."""
+
+    t_ns: int
+    wrist_rad: float
+    # The torques that a turn of the tool waits for, in words; empty for none.
+    awaited: str
+    # Whether a fault holds the wrist and the experiment's clock.
+    on_hold: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +139,12 @@ class ControlLoop:
         self._reported: list[Fault] = []
         self._ticked_ns = 0
         self.operator = OperatorView(
-            self.inputs, self.tool, self.safety, sources, self._zero_known, running=lambda: self.running
+            self.inputs,
+            self.tool,
+            self.safety,
+            sources,
+            self._zero_known,
+            running_experiment=lambda: self.running_experiment,
         )
 
     @property
@@ -136,7 +153,7 @@ class ControlLoop:
         return max((one.warm_up_s for one in self.sources.values() if one.measures_torque), default=0.0)
 
     @property
-    def running(self) -> Experiment | None:
+    def running_experiment(self) -> Experiment | None:
         """The experiment while it may still move something."""
         return self.experiment if self.experiment is not None and self.experiment.running else None
 
@@ -188,7 +205,7 @@ class ControlLoop:
         known = self.inputs.gripper
         if known is None or gripper.t_ns >= known.t_ns:
             self.inputs.gripper, before = gripper, self.tool.another
-            self.tool.on_gripper(gripper, judges=self.running is None)
+            self.tool.on_gripper(gripper, judges=self.running_experiment is None)
             if self.tool.another not in ("", before):
                 self.stated_tool_mm = None
 
@@ -290,8 +307,8 @@ class ControlLoop:
     def stop(self, reason: str, fault: Fault) -> None:
         """End the experiment, if one runs, and stand still until the operator acknowledges the stop."""
         self.safety.stop(fault, reason)
-        if self.running is not None:
-            self.running.stop(reason)
+        if self.running_experiment is not None:
+            self.running_experiment.stop(reason)
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command."""
@@ -305,7 +322,7 @@ class ControlLoop:
         """
         if sent_rad_per_s is not None:
             self.wrist.sent(sent_rad_per_s)
-        running, arm = self.running, self.inputs.arm
+        running, arm = self.running_experiment, self.inputs.arm
         self.inputs.late_s, self._ticked_ns = late_s, t_ns
         limits = self.experiment.limits if self.experiment is not None else DEFAULT_LIMITS
         awaited = self._awaited_torques(t_ns)
@@ -325,13 +342,14 @@ class ControlLoop:
             running.stop(" ".join(decision.reasons))
         if arm is None or decision.response >= Response.STOP_AND_KEEP_GRIP:
             return self._ended(decision)
-        return self._run_step(running, decision, awaited, arm.wrist_rad, t_ns)
+        tick = _Tick(t_ns, arm.wrist_rad, awaited, on_hold=decision.response is Response.HOLD)
+        return self._run_step(running, decision, tick)
 
     def _running_step(self, running: Experiment, awaited: str) -> RunningStep:
         """Return what the experiment needs and expects; `awaited` are the torques that a turn waits for."""
         command, controller = running.command, self.wrist.controller
         grasp = self._grasp(command)
-        needed = grasp.may_hold and _turns(command) and not awaited
+        needed = grasp.may_hold and command.turns and not awaited
         runs = running.phase is ExperimentPhase.RUNNING
         return RunningStep(
             torque_needed=needed and runs,
@@ -375,56 +393,53 @@ class ControlLoop:
     def _others(self, driving: TorqueSource) -> tuple[TorqueSource, ...]:
         return tuple(source for source in self.sources.values() if source is not driving)
 
-    def _run_step(
-        self, experiment: Experiment, decision: SafetyDecision, awaited: str, wrist_rad: float, t_ns: int
-    ) -> ControlOutput:
-        """Let the experiment choose its command, and the wrist's controller a speed.
-
-        `awaited` are the torques that a turn waits for.
-        """
-        on_hold = decision.response is Response.HOLD
-        origin_rad = self.tool.count_angle(wrist_rad)
-        clock_stands = on_hold or bool(awaited and _turns(experiment.command))
-        self._choose_command(experiment, origin_rad, t_ns, on_hold=on_hold, clock_stands=clock_stands)
-        turns = _turns(experiment.command)
-        if turns and self.tool.may_turn and not awaited:
+    def _run_step(self, experiment: Experiment, decision: SafetyDecision, tick: _Tick) -> ControlOutput:
+        """Let the experiment choose its command, and the wrist's controller a speed."""
+        self._choose_command(experiment, tick)
+        turns = experiment.command.turns
+        waits = turns and bool(tick.awaited)
+        if turns and not waits and self.tool.may_turn:
             # From the first turn on, a torque that does not come is a fault.
             self._unmeasured_since_ns = None
-        waits = turns and bool(awaited)
-        still = on_hold or waits or experiment.phase is ExperimentPhase.PAUSED
-        action = None if still else self._begin_command(experiment, wrist_rad, origin_rad, t_ns)
-        velocity = WristCommand()
-        if experiment.running:
-            velocity = self._wrist_command(experiment, wrist_rad, origin_rad, t_ns, still=still)
+        action, velocity = None, WristCommand()
+        stands = tick.on_hold or waits or experiment.phase is ExperimentPhase.PAUSED
+        if stands:
+            self.wrist.stand_still()
+        else:
+            action = self._begin_command(experiment, tick)
+            if experiment.running:
+                velocity = self._wrist_command(experiment, tick)
         if not experiment.running:
             return self._ended(self.safety.report(decision.faults))
-        phase = "held" if on_hold else experiment.phase.value
-        self.status = LoopStatus(phase, awaited if waits else experiment.command.activity, velocity, decision)
-        return StandStill() if still else Drive(velocity.speed_rad_per_s, action)
+        phase = "held" if tick.on_hold else experiment.phase.value
+        activity = tick.awaited if waits else experiment.command.activity
+        self.status = LoopStatus(phase, activity, velocity, decision)
+        return StandStill() if stands else Drive(velocity.speed_rad_per_s, action)
 
-    def _choose_command(
-        self, experiment: Experiment, origin_rad: float, t_ns: int, *, on_hold: bool, clock_stands: bool
-    ) -> None:
+    def _choose_command(self, experiment: Experiment, tick: _Tick) -> None:
         """Let the experiment choose its command; it ends if it would turn a tool that may be in the gripper."""
         latest = self.inputs.torques.get(experiment.file.torque_source)
-        torque_nm = latest.torque_nm if latest is not None and not on_hold else None
-        twisted_rad = self.tool.twisted_rad
-        experiment.update(t_ns, twisted_rad, torque_nm, gripped_at_rad=origin_rad, clock_stands=clock_stands)
+        torque_nm = latest.torque_nm if latest is not None and not tick.on_hold else None
+        gripped_at_rad = self.tool.count_angle(tick.wrist_rad)
+        clock_stands = tick.on_hold or (experiment.command.turns and bool(tick.awaited))
+        experiment.update(
+            tick.t_ns, tick.wrist_rad, torque_nm, gripped_at_rad=gripped_at_rad, clock_stands=clock_stands
+        )
         # After a stop, the gripper's doubt may arrive only now. A `grip` that may meet nothing allows turns, although a
         # tool as wide as its target is not felt: it is watched like a held one.
         gripper = self.inputs.gripper
         unfelt = gripper is not None and gripper.unfelt
-        if _turns(experiment.command) and not (self.tool.expected or unfelt) and (uncertain := self.tool.uncertain):
+        if experiment.command.turns and not (self.tool.expected or unfelt) and (uncertain := self.tool.uncertain):
             self._fail(experiment, f"{uncertain}; put a `grip` or a `release` before it")
 
-    def _begin_command(self, experiment: Experiment, wrist_rad: float, origin_rad: float, t_ns: int) -> Action | None:
+    def _begin_command(self, experiment: Experiment, tick: _Tick) -> Action | None:
         """Begin what the command asks for, and return the action of the devices that begins now, or None.
 
         A command that cannot be done ends the experiment.
         """
         command = experiment.command
         if isinstance(command.wrist, TrackTorque):
-            reason = self.wrist.close_loop(command.wrist, t_ns, wrist_rad)
+            reason = self.wrist.close_loop(command.wrist, tick.t_ns, tick.wrist_rad)
             if reason is not None:
                 self._fail(experiment, reason)
         if not experiment.running or command.action is None or not experiment.begin_action():
@@ -437,25 +452,21 @@ class ControlLoop:
                 self._fail(experiment, "the gripper holds nothing to identify; put a `grip` before it")
                 return None
             case GripStep() as grip:
-                self.tool.begin_grip(grip, origin_rad)
+                self.tool.begin_grip(grip)
             case IdentifyStep() as identify:
                 self.wrist.begin_identification(identify, experiment.limits.torque_nm)
                 return None
         return command.action
 
-    def _wrist_command(
-        self, experiment: Experiment, wrist_rad: float, origin_rad: float, t_ns: int, *, still: bool
-    ) -> WristCommand:
+    def _wrist_command(self, experiment: Experiment, tick: _Tick) -> WristCommand:
         """Return how the wrist turns for the command; the end of an identification begins the next step."""
         command = experiment.command
-        if still:
-            return self.wrist.stand_still()
         if isinstance(command.action, IdentifyStep) and (excitation := self.wrist.excitation) is not None:
-            velocity = self.wrist.identify(excitation, t_ns, wrist_rad)
+            velocity = self.wrist.identify(excitation, tick.t_ns, tick.wrist_rad)
             if excitation.done:
                 self.on_action_ended(excitation.failure)
             return velocity
-        return self.wrist.turn(command.wrist, t_ns, wrist_rad, origin_rad)
+        return self.wrist.turn(command.wrist, tick.t_ns, tick.wrist_rad)
 
     def _awaited_torques(self, t_ns: int) -> str:
         """Return in words which torques the next turn of the tool waits for after a grip or a tare; empty for none.
@@ -503,10 +514,6 @@ class ControlLoop:
         if experiment.phase is ExperimentPhase.STOPPED and stop is None and acknowledged is not None:
             return f"the stop is acknowledged; its cause was: {acknowledged.causes}"
         return experiment.stop_reason
-
-
-def _turns(command: StepCommand) -> bool:
-    return not isinstance(command.wrist, Hold) or isinstance(command.action, IdentifyStep)
 
 
 def _refusal_by(faults: Sequence[Fault]) -> str | None:

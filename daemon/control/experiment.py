@@ -26,7 +26,7 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class MoveToAngle:
-    """The wrist turns to an angle, counted from the angle at the grip, at most at this speed."""
+    """The wrist joint turns to an angle, at most at this speed."""
 
     angle_rad: float
     speed_rad_per_s: float
@@ -56,13 +56,12 @@ Action: TypeAlias = steps.ApproachStep | steps.GripStep | steps.TareStep | steps
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """Input of a step: how far the wrist has turned since the grip, and the driving torque.
+    """Input of a step: the wrist joint's angle now and at the grip, and the driving torque.
 
-    `gripped_at_rad` is the wrist joint's angle at the grip. `torque_nm` is None without a fresh valid estimate.
-    `elapsed_s` is the experiment's time.
+    `torque_nm` is None without a fresh valid estimate. `elapsed_s` is the experiment's time.
     """
 
-    twisted_rad: float
+    wrist_rad: float
     torque_nm: float | None
     gripped_at_rad: float
     elapsed_s: float
@@ -80,6 +79,11 @@ class StepCommand:
     action: Action | None = None
     activity: str = ""
     hold_number: int = 0
+
+    @property
+    def turns(self) -> bool:
+        """Whether it turns the wrist."""
+        return not isinstance(self.wrist, Hold) or isinstance(self.action, steps.IdentifyStep)
 
 
 class ExperimentPhase(Enum):
@@ -149,7 +153,7 @@ class Experiment:
     def update(
         self,
         t_ns: int,
-        twisted_rad: float,
+        wrist_rad: float,
         torque_nm: float | None,
         *,
         gripped_at_rad: float = 0.0,
@@ -157,14 +161,14 @@ class Experiment:
     ) -> None:
         """Choose the command for now, unless the experiment is paused or its clock has to stand.
 
-        `twisted_rad` counts from the wrist joint's angle at the grip, `gripped_at_rad`.
+        The angles are the wrist joint's: now, and at the grip.
         """
         passed_s = max(0, t_ns - self._t_ns) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
         if clock_stands or self.phase is not ExperimentPhase.RUNNING:
             return
         self._elapsed_s += passed_s
-        context = StepContext(twisted_rad, torque_nm, gripped_at_rad, self._elapsed_s)
+        context = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s)
         try:
             self.command = self._program.send(context)
         except StopIteration:
@@ -271,26 +275,25 @@ def _go_to(angle_rad: float, speed_rad_per_s: float, activity: str) -> Generator
     """Turn to an angle; return the context at the arrival."""
     while True:
         context = yield StepCommand(MoveToAngle(angle_rad, speed_rad_per_s), activity=activity)
-        if abs(context.twisted_rad - angle_rad) <= ANGLE_TOLERANCE_RAD:
+        if abs(context.wrist_rad - angle_rad) <= ANGLE_TOLERANCE_RAD:
             return context
 
 
 def _turn_to(step: steps.TurnToStep) -> StepProgram:
-    context = yield StepCommand(activity="reading the wrist's angle")
     activity = f"turning the wrist to {step.angle_rad:.3f} rad"
-    yield from _go_to(step.angle_rad - context.gripped_at_rad, step.speed_rad_per_s, activity)
+    yield from _go_to(step.angle_rad, step.speed_rad_per_s, activity)
 
 
 def _twist(step: steps.TwistStep) -> StepProgram:
     context = yield StepCommand(activity="reading the wrist's angle")
-    start_rad, speed_rad_per_s = context.twisted_rad, step.speed_rad_per_s
-    origin_rad = context.gripped_at_rad if step.absolute else 0.0
-    angles_rad = [angle_rad - origin_rad for angle_rad in step.angles_rad]
+    start_rad, speed_rad_per_s = context.wrist_rad, step.speed_rad_per_s
+    origin_rad = 0.0 if step.absolute else context.gripped_at_rad
     for repeat in range(1, step.repeats + 1):
-        for number, angle_rad in enumerate(angles_rad, start=1):
-            where = f"angle {number} of {len(angles_rad)}, repeat {repeat} of {step.repeats}"
-            context = yield from _go_to(angle_rad, speed_rad_per_s, f"twisting to {angle_rad:.3f} rad: {where}")
-            hold, hold_number = MoveToAngle(angle_rad, speed_rad_per_s), (repeat - 1) * len(angles_rad) + number
+        for number, angle_rad in enumerate(step.angles_rad, start=1):
+            where = f"angle {number} of {len(step.angles_rad)}, repeat {repeat} of {step.repeats}"
+            goal_rad = origin_rad + angle_rad
+            context = yield from _go_to(goal_rad, speed_rad_per_s, f"twisting to {angle_rad:.3f} rad: {where}")
+            hold, hold_number = MoveToAngle(goal_rad, speed_rad_per_s), (repeat - 1) * len(step.angles_rad) + number
             yield from _wait(hold, step.hold_s, context.elapsed_s, f"holding {angle_rad:.3f} rad: {where}", hold_number)
             if step.return_to_start:
                 yield from _go_to(start_rad, speed_rad_per_s, f"returning: {where}")
@@ -308,7 +311,7 @@ def _hold_torque(step: steps.HoldTorqueStep) -> StepProgram:
 
 
 def _tighten(step: steps.TightenStep) -> StepProgram:
-    start_rad = (yield StepCommand(activity="reading the wrist's angle")).twisted_rad
+    start_rad = (yield StepCommand(activity="reading the wrist's angle")).wrist_rad
     sign = steps.SIGNS[step.direction]
     velocity = ConstantVelocity(sign * step.speed_rad_per_s)
     while True:
@@ -317,5 +320,5 @@ def _tighten(step: steps.TightenStep) -> StepProgram:
         # A torque the other way is what the steps before have left.
         if context.torque_nm is not None and sign * context.torque_nm >= step.until_torque_nm:
             return
-        if abs(context.twisted_rad - start_rad) >= step.until_angle_rad:
+        if abs(context.wrist_rad - start_rad) >= step.until_angle_rad:
             return

@@ -105,7 +105,7 @@ class HeldTool:
         arm, origin_rad = self.inputs.arm, self.grip.origin_rad
         return 0.0 if arm is None or origin_rad is None else arm.wrist_rad - origin_rad
 
-    def begin_grip(self, action: GripStep, origin_rad: float) -> None:
+    def begin_grip(self, action: GripStep) -> None:
         """Store the state of the tool before the fingers move, and begin a new grip."""
         # If this process dies while the fingers close, the next process finds this force. Fingers that hold nothing do
         # not hold a tool once they open.
@@ -116,7 +116,7 @@ class HeldTool:
         self._tightens = not isinstance(action, Opening) and self._has_grip()
         # While the fingers open, their last width on the tool shows whether they have let the tool go.
         keeps_width = self._tightens or isinstance(action, Opening)
-        self.grip = Grip(origin_rad, force_n, self.grip.width_mm if keeps_width else None)
+        self.grip = Grip(self.grip.origin_rad, force_n, self.grip.width_mm if keeps_width else None)
         self.is_earlier = False
         self.another = ""
 

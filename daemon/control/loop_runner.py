@@ -120,7 +120,7 @@ class ControlLoopRunner:
         The next start waits for `unlock`. `also_idle`: also where nothing moves.
         """
         self._stop_count += 1
-        experiment, stopped = self._control_loop.running, self._stop_operator_action()
+        experiment, stopped = self._control_loop.running_experiment, self._stop_operator_action()
         if experiment is not None:
             stopped = experiment.file.name
         if stopped is not None or also_idle:
@@ -146,7 +146,7 @@ class ControlLoopRunner:
     def close(self) -> None:
         """Stop the running experiment at the daemon's end, and start nothing more."""
         self._stop_count, self._closed = self._stop_count + 1, True
-        if self._control_loop.running is not None:
+        if self._control_loop.running_experiment is not None:
             ended = "the wrist is stopped, a gripped tool stays gripped"
             self._request_stop(f"the daemon ended: {ended}", Fault(FaultCode.DAEMON_ENDED, ended))
             # The loop is cancelled before the next state.
@@ -189,7 +189,7 @@ class ControlLoopRunner:
 
     def motion(self) -> str | None:
         """Return what moves or may move now, in words, or None."""
-        if (experiment := self._control_loop.running) is not None:
+        if (experiment := self._control_loop.running_experiment) is not None:
             return f"the experiment {experiment.file.name!r} is running"
         if self.operator_action.under_way or self.actions.finishing:
             return "the gripper or the robot is being moved"

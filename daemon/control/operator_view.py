@@ -33,7 +33,7 @@ def activation_sentence(what: str) -> str:
 class OperatorView:
     """Answers from the control loop's present state; nothing here moves or changes anything.
 
-    `zero_known` says for each source whether its zero is known. `running` returns the running experiment.
+    `zero_known` says for each source whether its zero is known. `running_experiment` returns it, or None.
     """
 
     inputs: LatestInputs
@@ -41,7 +41,7 @@ class OperatorView:
     safety: SafetyMonitor
     sources: Mapping[str, TorqueSource]
     zero_known: Mapping[str, bool]
-    running: Callable[[], Experiment | None]
+    running_experiment: Callable[[], Experiment | None]
 
     def start_refusal(self) -> str | None:
         """Return why no experiment can begin, or None."""
@@ -55,7 +55,7 @@ class OperatorView:
 
     def running_refusal(self) -> str | None:
         """Return the running experiment as the reason of a refusal, or None."""
-        running = self.running()
+        running = self.running_experiment()
         return f"the experiment {running.file.name!r} is running; stop it first" if running is not None else None
 
     def file_refusal(self, file: ExperimentFile) -> str | None:
@@ -68,7 +68,7 @@ class OperatorView:
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken at present, or None; `confirmed`: by the operator, nothing is loaded."""
-        if (running := self.running()) is not None:
+        if (running := self.running_experiment()) is not None:
             return (
                 f"the experiment {running.file.name!r} is running, and a new zero would change its "
                 "torques; stop it first, or give it a step `tare`"

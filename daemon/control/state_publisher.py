@@ -102,7 +102,7 @@ class _LogKey(NamedTuple):
     def of(cls, control_loop: ControlLoop) -> "_LogKey":
         """Return the key of the present state."""
         status, experiment = control_loop.status, control_loop.experiment
-        moves = control_loop.running is not None
+        moves = control_loop.running_experiment is not None
         # At rest, a fault that would only hold the wrist holds nothing, and comes and goes on a busy computer.
         shown = (one for one in status.decision.reported if moves or one.rule.response is not Response.HOLD)
         step = experiment.step_number if experiment is not None else 0

@@ -81,8 +81,8 @@ class WristController:
         if self.excitation is not None:
             self.excitation.sent(speed_rad_per_s)
 
-    def turn(self, set_point: WristSetPoint, t_ns: int, wrist_rad: float, origin_rad: float) -> WristCommand:
-        """Return the speed for a set point; its angles count from origin_rad."""
+    def turn(self, set_point: WristSetPoint, t_ns: int, wrist_rad: float) -> WristCommand:
+        """Return the speed for a set point."""
         if not isinstance(set_point, TrackTorque):
             # An open loop records no angles; the next closed loop starts from the torque measured then.
             self.tracked = self.controller = None
@@ -93,7 +93,7 @@ class WristController:
             case Hold():
                 return WristCommand()
             case MoveToAngle(angle_rad, speed_rad_per_s):
-                missing_rad = origin_rad + angle_rad - wrist_rad - self._on_the_way_rad(t_ns)
+                missing_rad = angle_rad - wrist_rad - self._on_the_way_rad(t_ns)
                 speed = min(abs(self._config.angle_bandwidth_per_s * missing_rad), speed_rad_per_s)
                 return self._clipped(math.copysign(speed, missing_rad))
             case ConstantVelocity(speed_rad_per_s):
@@ -147,10 +147,9 @@ class WristController:
         self.tool, self.excitation, self._judged = excitation.result, None, None
         return WristCommand()
 
-    def stand_still(self) -> WristCommand:
+    def stand_still(self) -> None:
         """Stand still; the next `turn` continues without a jump."""
         self._stands_still = True
-        return WristCommand()
 
     def reset(self) -> None:
         """Forget the tool, after a new grip or a new zero."""

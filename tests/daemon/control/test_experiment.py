@@ -32,7 +32,7 @@ class Bench:
     """The simplest thing that can carry wishes out: a wrist that turns at once, a spring, and prompt actions."""
 
     def __init__(self, machine: Experiment, tick_ns: int = TICK_NS) -> None:
-        self.machine, self.t_ns, self.twisted_rad, self.tick_ns = machine, 0, 0.0, tick_ns
+        self.machine, self.t_ns, self.wrist_rad, self.tick_ns = machine, 0, 0.0, tick_ns
         self.begun: list[str] = []
         self.wish = StepCommand()
         self.seen: list[StepCommand] = []
@@ -41,8 +41,8 @@ class Bench:
         self.t_ns += self.tick_ns
         if self.wish.action:
             self.machine.end_action()
-        torque_nm = STIFFNESS_NM_PER_RAD * self.twisted_rad
-        self.machine.update(self.t_ns, self.twisted_rad, torque_nm, clock_stands=clock_stands)
+        torque_nm = STIFFNESS_NM_PER_RAD * self.wrist_rad
+        self.machine.update(self.t_ns, self.wrist_rad, torque_nm, clock_stands=clock_stands)
         wish = self.machine.command
         if wish.action is not None and self.machine.begin_action():
             self.begun.append(type(wish.action).__name__)
@@ -50,11 +50,11 @@ class Bench:
         match Hold() if clock_stands or self.machine.phase is ExperimentPhase.PAUSED else wish.wrist:
             case MoveToAngle(angle, speed):
                 reach = speed * step_s
-                self.twisted_rad += max(-reach, min(reach, angle - self.twisted_rad))
+                self.wrist_rad += max(-reach, min(reach, angle - self.wrist_rad))
             case ConstantVelocity(speed):
-                self.twisted_rad += speed * step_s
+                self.wrist_rad += speed * step_s
             case TrackTorque(torque, _):
-                self.twisted_rad += 0.05 * (torque / STIFFNESS_NM_PER_RAD - self.twisted_rad)
+                self.wrist_rad += 0.05 * (torque / STIFFNESS_NM_PER_RAD - self.wrist_rad)
             case Hold():
                 pass
         self.wish = wish
@@ -89,12 +89,13 @@ def test_the_steps_are_carried_out_in_order_to_the_end():
     assert {wish.activity.split(": ")[1].split(",")[1] for wish in holds} == {" repeat 1 of 2", " repeat 2 of 2"}
 
 
-def test_absolute_angles_are_the_wrists_own():
-    machine = experiment({"do": "twist", "angles_rad": [1.5], "absolute": True})
+@pytest.mark.parametrize(("absolute", "goal_rad"), [(True, 1.5), (False, 2.9)])
+def test_absolute_angles_are_the_wrists_own_and_others_count_from_the_grip(absolute, goal_rad):
+    machine = experiment({"do": "twist", "angles_rad": [1.5], "absolute": absolute})
     for cycle in (1, 2):
-        machine.update(cycle * TICK_NS, 0.0, 0.0, gripped_at_rad=1.4)
+        machine.update(cycle * TICK_NS, 1.6, 0.0, gripped_at_rad=1.4)
     assert isinstance(machine.command.wrist, MoveToAngle)
-    assert machine.command.wrist.angle_rad == pytest.approx(0.1)
+    assert machine.command.wrist.angle_rad == pytest.approx(goal_rad)
 
 
 def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first():
@@ -105,14 +106,14 @@ def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first():
             )
         )
         bench.run()
-        assert bench.twisted_rad == pytest.approx(-reached_rad, abs=0.002), "clockwise is negative"
+        assert bench.wrist_rad == pytest.approx(-reached_rad, abs=0.002), "clockwise is negative"
 
 
 def test_a_torque_the_other_way_does_not_end_a_tightening():
     tighten = {"do": "tighten", "until_torque_nm": 0.05, "until_angle_rad": 3.0}
     bench = Bench(experiment({**tighten, "direction": "counterclockwise"}, {**tighten, "direction": "clockwise"}))
     bench.run()
-    assert bench.twisted_rad == pytest.approx(-0.25, abs=0.002)
+    assert bench.wrist_rad == pytest.approx(-0.25, abs=0.002)
 
 
 def test_a_failed_action_stops_the_experiment_with_its_reason():

@@ -105,7 +105,7 @@ async def test_a_persons_own_stop_is_no_error_and_its_line_begins_with_it(step):
         cell.sensors["right"] = SimpleNamespace(taring=False, tare_and_wait=lambda _: asyncio.Event().wait())
         await cell.start(step)
         await cell.cycles(10)
-        assert cell.control_loop.running is not None
+        assert cell.control_loop.running_experiment is not None
         with capture_logs() as lines:
             assert cell.runner.stop() == "test"
             await cell.until_ended(50)

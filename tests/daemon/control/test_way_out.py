@@ -450,7 +450,7 @@ async def test_no_experiment_begins_while_a_zero_is_taken_that_came_during_its_s
         cell.sensors["load_cell"].tare()
         await cell.cycles(10)
         assert "a zero is being taken (load_cell)" in (starting.result() or "")
-        assert (cell.control_loop.running, cell.gripper.asked) == (None, [])
+        assert (cell.control_loop.running_experiment, cell.gripper.asked) == (None, [])
 
 
 class OnLever(Rig):

@@ -28,14 +28,14 @@ def wrist(config: LoopConfig = AT_ONCE) -> WristController:
 
 
 def test_a_wrist_that_stands_sets_out_for_however_little():
-    turn = wrist().turn(MoveToAngle(0.1 * CLOSE_RAD, 0.2), 10**9, 0.0, 0.0)
+    turn = wrist().turn(MoveToAngle(0.1 * CLOSE_RAD, 0.2), 10**9, 0.0)
     assert turn.speed_rad_per_s == pytest.approx(0.1 * CLOSE_RAD * CONFIG.angle_bandwidth_per_s)
 
 
 def test_a_held_angle_is_kept():
     one, angle_rad, errors_rad = wrist(), 0.0, []
     for cycle in range(1000):
-        speed = one.turn(MoveToAngle(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad, 0.0).speed_rad_per_s
+        speed = one.turn(MoveToAngle(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad).speed_rad_per_s
         one.sent(speed)
         angle_rad += speed * CYCLE_NS / 1e9
         errors_rad.append(abs(angle_rad - 0.15))
@@ -52,7 +52,7 @@ def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(allowed_rad_
     cycles = round(300 + 12.0 / bandwidth_per_s / (CYCLE_NS / 1e9))
     for goal_rad in (way_rad, -way_rad):
         for _ in range(2 * cycles):
-            speed = one.turn(MoveToAngle(goal_rad, allowed_rad_per_s), t_ns, angle_rad, 0.0).speed_rad_per_s
+            speed = one.turn(MoveToAngle(goal_rad, allowed_rad_per_s), t_ns, angle_rad).speed_rad_per_s
             assert abs(speed) <= allowed_rad_per_s
             one.sent(speed)
             angle_rad += speed * CYCLE_NS / 1e9
@@ -95,7 +95,7 @@ def test_while_the_gain_is_checked_elsewhere_the_wrist_stands_and_then_the_loop_
         t_ns = 10**9 + cycle * CYCLE_NS
         assert one.close_loop(goal, t_ns, 0.0) is None
         assert one.tracked is None
-        assert one.turn(goal, t_ns, 0.0, 0.0).speed_rad_per_s == 0.0
+        assert one.turn(goal, t_ns, 0.0).speed_rad_per_s == 0.0
     ((job, checked),) = checks
     checked.set_result(job())
     assert one.close_loop(goal, t_ns + CYCLE_NS, 0.0) is None
@@ -116,7 +116,7 @@ def test_each_torque_has_its_own_ramp():
     for cycle in range(1, 500):
         t_ns = 10**9 + cycle * CYCLE_NS
         one.on_torque(TorqueSample("load_cell", 0.2 * angle_rad, "", t_ns - CYCLE_NS // 2, t_ns))
-        speed = one.turn(TrackTorque(0.3, 0.01), t_ns, angle_rad, 0.0).speed_rad_per_s
+        speed = one.turn(TrackTorque(0.3, 0.01), t_ns, angle_rad).speed_rad_per_s
         one.sent(speed)
         angle_rad += speed * CYCLE_NS / 1e9
     assert 0.2 * angle_rad == pytest.approx(0.01 * 500 * CYCLE_NS / 1e9, rel=0.15)

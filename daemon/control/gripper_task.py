@@ -77,8 +77,15 @@ class GripperTask:
                 await self.gripper.activate(may_drop=isinstance(target, Opening))
             except GripperTooHotError as error:
                 raise NotBegunError(str(error)) from error
-            if (width_mm := await self._width_of(target)) is None:
+            state, width_mm = await self.gripper.read(), target.width_mm
+            if not isinstance(target, Opening):
+                self._refuse_to_open(target, state)
+            elif self._is_open(target, state):
+                self.gripper.take_as_open()
+                self._take(replace(state, opened=True))
                 return
+            else:
+                width_mm = self._opening_width(target, state)
             sent = await self.gripper.move(GripperCommand(width_mm, target.speed_mm_per_s, target.force_n))
             state = await self.gripper.finish(sent)
         widest_mm = min(width_mm, self.gripper.model.stroke_mm)
@@ -92,25 +99,22 @@ class GripperTask:
             thinner = "put the tool between them, or make `width_mm` some millimetres less than the tool"
             raise ActionError(f"{closed}; {thinner}")
 
-    async def _width_of(self, target: GripStep) -> float | None:
-        """Return the width that the fingers have to move to, None where they are open already; raises DriverError.
+    def _is_open(self, target: Opening, state: GripperState) -> bool:
+        """Return whether a release has nothing to do: it never closes the fingers."""
+        return not self._may_grip(state) and state.width_mm >= target.width_mm
 
-        A release never closes them, and lets go: fingers that may hold something open fully where the width is not well
-        above the present one. A grip never opens them: raises ActionError where something would drop, NotBegunError
-        where they rest.
-        """
-        state = await self.gripper.read()
-        if isinstance(target, Opening):
-            lets_go = target.width_mm > state.width_mm + MIN_OPENING_MM
-            # Of a tool as wide as their target the fingers feel nothing, so a known grip counts as one.
-            gripped = state.opened is False or self.control_loop.tool.was_gripped
-            if state.object is not ObjectStatus.AT_TARGET or (self._unfelt(state) and gripped):
-                return target.width_mm if lets_go else LARGEST_STROKE_MM
-            if state.width_mm >= target.width_mm:
-                self.gripper.take_as_open()
-                self._take(replace(state, opened=True))
-                return None
-            return target.width_mm
+    def _opening_width(self, target: Opening, state: GripperState) -> float:
+        """Return the width that lets go: fully open, where the target is not well above the present width."""
+        lets_go = target.width_mm > state.width_mm + MIN_OPENING_MM
+        return LARGEST_STROKE_MM if self._may_grip(state) and not lets_go else target.width_mm
+
+    def _may_grip(self, state: GripperState) -> bool:
+        """Return whether the fingers hold something, or may; of a tool as wide as their target they feel nothing."""
+        gripped = state.opened is False or self.control_loop.tool.was_gripped
+        return state.object is not ObjectStatus.AT_TARGET or (self._unfelt(state) and gripped)
+
+    def _refuse_to_open(self, target: GripStep, state: GripperState) -> None:
+        """Raise ActionError where a grip would open the fingers and drop something, NotBegunError where they rest."""
         may_hold = state.object is not ObjectStatus.AT_TARGET or self._unfelt(state)
         # In counts: the fingers may stand less than one count from the target.
         opens = self.gripper.calibration.counts(target.width_mm) < state.position_counts
@@ -121,7 +125,6 @@ class GripperTask:
                 f"the fingers are {state.width_mm:.1f} mm apart and hold something, or may hold it, and a grip to "
                 f"{target.width_mm:g} mm would open them and drop it; put a `release` before it, or correct `width_mm`"
             )
-        return target.width_mm
 
     async def release(self) -> None:
         """Open wide; raises DriverError and ActionError."""

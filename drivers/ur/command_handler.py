@@ -47,7 +47,8 @@ class CommandHandler:
         self._unfit = ""
         self._executor = MotionExecutor(settings, arm, now_ns)
         self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s)
-        self._disabled_reason = NOT_ENABLED
+        # Why motion waits for an `Enable` or an `Unlock`; empty while it is enabled.
+        self._why_not_enabled = NOT_ENABLED
         # Whether messages that came late can be that reason.
         self._disabled_late = False
         self._daemon_alive_ns = now_ns
@@ -100,7 +101,7 @@ class CommandHandler:
             case Unlock() if self._recovery is not None and self._recovery.operator_asked:
                 refusal = "Unlocking is under way."
             case Unlock() if unfit:
-                if not self._executor.disabled_reason:
+                if not self._executor.why_not_ours:
                     self._executor.disable(unfit)
                 self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, number)
                 self._recovery.held = self._held_tool
@@ -110,7 +111,7 @@ class CommandHandler:
             case Enable() | Unlock():
                 refusal = unfit or self._executor.violation
                 if not refusal:
-                    self._disabled_reason = ""
+                    self._why_not_enabled = ""
                 return CommandReply(refusal=refusal)
             case ZeroForceTorque():
                 return CommandReply(refusal=unfit or self._zero_wrench())
@@ -164,7 +165,7 @@ class CommandHandler:
         unfit = self._why_unsent
         if unfit:
             # Nothing can be sent. The arm stops by itself, or by its watchdog, which is not fed now.
-            self._disabled_reason = unfit
+            self._why_not_enabled = unfit
             if self._unfit:
                 self._disabled_late = may_be_late(sample, self._settings)
             if not self.at_rest:
@@ -175,7 +176,7 @@ class CommandHandler:
             return None
         beyond = self._executor.violation
         if beyond:
-            self._disabled_reason = beyond
+            self._why_not_enabled = beyond
             self._disabled_late = False
             self._executor.stop(sample, now_ns, beyond)
         elif now_ns - self._daemon_alive_ns > self._settings.silence_timeout_s * 1e9:
@@ -205,21 +206,21 @@ class CommandHandler:
     @property
     def _why_unsent(self) -> str:
         """Why nothing can be sent to the robot, or the empty string."""
-        return self._unfit or self._executor.disabled_reason
+        return self._unfit or self._executor.why_not_ours
 
     @property
     def _why_blocked(self) -> str:
         """Why motion is refused, or the empty string."""
         if self._recovery is not None:
             return BEING_MADE_READY
-        return self._why_unsent or self._executor.violation or self._disabled_reason
+        return self._why_unsent or self._executor.violation or self._why_not_enabled
 
     @property
     def _may_be_late(self) -> bool:
         """Whether messages that came late can be why motion is refused."""
         if self._unfit:
             return may_be_late(self._sample, self._settings)
-        is_beyond = not self._executor.disabled_reason and self._executor.violation != ""
+        is_beyond = not self._executor.why_not_ours and self._executor.violation != ""
         return self._recovery is None and not is_beyond and self._disabled_late
 
     def _end_recovery(self, recovery: Recovery) -> tuple[int, CommandReply] | None:
@@ -227,13 +228,13 @@ class CommandHandler:
         if recovery.ready:
             self._executor.enable()
         if recovery.unlock_number is None:
-            self._disabled_reason = recovery.refusal or self._disabled_reason
+            self._why_not_enabled = recovery.refusal or self._why_not_enabled
             return None
         if recovery.ready:
-            self._disabled_reason = ""
+            self._why_not_enabled = ""
         return recovery.unlock_number, CommandReply(refusal=recovery.refusal or "")
 
     def end_program(self) -> None:
         """End our program. One that has no heartbeats now ends by its watchdog, also when it starts or is resumed."""
-        if self._sample.program_running and not self._executor.disabled_reason:
+        if self._sample.program_running and not self._executor.why_not_ours:
             self._arm.end_program()

@@ -69,7 +69,7 @@ class _Braking:
 class MotionExecutor:
     """Turns the wrist, moves along lines, and stops.
 
-    `disabled_reason` is why nothing may be sent to the program on the robot; empty while it may.
+    `why_not_ours` is why the program on the robot is not ours, and nothing may be sent to it; empty while it is ours.
     """
 
     def __init__(self, settings: UrSettings, arm: "UrArm", now_ns: int) -> None:
@@ -80,7 +80,7 @@ class MotionExecutor:
         self.end_reason = ""
         self.sent: WristSpeed | MoveLinear | Stop | None = None
         self.clipped: tuple[str, ...] = ()
-        self.disabled_reason = NOT_OURS
+        self.why_not_ours = NOT_OURS
         # A wrist speed is the one last asked for, with the time of its decision.
         self._motion: WristSpeed | _Move | _Braking | None = None
         self._rejected = False
@@ -142,7 +142,7 @@ class MotionExecutor:
             self._motion = _Move(sent.pose, now_ns, deadline_ns)
             if not self._arm.move(sent):
                 self._reject("straight move")
-        return self.disabled_reason
+        return self.why_not_ours
 
     def stop_on_command(self, motion_id: int, asked: Stop, sample: RtdeSample, now_ns: int) -> str:
         """Stop at once, as hard as commanded within the needed and the allowed deceleration; return why not."""
@@ -151,7 +151,7 @@ class MotionExecutor:
             deceleration = max(deceleration, self._motion.deceleration_rad_per_s2)
         self.motion_id, self.sent, self.clipped = motion_id, Stop(deceleration), ()
         self.stop_now(sample, now_ns, STOPPED_ON_COMMAND, deceleration)
-        return self.disabled_reason
+        return self.why_not_ours
 
     def stop_now(self, sample: RtdeSample, now_ns: int, reason: str, deceleration: float | None = None) -> None:
         """Begin to stop and send it at once, without waiting for the next cycle."""
@@ -177,18 +177,18 @@ class MotionExecutor:
 
     def enable(self) -> None:
         """Send commands from now on: our program runs."""
-        self.disabled_reason = ""
+        self.why_not_ours = ""
 
     def leave_to_watchdog(self, reason: str) -> None:
         """Send nothing more to this program, so that the robot's watchdog ends it."""
         self.disable(reason, LEFT_TO_WATCHDOG.format(reason=reason))
 
-    def disable(self, end_reason: str, disabled_reason: str = NOT_OURS) -> None:
+    def disable(self, end_reason: str, why_not_ours: str = NOT_OURS) -> None:
         """End the present motion on paper, and send nothing to the program on the robot."""
         if isinstance(self._motion, WristSpeed | _Move):
             self.end_reason = end_reason
         self._motion, self._speed_thread = None, False
-        self.disabled_reason = disabled_reason
+        self.why_not_ours = why_not_ours
 
     def take(self, sample: RtdeSample) -> None:
         """Compare the latest sample, and the accelerations up to it, with the limits."""
@@ -211,7 +211,7 @@ class MotionExecutor:
 
     def keep(self, sample: RtdeSample, now_ns: int, daemon_alive_ns: int) -> None:
         """Send what this cycle needs; the daemon's last message came at `daemon_alive_ns`."""
-        if self.disabled_reason:
+        if self.why_not_ours:
             return
         match self._motion:
             case WristSpeed() as asked:

@@ -304,11 +304,11 @@ class ControlLoop:
         """Continue after `pause`; return None, or why not."""
         return self.experiment.resume() if self.experiment is not None else "no experiment is paused"
 
-    def stop(self, reason: str, fault: Fault) -> None:
+    def stop(self, fault: Fault) -> None:
         """End the experiment, if one runs, and stand still until the operator acknowledges the stop."""
-        self.safety.stop(fault, reason)
+        self.safety.stop(fault)
         if self.running_experiment is not None:
-            self.running_experiment.stop(reason)
+            self.running_experiment.stop(fault.cause)
 
     def acknowledge(self) -> None:
         """Clear a stop on the operator's command."""
@@ -506,8 +506,8 @@ class ControlLoop:
     def _why_ended(self) -> str:
         """Return why nothing moves, for the status; empty if nothing was stopped."""
         experiment, stop = self.experiment, self.safety.waiting
-        if stop is not None and stop.reason:
-            return stop.reason
+        if stop is not None and stop.asked_for:
+            return stop.asked_for
         if experiment is None:
             return ""
         acknowledged = self.safety.acknowledged

@@ -125,7 +125,7 @@ class ControlLoopRunner:
             stopped = experiment.file.name
         if stopped is not None or also_idle:
             what = f"{stopped!r} was under way" if stopped is not None else "nothing was under way"
-            self._request_stop("the operator stopped it", Fault(FaultCode.OPERATOR_STOP, what))
+            self._request_stop(Fault(FaultCode.OPERATOR_STOP, what))
         return stopped
 
     def just_ended(self) -> dict[str, str]:
@@ -148,13 +148,13 @@ class ControlLoopRunner:
         self._stop_count, self._closed = self._stop_count + 1, True
         if self._control_loop.running_experiment is not None:
             ended = "the wrist is stopped, a gripped tool stays gripped"
-            self._request_stop(f"the daemon ended: {ended}", Fault(FaultCode.DAEMON_ENDED, ended))
+            self._request_stop(Fault(FaultCode.DAEMON_ENDED, ended))
             # The loop is cancelled before the next state.
             self.decide_now()
 
-    def _request_stop(self, reason: str, fault: Fault) -> None:
+    def _request_stop(self, fault: Fault) -> None:
         self._timeline.request(self._clock.now_ns())
-        self._control_loop.stop(reason, fault)
+        self._control_loop.stop(fault)
 
     def decide_now(self) -> None:
         """Decide without a new state: at the daemon's end, and before a stop is acknowledged."""
@@ -216,7 +216,7 @@ class ControlLoopRunner:
             refusal = await self._enable() or deadline.why_passed("enabling the arm")
         if self._stop_count != stops_before:
             if not self._closed:
-                self._control_loop.stop(STOPPED_AT_START, Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
+                self._control_loop.stop(Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
             return STOPPED_AT_START
         # The first step could grip a tool, and the tool's torque would become the zero.
         if (refusal := refusal or self.busy() or self._taring()) is not None:

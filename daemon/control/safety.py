@@ -41,8 +41,6 @@ class Stop:
     faults: tuple[Fault, ...]
     # Grows with each cause that begins a stop or joins one.
     number: int
-    # The reason of a stop on request, as the status shows it; empty for a stop by a fault.
-    reason: str = ""
     # Whether it has opened the gripper.
     released: bool = False
 
@@ -50,6 +48,11 @@ class Stop:
     def causes(self) -> str:
         """The causes, without their cures."""
         return "; ".join(fault.cause for fault in self.faults)
+
+    @property
+    def asked_for(self) -> str:
+        """The cause of the latest stop on request, such as an operator's; empty for a stop by faults alone."""
+        return next((fault.cause for fault in reversed(self.faults) if fault.rule.asked_for), "")
 
 
 class SafetyMonitor:
@@ -110,22 +113,19 @@ class SafetyMonitor:
                 self._join(fault)
         return SafetyDecision(Response.NOTE, active) if self.waiting is None else self._with_stop(self.waiting, active)
 
-    def stop(self, fault: Fault, reason: str = "") -> None:
-        """Begin a stop that no input shows, such as an operator's; it keeps the grip, and a stronger one stays.
-
-        `reason` is as in `Stop`.
-        """
+    def stop(self, fault: Fault) -> None:
+        """Begin a stop that no input shows, such as an operator's; it keeps the grip, and a stronger one stays."""
         self._causes += 1
         waiting = self.waiting.faults if self.waiting is not None else ()
         # A further stop of an arm that stands does not hide what the first one stopped.
         known = next((one for one in waiting if one.code is fault.code), fault)
-        self._join(known, reason)
+        self._join(known)
 
-    def _join(self, fault: Fault, reason: str = "") -> None:
+    def _join(self, fault: Fault) -> None:
         """Let a fault join the stop that waits, or begin one."""
         stop = self.waiting or Stop(Response.STOP_AND_KEEP_GRIP, (), self._causes)
         others = (one for one in stop.faults if one.code is not fault.code)
-        self.waiting = replace(stop, faults=(*others, fault), number=self._causes, reason=reason or stop.reason)
+        self.waiting = replace(stop, faults=(*others, fault), number=self._causes)
 
     def release_once(self) -> bool:
         """Return whether the stop that waits has to open the gripper now; it counts as done."""

@@ -125,7 +125,7 @@ def started(rig: Rig, *steps: dict[str, Any], **keys: Any) -> Rig:
 
 def stop(rig: Rig) -> None:
     """Stop as the operator does."""
-    rig.control_loop.stop("the operator stopped it", Fault(FaultCode.OPERATOR_STOP, "'test' was under way"))
+    rig.control_loop.stop(Fault(FaultCode.OPERATOR_STOP, "'test' was under way"))
 
 
 def phase(rig: Rig) -> ExperimentPhase:

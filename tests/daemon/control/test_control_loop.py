@@ -636,20 +636,20 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged():
 def test_a_stop_after_the_end_has_a_reason_of_its_own():
     rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 60})
     loop = rig.control_loop
-    loop.stop("the first operator stopped it", Fault(FaultCode.OPERATOR_STOP, "one"))
+    loop.stop(Fault(FaultCode.OPERATOR_STOP, "one"))
     rig.run(0.1)
-    assert loop.status.activity == "the first operator stopped it"
+    assert loop.status.activity == "the operator stopped it: one"
     loop.acknowledge()
-    loop.stop("the second operator stopped it", Fault(FaultCode.OPERATOR_STOP, "two"))
+    loop.stop(Fault(FaultCode.OPERATOR_STOP, "two"))
     rig.run(0.1)
-    assert loop.status.activity == "the second operator stopped it"
+    assert loop.status.activity == "the operator stopped it: two"
     rig.arm = replace(rig.arm, emergency_stop=True)
     rig.run(0.1)
-    assert loop.status.activity == "the second operator stopped it", "also after another cause has joined"
+    assert loop.status.activity == "the operator stopped it: two", "also after another cause has joined"
     rig.arm = replace(rig.arm, emergency_stop=False)
     loop.acknowledge()
     rig.run(0.1)
-    assert "second" not in loop.status.activity
+    assert "two" not in loop.status.activity
 
 
 def test_after_the_acknowledgement_the_state_asks_for_nothing_and_still_names_the_cause():

@@ -458,7 +458,7 @@ def why_no_turn(rig: Rig) -> str:
     """Return why a twist by the load cell cannot start."""
     content = {"name": "one", "torque_source": "load_cell", "steps": [{"do": "twist", "angles_rad": [0.1]}]}
     said = rig.control_loop.start(ExperimentFile.model_validate(content), rig.t_ns) or ""
-    rig.control_loop.stop("it is over", Fault(FaultCode.OPERATOR_STOP, ""))
+    rig.control_loop.stop(Fault(FaultCode.OPERATOR_STOP, ""))
     rig.control_loop.acknowledge()
     return said
 

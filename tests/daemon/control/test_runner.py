@@ -395,7 +395,7 @@ async def test_cause_of_a_requested_stop_is_the_request():
         assert cell.runner.stop() == "test"
         await cell.cycles(60)
         (stop,) = stops(cell)
-        assert (stop.t_mono_ns, stop.cause) == (asked_ns, "the operator stopped it")
+        assert (stop.t_mono_ns, stop.cause) == (asked_ns, "the operator stopped it: 'test' was under way")
         assert stop.decided_after_s <= 0.02
 
 
@@ -408,7 +408,8 @@ async def test_a_stop_that_is_unlocked_at_once_says_its_own_cause(cycles):
         assert await cell.runner.unlock() is None
         await cell.cycles(60)
         (stop,) = stops(cell)
-        assert (stop.cause, stop.response) == ("the operator stopped it", "stop and keep grip")
+        assert stop.cause == "the operator stopped it: 'test' was under way"
+        assert stop.response == "stop and keep grip"
         assert stop.faults == FaultCode.OPERATOR_STOP.text
         assert stop.stands_after_s > 0
 
@@ -435,7 +436,8 @@ async def test_each_of_two_stops_is_published_though_the_second_follows_at_once(
         first, second = stops(cell)
         assert (first.experiment, second.experiment) == ("test", "second")
         for stop in (first, second):
-            assert (stop.cause, stop.faults) == ("the operator stopped it", FaultCode.OPERATOR_STOP.text)
+            assert stop.cause == f"the operator stopped it: {stop.experiment!r} was under way"
+            assert stop.faults == FaultCode.OPERATOR_STOP.text
         assert second.stands_after_s is not None
         assert cell.state.rests
 

@@ -277,7 +277,7 @@ class Commands:
         """Stop a motion or the beginning of one, else the daemon; return what was stopped."""
         # An unknown argument may be a misspelt `spare_daemon`.
         spare_daemon = bool(request.get("spare_daemon") or request.keys() - {"command", "by", "spare_daemon", *_OF_ALL})
-        held = self.rig.control_loop.tool.held_or_unknown if self.rig is not None else None
+        held = self.rig.control_loop.tool.any_object if self.rig is not None else None
         stopped, ended = None, {}
         if self.rig is not None:
             ended = self.rig.runner.just_ended()

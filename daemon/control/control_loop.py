@@ -371,7 +371,7 @@ class ControlLoop:
     def _at_rest(self, found: Sequence[Fault]) -> list[Fault]:
         """Return the faults while no experiment runs, with what the operator should know of a held tool."""
         faults = list(found)
-        if self.safety.waiting is not None and (held := self.tool.may_still_hold) is not None:
+        if self.safety.waiting is not None and (held := self.tool.gripped_tool) is not None:
             is_held = self.tool.held is not None
             faults.append(Fault(FaultCode.TOOL_GRIPPED if is_held else FaultCode.TOOL_MAY_BE_GRIPPED, held))
         if unknown := self.tool.unknown_grip:

@@ -26,6 +26,18 @@ class HeldTool:
 
     `has_gripper`: our gripper holds the tool. Otherwise the tool is clamped by other means, and its grip has only an
     angle.
+
+    What the answers are, by the gripper's latest state; it is in doubt while its fingers move, and where they stand
+    without a sign of an object that may be there. A sentence stands for yes, None for no.
+
+    | answer | no state yet | an object | in doubt | empty |
+    |---|---|---|---|---|
+    | `held` | no | yes | no | no |
+    | `uncertain` | no | no | yes | no |
+    | `gripped_tool` | if gripped before | yes | if a grip is known | no |
+    | `any_object` | if gripped before | yes | yes; of an inactive gripper that never moved: if a grip is known | no |
+    | `may_hold` | if gripped before | yes | yes | no |
+    | `is_empty` | no | no | no | yes |
     """
 
     inputs: LatestInputs
@@ -216,8 +228,8 @@ class HeldTool:
         return f"the gripper does not know whether it holds a tool: its fingers, {width}, {doubt}"
 
     @property
-    def may_still_hold(self) -> str | None:
-        """The object between the fingers, or why a gripped tool may still be there; None without both."""
+    def gripped_tool(self) -> str | None:
+        """The object between the fingers, or why the tool of a known grip may still be there; None without both."""
         if self.inputs.gripper is None:
             return GRIPPED_BEFORE if self.may_hold() else None
         if self.held is not None or self.grip.force_n is None:
@@ -225,7 +237,7 @@ class HeldTool:
         return self.uncertain
 
     @property
-    def held_or_unknown(self) -> str | None:
+    def any_object(self) -> str | None:
         """The object between the fingers, or why one may be there, also if no grip is known; None without both.
 
         A gripper that was not activated since its power came may hold a tool too. Before it first moves, only a known
@@ -233,7 +245,7 @@ class HeldTool:
         """
         gripper = self.inputs.gripper
         if gripper is None or (gripper.inactive and not self._moved):
-            return self.may_still_hold
+            return self.gripped_tool
         return self.held or self.uncertain
 
     def may_hold(self) -> bool:

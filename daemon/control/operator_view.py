@@ -227,7 +227,7 @@ class OperatorView:
 
     def _why_no_activation(self, file: ExperimentFile) -> str | None:
         """Return why a `grip` must not activate the gripper, or None: an activation would drop the held tool."""
-        first, held = first_grip(file), self.tool.may_still_hold
+        first, held = first_grip(file), self.tool.gripped_tool
         if first is None or not self.tool.activates or held is None:
             return None
         number, _ = first

@@ -467,7 +467,7 @@ def test_a_grip_that_may_meet_nothing_allows_turns_after_it():
     started(rig, {**GRIP, "expect_object": False}, TWIST_NOW, torque_source="load_cell")
     rig.run(20)
     assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
-    assert "stand at their target" in (rig.control_loop.tool.may_still_hold or "")
+    assert "stand at their target" in (rig.control_loop.tool.gripped_tool or "")
 
 
 def turning_what_is_not_felt(**keys: Any) -> Rig:

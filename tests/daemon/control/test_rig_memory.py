@@ -558,10 +558,10 @@ async def test_no_zero_is_taken_before_the_gripper_shows_what_it_holds():
     after.run(0.6)
     assert "the gripper has not answered yet" in (after.control_loop.operator.tare_refusal(confirmed=True) or "")
     # A stop keeps the daemon: without it, no command opens the fingers.
-    assert "an earlier daemon had gripped a tool" in (after.control_loop.tool.may_still_hold or "")
+    assert "an earlier daemon had gripped a tool" in (after.control_loop.tool.gripped_tool or "")
     after.silent.clear()
     after.run(0.1)
-    assert after.control_loop.tool.may_still_hold is None
+    assert after.control_loop.tool.gripped_tool is None
     assert after.control_loop.operator.tare_refusal(confirmed=True) is None, "it holds nothing"
 
 

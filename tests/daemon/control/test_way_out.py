@@ -296,7 +296,7 @@ def test_after_a_grip_fingers_that_were_halted_may_still_hold_the_tool(gripped):
     stop(rig)
     rig.force_n, rig.hand = 0.0, replace(rig.hand, uncertain=True)
     rig.run(0.6)
-    said = rig.control_loop.tool.may_still_hold
+    said = rig.control_loop.tool.gripped_tool
     assert ("does not know whether it holds a tool" in said) if gripped else said is None
 
 

@@ -160,7 +160,7 @@ class ControlLoop:
     @property
     def stated_tool_note(self) -> str:
         """How the widths by the maker's figures differ from the stated diameter; empty where they do not."""
-        running = self.running
+        running = self.running_experiment
         first = first_gripper_step(running.file) if running is not None else None
         if running is not None and first is not None and running.step_number <= first[0]:
             # The fingers may still hold the tool of before.

@@ -701,7 +701,7 @@ def test_a_stated_diameter_that_an_uncalibrated_gripper_does_not_fit_is_noted_wh
     rig.force_n, rig.hand = 60.0, replace(rig.hand, unmeasured_mm=Measured(40.0, 9.0))
     started(rig, {"do": "release"}, GRIP, {"do": "wait", "wait_s": 0.5}, tool_mm=20.0)
     notes: dict[int, str] = {}
-    while rig.control_loop.running is not None:
+    while rig.control_loop.running_experiment is not None:
         rig.step()
         held = rig.force_n > 0
         rig.hand = replace(rig.hand, unmeasured_mm=Measured(40.0, 9.0) if held else None)

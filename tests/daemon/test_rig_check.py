@@ -13,9 +13,7 @@ import yaml
 
 from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
-from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.experiment_files import ExperimentFiles, check_experiment
-from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.ur.settings import ForceBound, TorqueBound, read_settings
 from shearloop.errors import UserError
@@ -166,15 +164,17 @@ ONE_WAY = [
 
 
 @pytest.mark.parametrize("step", ONE_WAY)
-def test_a_torque_that_the_driving_calibration_reads_as_none_is_refused(tmp_path, step):
+async def test_a_torque_that_the_driving_calibration_reads_as_none_is_refused(tmp_path, step):
     steps, both_ways = [IDENTIFY, step], TorqueSource(name="right", period_s=0.5)
     experiment = config(tmp_path, {"torque_source": "right", "steps": steps})
     one_sided = replace(both_ways, only_sign=1)
-    with pytest.raises(UserError, match=rf"steps\[1\]: {step['do']} turns clockwise, and right measures no torque of"):
+    said = rf"steps\[1\]: {step['do']} turns clockwise, and right measures no torque of"
+    with pytest.raises(UserError, match=said):
         check_experiment(experiment, {"right": one_sided})
-    file = check_experiment(experiment, {"right": both_ways})
-    loop = ControlLoop(LoopConfig(), {"right": one_sided}, ("robot",))
-    assert f"step 2: {step['do']} turns clockwise" in loop.start(file, 0), "a running daemon refuses it too"
+    assert check_experiment(experiment, {"right": both_ways}) is not None
+    # A running daemon reads it before each start.
+    with pytest.raises(UserError, match=said):
+        await ExperimentFiles((tmp_path,), experiment, {"right": one_sided}).read(experiment.experiment)
 
 
 def of_tool(tool_mm: float) -> TorqueSource:

@@ -136,8 +136,7 @@ class Daemon:
             config, settings, files, sessions, self.publisher, clock, self.recorder, self.supervisor,
             self.health.running_rig.instance,
         )  # fmt: skip
-        if self.rig.commissioning is not None:
-            self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
+        self.health.cap = partial(getattr, self.rig.commissioning, "sentence")
         self.health.refusals |= {"start": self.rig.start_refusal, "release": self.rig.runner.release_refusal}
         if config.experiment is not None:
             daemon_end = self.ending if config.stop_when_done else None

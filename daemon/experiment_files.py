@@ -22,8 +22,8 @@ import structlog
 
 from shearloop.daemon.commissioning import Commissioning, MotionCap
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.control.experiment_check import check_steps, experiment_mistakes, tool_note
-from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake, outline
+from shearloop.daemon.control.experiment_check import experiment_mistakes, tool_note
+from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.torques import TorqueSource
@@ -118,15 +118,15 @@ class _Listed(NamedTuple):
 class ExperimentFiles:
     """The experiments that a request may name: regular files of at most 32 kB in `folders`, or below them.
 
-    Each can run on the rig of `config`, where it is given: with its torque `sources`, but the robot's, and its `robot`.
+    Each can run on the rig of `config`, with its torque `sources`, but the robot's, and its `robot`, if that is known.
     None begins where a file of `loaded` has changed.
     """
 
     folders: tuple[Path, ...]
-    config: DaemonConfig | None = None
-    sources: Mapping[str, TorqueSource] = field(default_factory=dict)
-    robot: Commissioning | None = None
-    loaded: LoadedFiles | None = None
+    config: DaemonConfig
+    sources: Mapping[str, TorqueSource]
+    robot: Commissioning | None
+    loaded: LoadedFiles
     # Held by the one thread that reads, also after its request has given up.
     _turn: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
     _waiting: int = field(default=0, init=False)
@@ -139,11 +139,11 @@ class ExperimentFiles:
     @property
     def gripper(self) -> GripperModel | None:
         """The rig's gripper, if one is known."""
-        return self.config.gripper_model if self.config is not None else None
+        return self.config.gripper_model
 
     def tool_note(self, file: ExperimentFile) -> str:
         """Return what the driving torque rests on that nothing will check about the tool; empty without anything."""
-        return "" if self.config is None else tool_note(file, self.config, self.sources, self.robot)
+        return tool_note(file, self.config, self.sources, self.robot)
 
     async def read(self, path: Path) -> ReadExperiment:
         """Return the experiment of a file; raises UserError without the file's content, at the latest after 5 s."""
@@ -248,9 +248,7 @@ class ExperimentFiles:
             yield from sorted(islice(paths, MAX_LISTED))
 
     def _mistakes(self, document: Document) -> Sequence[Mistake]:
-        """Return what the experiment's own limits, or the rig where it is known, do not allow."""
-        if self.config is None:
-            return check_steps(outline(document.content))
+        """Return what the experiment's own limits, or the rig, do not allow."""
         return experiment_mistakes(document.content, self.config, self.sources, self.robot)
 
     def _meant(self, named: Path) -> str:
@@ -292,7 +290,7 @@ class ExperimentFiles:
                 f" (and {counted(len(mistakes) - 1, 'more mistake')}: see the daemon's log)" if mistakes[1:] else ""
             )
             raise InvalidExperimentError(f"{first}{others}")
-        if self.loaded is not None and (outdated := self.loaded.why_outdated()):
+        if outdated := self.loaded.why_outdated():
             raise UserError(outdated)
         return ReadExperiment(path, file, data)
 

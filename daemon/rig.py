@@ -220,8 +220,8 @@ class Rig:
     recorder: "Recorder | None"
     # The daemon's own, so that a question of an earlier one asks for another moment.
     instance: str
-    memory: RigMemory | NoMemory = field(default_factory=NoMemory)
-    commissioning: Commissioning | None = None
+    memory: RigMemory | NoMemory
+    commissioning: Commissioning
     # The file of the experiment that is about to begin.
     starting: str = field(default="", init=False)
 

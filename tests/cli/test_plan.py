@@ -14,6 +14,7 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
+from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.drivers.ur.settings import UrLimits, read_settings
 from tests.daemon.control.loop_rig import TICK_S, Rig, new_loop, phase, started
@@ -163,7 +164,7 @@ async def test_what_lies_outside_the_devices_is_refused_by_check_and_by_start(st
     # As `command start` does, before the experiment begins.
     config, robot = load_daemon_config(rig(tmp_path)), Commissioning(read_settings(ROBOT), None, emulated=True)
     with pytest.raises(InvalidExperimentError, match=rf"experiment\.yaml:\d+: steps\[1\]: {re.escape(said)}"):
-        await ExperimentFiles((tmp_path,), config, torque_sources(config, {}, None), robot).read(path)
+        await ExperimentFiles((tmp_path,), config, torque_sources(config, {}, None), robot, LoadedFiles(())).read(path)
 
 
 @pytest.mark.parametrize(

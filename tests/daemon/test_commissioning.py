@@ -24,6 +24,7 @@ from shearloop.daemon.commissioning import (
 )
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
+from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.rig import make_loop
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.drivers.ur.client import UrRobot
@@ -262,7 +263,8 @@ async def test_a_running_daemon_refuses_an_experiment_beyond_the_cap(tmp_path):
     content = {"name": "one", "limits": {"torque_nm": 0.3}, "steps": [BEYOND[0][0]]}
     path.write_text(yaml.safe_dump(content))
     config = load_daemon_config(write_rig(tmp_path))
-    files = ExperimentFiles((tmp_path,), config, {}, commissioning_of(config, read_settings(config.robot), NOW))
+    robot = commissioning_of(config, read_settings(config.robot), NOW)
+    files = ExperimentFiles((tmp_path,), config, {}, robot, LoadedFiles(()))
     with pytest.raises(InvalidExperimentError):
         await files.read(path)
 

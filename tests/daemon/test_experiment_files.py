@@ -15,15 +15,17 @@ import yaml
 from shearloop.cli import command, main
 from shearloop.daemon import experiment_files
 from shearloop.daemon.commands import Commands
-from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.experiment_schema import MAX_ANGLES_IN_ALL, MAX_STEPS
 from shearloop.daemon.control.known_tool import AT_REST
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.experiment_files import ExperimentFiles
+from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
 from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensing.sessions import torque_sources
+from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
 from shearloop.tools.check import read_experiment
 from tests.fixtures.daemons import bound_handlers, deadline
@@ -37,6 +39,13 @@ def write(path: Path, content: object) -> Path:
     return path
 
 
+def files_in(folder: Path) -> ExperimentFiles:
+    """Return the experiments of a folder, for a rig with a fingertip that measures torque."""
+    config = DaemonConfig.model_validate({"fingertips": {"right": {"device": {"path": "right"}}}})
+    sources = {name: TorqueSource(name=name, period_s=0.5) for name in ("right", "combined")}
+    return ExperimentFiles((folder,), config, sources, None, LoadedFiles(()))
+
+
 @pytest.fixture
 def folder(tmp_path) -> Path:
     (tmp_path / "experiments").mkdir()
@@ -46,14 +55,14 @@ def folder(tmp_path) -> Path:
 async def refusal(folder: Path, path: Path) -> str:
     async with deadline("the file was not refused"):
         with pytest.raises(UserError) as refused:
-            await ExperimentFiles((folder,)).read(path)
+            await files_in(folder).read(path)
     return str(refused.value)
 
 
 async def test_an_experiment_in_a_folder_or_below_it_is_read_once(folder):
     (folder / "more").mkdir()
     path = write(folder / "more" / "one.yaml", VALID)
-    found = await ExperimentFiles((folder,)).read(path)
+    found = await files_in(folder).read(path)
     assert (found.file.name, found.data) == ("one", path.read_bytes())
 
 
@@ -64,7 +73,7 @@ async def test_the_list_has_the_valid_experiments_of_the_folders_alone(folder):
     write(folder / "wrong.yaml", {"name": "wrong", "steps": [{"do": "wiat"}]})
     write(folder / "broken.yaml", "name: [")
     (folder / "link.yaml").symlink_to(write(folder.parent / "secret.yaml", VALID))
-    assert (await ExperimentFiles((folder,)).list()).names == {str(valid): "one"}
+    assert (await files_in(folder).list()).names == {str(valid): "one"}
 
 
 HOLD = [{"do": "grip"}, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.05}]
@@ -94,7 +103,7 @@ async def test_the_list_has_only_what_start_accepts_on_this_rig(content, gripper
     path = write(folder / "one.yaml", {"name": "one", **content})
     more = {"gripper": {"model": "2F-85", "socket": {"host": "192.168.1.10"}}} if gripper else {}
     config = load_daemon_config(write(folder.parent / "rig.yaml", {**RIG, **more}))
-    files = ExperimentFiles((folder,), config, torque_sources(config, {}, None))
+    files = ExperimentFiles((folder,), config, torque_sources(config, {}, None), None, LoadedFiles(()))
     if not said:
         assert (await files.read(path)).file.name == "one"
     else:
@@ -171,7 +180,7 @@ async def test_a_reply_has_no_content_of_a_file(text, folder, log):
 
 async def test_the_event_loop_goes_on_while_a_large_file_is_read(folder):
     steps = [{"do": "wait", "wait_s": number % 7 + 0.5} for number in range(MAX_STEPS)]
-    files, beats = ExperimentFiles((folder,)), 0
+    files, beats = files_in(folder), 0
     reading = asyncio.create_task(files.read(write(folder / "large.yaml", {**VALID, "steps": steps})))
     while not reading.done():
         await asyncio.sleep(0)
@@ -212,7 +221,7 @@ async def end_of_reading() -> None:
 
 async def test_a_drive_that_does_not_answer_ends_the_start_and_keeps_one_thread(folder, slow_drive, monkeypatch):
     monkeypatch.setattr(experiment_files, "READ_WITHIN_S", 0.05)
-    files, path = ExperimentFiles((folder,)), write(folder / "one.yaml", VALID)
+    files, path = files_in(folder), write(folder / "one.yaml", VALID)
     with pytest.raises(UserError, match=r"was not read within 0\.05 s"):
         await files.read(path)
     for _ in range(16):
@@ -259,9 +268,11 @@ def rig(folder: Path, runner: Runner, instance: str = "a1") -> Rig:
         ),
         runner,
         {},
-        ExperimentFiles((folder,)),
+        files_in(folder),
         None,
         instance,
+        None,
+        SimpleNamespace(),
     )
 
 
@@ -350,7 +361,7 @@ async def test_a_start_does_not_wait_for_a_long_list(folder, slow_drive):
 
 async def test_a_file_is_read_for_the_list_only_after_a_change(folder, slow_drive):
     slow_drive.answers.set()
-    files, path = ExperimentFiles((folder,)), write(folder / "one.yaml", VALID)
+    files, path = files_in(folder), write(folder / "one.yaml", VALID)
     wrong = write(folder / "wrong.yaml", "name: [")
     for _ in range(3):
         assert (await files.list()).names == {str(path): "one"}
@@ -363,7 +374,7 @@ async def test_a_file_is_read_for_the_list_only_after_a_change(folder, slow_driv
 
 
 async def test_as_many_requests_wait_for_a_file_as_leave_room_for_others(folder, slow_drive):
-    files, path = ExperimentFiles((folder,)), write(folder / "one.yaml", VALID)
+    files, path = files_in(folder), write(folder / "one.yaml", VALID)
     reading = [asyncio.create_task(files.read(path)) for _ in range(MAX_CONCURRENT)]
     await asyncio.to_thread(slow_drive.asked.wait)
     slow_drive.answers.set()

@@ -10,6 +10,7 @@ from shearloop.daemon import loaded_files
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles
 from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
 
 EXPERIMENT = {"name": "one", "steps": [{"do": "wait", "wait_s": 1}]}
@@ -36,7 +37,8 @@ def rig(tmp_path):
 @pytest.mark.parametrize("name", ["rig.yaml", "ur.yaml", "right.cal"])
 async def test_no_experiment_begins_once_a_file_of_the_rig_has_changed(rig, name):
     config = load_daemon_config(rig)
-    files = ExperimentFiles(config.experiment_folders, loaded=LoadedFiles.of(config))
+    sources = {name: TorqueSource(name=name, period_s=0.5) for name in ("right", "combined")}
+    files = ExperimentFiles(config.experiment_folders, config, sources, None, LoadedFiles.of(config))
     assert (await files.read(rig.parent / "one.yaml")).file.name == "one"
     changed = rig.parent / name
     before = changed.read_bytes()

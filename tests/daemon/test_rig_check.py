@@ -14,6 +14,7 @@ import yaml
 from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles, check_experiment
+from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.ur.settings import ForceBound, TorqueBound, read_settings
 from shearloop.errors import UserError
@@ -173,8 +174,9 @@ async def test_a_torque_that_the_driving_calibration_reads_as_none_is_refused(tm
         check_experiment(experiment, {"right": one_sided})
     assert check_experiment(experiment, {"right": both_ways}) is not None
     # A running daemon reads it before each start.
+    files = ExperimentFiles((tmp_path,), experiment, {"right": one_sided}, None, LoadedFiles(()))
     with pytest.raises(UserError, match=said):
-        await ExperimentFiles((tmp_path,), experiment, {"right": one_sided}).read(experiment.experiment)
+        await files.read(experiment.experiment)
 
 
 def of_tool(tool_mm: float) -> TorqueSource:
@@ -201,7 +203,7 @@ TURN = [{"do": "turn_to", "angle_rad": 0.1}]
 async def test_an_experiment_on_another_tool_than_the_calibrated_one_is_refused(tmp_path, content, said):
     content = {"torque_source": "right", **content}
     daemon, sources = config(tmp_path, content, **CELL), {"right": of_tool(20.0), **LOAD}
-    files = ExperimentFiles((tmp_path,), daemon, sources)
+    files = ExperimentFiles((tmp_path,), daemon, sources, None, LoadedFiles(()))
     if not said:
         assert check_experiment(daemon, sources) is not None
         assert (await files.read(daemon.experiment)).file.tool_mm == content.get("tool_mm")
@@ -226,7 +228,7 @@ def test_a_plan_says_that_nothing_will_know_the_tool(tmp_path, content, gripper,
     daemon = config(tmp_path, {"torque_source": "right", **content}, **CELL, **gripper)
     sources = {"right": of_tool(20.0), **LOAD}
     file = check_experiment(daemon, sources)
-    note = ExperimentFiles((tmp_path,), daemon, sources).tool_note(file)
+    note = ExperimentFiles((tmp_path,), daemon, sources, None, LoadedFiles(())).tool_note(file)
     assert said in note
     assert bool(note) is bool(said)
 

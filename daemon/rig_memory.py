@@ -147,8 +147,8 @@ class RigMemory:
 
     files: RobotFiles
     loop: ControlLoop
-    load_cell: LoadCell | None = None
-    robot: UrRobot | None = None
+    load_cell: LoadCell | None
+    robot: UrRobot
     error: str = ""
     # The experiment that is about to begin.
     _starting: str = ""
@@ -182,7 +182,7 @@ class RigMemory:
         if cell is not None and zero is not None and cell.calibration.nm_per_count == remembered.load_nm_per_count:
             self._calibrated_zero, self._load_restored = cell.calibration.tare_counts, zero
             cell.tare(zero)
-        if self.robot is not None and remembered.wrench_zero is not None:
+        if remembered.wrench_zero is not None:
             self._wrench_restored, self._wrench_tared = True, remembered.wrench_tared
             self.robot.restore_wrench_zero(remembered.wrench_zero)
         if clamped:
@@ -228,7 +228,7 @@ class RigMemory:
             and cell.calibration.tare_counts == self._load_restored
         ):
             cell.tare(self._calibrated_zero)
-        if self.robot is not None and self._wrench_restored:
+        if self._wrench_restored:
             self.robot.forget_wrench_zero()
 
     async def run(self) -> None:
@@ -255,7 +255,7 @@ class RigMemory:
         if self.load_cell is not None and self.loop.tool.may_be_loaded() and self._knows_load_zero:
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)
-        if self.robot is not None and self.loop.tool.may_be_loaded():
+        if self.loop.tool.may_be_loaded():
             state = replace(state, wrench_zero=self.robot.wrench_zero, wrench_tared=self._knows_wrench_zero)
         await self.save(state)
         return self.error or None
@@ -291,7 +291,7 @@ class RigMemory:
 
     def _watch_wrench(self) -> None:
         """Note whether a program is starting: if the daemon is killed now, the earlier zero must not be used."""
-        robot_state = self.robot.state if self.robot is not None else None
+        robot_state = self.robot.state
         if robot_state is None:
             return
         # A start that is given up leaves motion blocked; its program may run on, with a zero of its own.

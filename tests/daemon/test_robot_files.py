@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.control.faults import FaultCode
-from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memory
+from shearloop.daemon.rig_memory import Remembered, read_memories, read_memory, write_memory
 from shearloop.daemon.robot_files import RobotFiles, lock_robot, memory_path
 from shearloop.errors import UserError
-from tests.daemon.control.loop_rig import new_loop
+from tests.daemon.control.loop_rig import memory_of, new_loop
 
 STOP = (FaultCode.GRIP_LOST.name, "the object is gone")
 SAME = [
@@ -49,7 +49,7 @@ async def test_a_stop_under_a_name_stops_every_robot_until_a_person_removes_its_
     write_memory(files.state, grip)
     write_memory(memory_path("other.lab"), grip)
     write_memory(by_name, Remembered(running="loosen", stop=(STOP,)))
-    memory = RigMemory(files, loop := new_loop())
+    memory = memory_of(loop := new_loop(), files=files)
     (fault,) = loop.safety.waiting.faults
     assert f"{by_name} keeps a stop of a robot by its name, which may be this one" in fault.detail
     assert "the object is gone" in fault.detail
@@ -57,7 +57,7 @@ async def test_a_stop_under_a_name_stops_every_robot_until_a_person_removes_its_
     loop.acknowledge()
     await memory.save_present()
     assert read_memory(by_name).stop == (STOP,), "it may be another robot's"
-    assert RigMemory(RobotFiles("192.168.1.11"), new_loop()).loop.safety.waiting is not None
+    assert memory_of(new_loop(), files=RobotFiles("192.168.1.11")).loop.safety.waiting is not None
     by_name.unlink()
     assert read_memories(files) == grip, "the other name keeps no stop"
 

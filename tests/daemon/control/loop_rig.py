@@ -12,10 +12,17 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.rig_memory import RigMemory
+from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.torques import TorqueSample, TorqueSource
+from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.ur.client import UrRobot
 from shearloop.emulators.scene import Twin, TwinSettings
+from tests.drivers.ur.handler_bench import SETTINGS
 
 TICK_S = 0.008
+# Its file is in the state folder of each test.
+FILES = RobotFiles("192.168.1.10")
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
 LOAD = TorqueSource(name="load_cell", period_s=1 / 10.9)
 GRIP = {"do": "grip", "width_mm": 10.0, "force_n": 60.0}
@@ -130,3 +137,10 @@ def stop(rig: Rig) -> None:
 
 def phase(rig: Rig) -> ExperimentPhase:
     return rig.control_loop.experiment.phase
+
+
+def memory_of(
+    loop: ControlLoop, cell: LoadCell | None = None, robot: UrRobot | None = None, files: RobotFiles = FILES
+) -> RigMemory:
+    """Return the memory of a rig, whose robot is not connected unless a test has its own."""
+    return RigMemory(files, loop, cell, UrRobot(SETTINGS) if robot is None else robot)

@@ -14,13 +14,12 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.wrench import wrench_source
-from shearloop.daemon.rig_memory import RigMemory, read_memories
-from shearloop.daemon.robot_files import RobotFiles
+from shearloop.daemon.rig_memory import read_memories
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from tests.daemon.control.cell import TWIST, driven
-from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, Rig, new_loop, phase, started, stop
+from tests.daemon.control.loop_rig import CONFIG, EIT, FILES, GRIP, LOAD, Rig, memory_of, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS
 from tests.fixtures.daemons import bound_handlers
 
@@ -124,9 +123,6 @@ def test_the_question_before_a_tighter_grip_says_that_the_angle_is_not_known():
     assert twisted().control_loop.operator.held_note(tighter) == "", "its angle goes on"
 
 
-FILES = RobotFiles("192.168.1.10")
-
-
 def clamped_rig() -> Rig:
     """Return a rig without a gripper, with a tool clamped to the wrist."""
     rig = Rig(ControlLoop(CONFIG, {"right": EIT, "load_cell": LOAD}, ("right",)))
@@ -168,20 +164,20 @@ def test_the_angle_of_a_clamped_tool_goes_on_from_start_to_start_until_another_o
 
 async def test_the_angle_of_a_clamped_tool_outlives_the_process():
     before = clamped_rig()
-    memory = RigMemory(FILES, before.control_loop)
+    memory = memory_of(before.control_loop)
     turn_to_limit(before)
     await memory.save_present()
     after = clamped_rig()
     after.wrist_rad = before.wrist_rad
-    RigMemory(FILES, after.control_loop)
+    memory_of(after.control_loop)
     assert turn_to_limit(after) == pytest.approx(0.0, abs=0.01)
     after.control_loop.tool.on_release_ended()
-    memory = RigMemory(FILES, after.control_loop)
+    memory = memory_of(after.control_loop)
     assert after.control_loop.tool.grip == before.control_loop.tool.grip, "what is on the disk counts"
     after.control_loop.tool.on_release_ended()
     await memory.save_present()
     again = clamped_rig()
-    RigMemory(FILES, again.control_loop)
+    memory_of(again.control_loop)
     assert not again.control_loop.tool.grip.known
 
 
@@ -189,12 +185,12 @@ async def test_a_daemon_that_has_lost_its_gripper_keeps_the_angle_and_none_of_th
     """The tool may still be in the gripper that the configuration does not name."""
     before = twisted()
     cell = LoadCell(None, LoadCalibration(tare_counts=8321.5, scale_n_per_count=0.001))
-    memory = RigMemory(FILES, before.control_loop, cell)
+    memory = memory_of(before.control_loop, cell)
     before.control_loop.on_zero("load_cell")
     await memory.save_present()
     after, cell = clamped_rig(), LoadCell(None, LoadCalibration(tare_counts=8000.0, scale_n_per_count=0.001))
     after.wrist_rad = before.wrist_rad
-    RigMemory(FILES, after.control_loop, cell)
+    memory_of(after.control_loop, cell)
     assert cell.calibration.tare_counts == 8000.0
     assert after.control_loop.tool.grip == Grip(before.control_loop.tool.grip.origin_rad)
 
@@ -224,7 +220,7 @@ def test_a_clamped_tool_that_was_turned_may_load_the_wrench_until_another_one_is
 async def test_the_zeros_of_a_clamped_tool_outlive_the_process(tared):
     before, robot = clamped_with_wrench(), UrRobot(SETTINGS)
     cell = LoadCell(None, LoadCalibration(tare_counts=8321.5, scale_n_per_count=0.001))
-    memory = RigMemory(FILES, before.control_loop, cell, robot)
+    memory = memory_of(before.control_loop, cell, robot)
     turn_to_limit(before)
     robot.restore_wrench_zero(ZERO)
     before.control_loop.on_zero("load_cell")
@@ -232,7 +228,7 @@ async def test_the_zeros_of_a_clamped_tool_outlive_the_process(tared):
     await memory.save_present()
     after, robot = clamped_with_wrench(), UrRobot(SETTINGS)
     cell = LoadCell(None, LoadCalibration(tare_counts=8000.0, scale_n_per_count=0.001))
-    RigMemory(FILES, after.control_loop, cell, robot)
+    memory_of(after.control_loop, cell, robot)
     assert (cell.calibration.tare_counts, robot.wrench_zero) == (8321.5, ZERO)
     assert after.control_loop.has_zero("load_cell")
     assert after.control_loop.has_zero("wrench") is tared
@@ -287,7 +283,7 @@ def test_a_step_takes_no_zero_of_the_wrench_under_a_clamped_tool_that_is_turned(
 async def test_a_release_is_on_the_disk_before_it_is_answered():
     """A daemon that is killed then must not restore the angle and the zeros of the tool before."""
     rig = clamped_with_wrench()
-    memory = RigMemory(FILES, rig.control_loop)
+    memory = memory_of(rig.control_loop)
     turn_to_limit(rig)
     await memory.save_present()
 

@@ -21,12 +21,11 @@ from shearloop.daemon.control.grip import FOLLOWED_MM, NO_GRIP, SAME_WIDTH_MM, G
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memory
-from shearloop.daemon.robot_files import RobotFiles
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.command_handler import BEING_MADE_READY
 from shearloop.drivers.ur.motion import NOT_OURS
-from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, Rig, new_loop, phase, started, stop
+from tests.daemon.control.loop_rig import CONFIG, EIT, FILES, GRIP, Rig, memory_of, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS, HandlerBench
 from tests.fixtures.daemons import DEADLINE_S
 
@@ -39,8 +38,6 @@ def logged() -> Iterator[list[MutableMapping[str, Any]]]:
 
 
 WAIT = {"do": "wait", "wait_s": 60}
-# Its file is in the state folder of each test.
-FILES = RobotFiles("192.168.1.10")
 
 
 def refusal(rig: Rig) -> str:
@@ -52,7 +49,7 @@ def after_restart(before: Rig) -> Rig:
     """Return the rig with the loop of a new process, which finds what the old one has written."""
     write_memory(FILES.state, Remembered.of(before.control_loop))
     after = Rig(new_loop())
-    RigMemory(FILES, after.control_loop)
+    memory_of(after.control_loop)
     after.wrist_rad, after.force_n, after.width_mm = before.wrist_rad, before.force_n, before.width_mm
     after.run(0.6)
     return after
@@ -163,7 +160,7 @@ class Restarted:
         write_memory(FILES.state, replace(state, **asdict(grip), wrench_zero=self.WRENCH_ZERO))
         self.rig = after = Rig(new_loop())
         self.cell, self.robot = load_cell(), UrRobot(SETTINGS)
-        self.memory = RigMemory(FILES, after.control_loop, self.cell, self.robot)
+        self.memory = memory_of(after.control_loop, self.cell, self.robot)
         after.wrist_rad, after.force_n, after.width_mm = before.wrist_rad, before.force_n, before.width_mm
         after.hand = before.hand
 
@@ -210,7 +207,7 @@ def test_the_log_calls_a_zero_kept_only_where_it_was_taken(tared, restarted, log
     rig = restarted.rig
     again = Rig(new_loop())
     again.wrist_rad, again.force_n, again.width_mm, again.hand = rig.wrist_rad, rig.force_n, rig.width_mm, rig.hand
-    RigMemory(FILES, again.control_loop, load_cell(), UrRobot(SETTINGS))
+    memory_of(again.control_loop, load_cell(), UrRobot(SETTINGS))
     again.run(0.1)
     (kept,) = (line["of"] for line in logged if line["event"] == "the zeros of the present tool are kept")
     unknown = [line for line in logged if "the wrench has no known zero" in line["event"]]
@@ -332,15 +329,15 @@ def test_a_tool_that_was_exchanged_while_the_gripper_was_away_is_another_one(res
 async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_one():
     rig = started(Rig(new_loop()), GRIP, WAIT)
     cell = load_cell()
-    memory = RigMemory(FILES, rig.control_loop, cell)
+    memory = memory_of(rig.control_loop, cell)
     cell.tare(8321.5)
     rig.control_loop.on_zero("load_cell")
     rig.run(2)
     await memory.save_present()
 
     after, calibrated_anew = load_cell(), load_cell(scale_n_per_count=0.002)
-    again = RigMemory(FILES, new_loop(), after)
-    RigMemory(FILES, new_loop(), calibrated_anew)
+    again = memory_of(new_loop(), after)
+    memory_of(new_loop(), calibrated_anew)
     assert after.calibration.tare_counts == 8321.5
     assert calibrated_anew.calibration.tare_counts == 8000.0
     # Until the gripper answers, nobody knows of another zero.
@@ -351,7 +348,7 @@ async def test_the_load_cells_zero_is_kept_with_the_grip_that_forbids_another_on
     stop(rig)
     rig.run(0.6)
     await memory.save_present()
-    RigMemory(FILES, new_loop(), free := load_cell())
+    memory_of(new_loop(), free := load_cell())
     assert free.calibration.tare_counts == 8000.0
 
 
@@ -359,17 +356,17 @@ async def test_the_wrench_keeps_its_zero_with_the_grip():
     zero = (0.0, 1.0, 0.0, 0.0, 0.0, -0.11)
     rig = started(Rig(new_loop()), GRIP, WAIT)
     before, after, free = UrRobot(SETTINGS), UrRobot(SETTINGS), UrRobot(SETTINGS)
-    memory = RigMemory(FILES, rig.control_loop, robot=before)
+    memory = memory_of(rig.control_loop, robot=before)
     before.restore_wrench_zero(zero)
     rig.run(2)
     await memory.save_present()
-    RigMemory(FILES, new_loop(), robot=after)
+    memory_of(new_loop(), robot=after)
     assert after.wrench_zero == zero
     rig.force_n = 0.0
     stop(rig)
     rig.run(0.6)
     await memory.save_present()
-    RigMemory(FILES, new_loop(), robot=free)
+    memory_of(new_loop(), robot=free)
     assert free.wrench_zero == (0.0,) * 6
 
 
@@ -408,7 +405,7 @@ def test_a_fault_of_another_version_is_a_stop_all_the_same():
 
 
 async def test_nothing_starts_where_a_stop_could_not_be_remembered(tmp_path, monkeypatch):
-    memory = RigMemory(FILES, new_loop())
+    memory = memory_of(new_loop())
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     assert "cannot be kept" in (await memory.begins("test") or "")
@@ -418,7 +415,7 @@ async def test_nothing_starts_where_a_stop_could_not_be_remembered(tmp_path, mon
 
 
 async def test_an_experiment_that_begins_stays_on_the_disk_until_the_loop_has_it(monkeypatch):
-    memory = RigMemory(FILES, new_loop())
+    memory = memory_of(new_loop())
     assert await memory.begins("test") is None
     saved: list[Remembered] = []
     twice = asyncio.Event()
@@ -471,9 +468,9 @@ async def restarted_with_a_tool(*, tared: bool) -> tuple[Rig, LoadCell, RigMemor
         before.control_loop.on_zero("load_cell")
     before.force_n = 60.0
     before.run(0.6)
-    await RigMemory(FILES, before.control_loop, cell).save_present()
+    await memory_of(before.control_loop, cell).save_present()
     after, cell = Rig(new_loop(needs_zero=True)), load_cell()
-    return after, cell, RigMemory(FILES, after.control_loop, cell)
+    return after, cell, memory_of(after.control_loop, cell)
 
 
 @pytest.mark.parametrize("tared", [False, True])
@@ -512,7 +509,7 @@ async def test_a_zero_of_the_wrench_that_goes_with_the_robots_process_is_logged_
     before.control_loop.on_zero("wrench")
     before.force_n = 60.0
     before.run(0.6)
-    memory = RigMemory(FILES, before.control_loop, robot=UrRobot(SETTINGS))
+    memory = memory_of(before.control_loop, robot=UrRobot(SETTINGS))
     await memory.save_present()
     assert not [line for line in logged if lost in line["event"]]
     before.control_loop.on_link("robot", "its process was killed", up=False)
@@ -521,7 +518,7 @@ async def test_a_zero_of_the_wrench_that_goes_with_the_robots_process_is_logged_
         await memory.save_present()
     assert len([line for line in logged if lost in line["event"]]) == 1
     after = Rig(ControlLoop(CONFIG, {"right": EIT, "wrench": wrench_source(125.0)}, ("gripper", "right")))
-    RigMemory(FILES, after.control_loop, robot=UrRobot(SETTINGS))
+    memory_of(after.control_loop, robot=UrRobot(SETTINGS))
     after.force_n = 60.0
     after.run(0.6)
     (unknown,) = (line for line in logged if "the wrench has no known zero" in line["event"])
@@ -537,10 +534,10 @@ async def test_only_a_wrench_that_somebody_tared_has_a_known_zero_after_a_restar
         before.run(0.6)
         robot = UrRobot(SETTINGS)
         robot.restore_wrench_zero((0.0, 1.0, 0.0, 0.0, 0.0, -0.11))
-        await RigMemory(FILES, before.control_loop, robot=robot).save_present()
+        await memory_of(before.control_loop, robot=robot).save_present()
         after = Rig(ControlLoop(CONFIG, {"right": EIT, "wrench": wrench_source(125.0)}, ("gripper", "right")))
         again = UrRobot(SETTINGS)
-        RigMemory(FILES, after.control_loop, robot=again)
+        memory_of(after.control_loop, robot=again)
         after.force_n = 60.0
         after.run(0.6)
         assert again.wrench_zero[5] == -0.11, "what it reads goes on as before"
@@ -551,9 +548,9 @@ async def test_no_zero_is_taken_before_the_gripper_shows_what_it_holds():
     """Not even a confirmed one: an earlier daemon knows of a tool."""
     before = started(Rig(new_loop()), GRIP, WAIT)
     before.run(2)
-    await RigMemory(FILES, before.control_loop).save_present()
+    await memory_of(before.control_loop).save_present()
     after = Rig(new_loop())
-    RigMemory(FILES, after.control_loop)
+    memory_of(after.control_loop)
     after.silent.add("hand")
     after.run(0.6)
     assert "the gripper has not answered yet" in (after.control_loop.operator.tare_refusal(confirmed=True) or "")
@@ -572,7 +569,7 @@ async def test_a_daemon_that_is_killed_while_a_program_starts_leaves_no_zero_of_
     before.force_n = 60.0
     before.run(0.6)
     robot, ready = UrRobot(SETTINGS), HandlerBench().state
-    memory = RigMemory(FILES, before.control_loop, robot=robot)
+    memory = memory_of(before.control_loop, robot=robot)
     for recovering, program_running, blocked, tared in (
         (False, True, "", True),
         (True, False, BEING_MADE_READY, False),
@@ -614,7 +611,7 @@ async def test_a_write_that_is_cut_off_is_no_other_programs_for_the_next_one(mon
         may_end.wait(DEADLINE_S)
         write(*arguments)
 
-    memory = RigMemory(FILES, new_loop())
+    memory = memory_of(new_loop())
     monkeypatch.setattr(rig_memory, "write_memory", slowly)
     first = asyncio.create_task(memory.save(Remembered(running="one")))
     await asyncio.to_thread(begun.wait, DEADLINE_S)

@@ -44,7 +44,7 @@ def test_two_robots_have_two_locks_and_two_memories(one, other):
 
 async def test_a_stop_under_a_name_stops_every_robot_until_a_person_removes_its_file():
     """The configuration named the robot `ur.lab` then, and which address that was is not known any more."""
-    grip = Remembered(origin_rad=0.3, force_n=60.0, width_mm=30.0)
+    grip = Remembered(origin_rad=0.3, force_n=60.0, width_mm=30.0, wrench_zero=(0.0,) * 6)
     files, by_name = RobotFiles("192.168.1.10"), memory_path("ur.lab")
     write_memory(files.state, grip)
     write_memory(memory_path("other.lab"), grip)

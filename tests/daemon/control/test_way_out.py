@@ -133,8 +133,14 @@ async def test_a_release_of_another_moment_than_its_question_opens_nothing(betwe
         assert await answered == {}
 
 
+def rig_of(cell: Cell, files: Any = None, instance: str = "a1") -> RigOfDaemon:
+    return RigOfDaemon(
+        cell.control_loop, cell.runner, {}, files, None, instance, memory=None, commissioning=SimpleNamespace()
+    )
+
+
 def commands_of(cell: Cell, instance: str = "a1") -> Any:
-    return commands_with(RigOfDaemon(cell.control_loop, cell.runner, {}, None, None, instance))
+    return commands_with(rig_of(cell, instance=instance))
 
 
 def commands_with(rig: RigOfDaemon, sensors: dict[str, Any] | None = None) -> Any:
@@ -191,7 +197,7 @@ async def unlocked(cell: Cell, unlock: Any, **arguments: Any) -> dict[str, Any]:
 async def test_an_unlock_acknowledges_the_stop_that_was_shown_and_no_other():
     """A second person presses STOP just before the unlock of the first one arrives, and a third one after that."""
     async with with_gripper() as cell:
-        rig = RigOfDaemon(cell.control_loop, cell.runner, {}, None, None, "a1")
+        rig = rig_of(cell)
         unlock = commands_with(rig)["unlock"]
         cell.runner.stop(also_idle=True)
         await cell.cycles(3)
@@ -426,7 +432,7 @@ async def test_no_zero_is_taken_while_an_experiment_starts():
         cell.holding = False
         await cell.cycles(5)
         files, cell.sensors["load_cell"] = OneFile(), Tared()
-        commands = commands_with(RigOfDaemon(cell.control_loop, cell.runner, {}, files, None, "a1"), cell.sensors)
+        commands = commands_with(rig_of(cell, files), cell.sensors)
         starting = asyncio.create_task(commands["start"]({"experiment": "/rig/grip.yaml"}))
         await files.asked.wait()
         for confirmed in (False, True):

@@ -24,6 +24,7 @@ from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
 from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.rig import Rig
+from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
@@ -271,7 +272,7 @@ def rig(folder: Path, runner: Runner, instance: str = "a1") -> Rig:
         files_in(folder),
         None,
         instance,
-        None,
+        NoMemory(),
         SimpleNamespace(),
     )
 

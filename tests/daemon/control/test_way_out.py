@@ -26,6 +26,7 @@ from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.messaging.stop_client import nothing_moved
 from shearloop.daemon.rig import Rig as RigOfDaemon
+from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.torques import LARGEST_DRIFT_NM, WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
@@ -135,7 +136,7 @@ async def test_a_release_of_another_moment_than_its_question_opens_nothing(betwe
 
 def rig_of(cell: Cell, files: Any = None, instance: str = "a1") -> RigOfDaemon:
     return RigOfDaemon(
-        cell.control_loop, cell.runner, {}, files, None, instance, memory=None, commissioning=SimpleNamespace()
+        cell.control_loop, cell.runner, {}, files, None, instance, memory=NoMemory(), commissioning=SimpleNamespace()
     )
 
 

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.real_time
 pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
 
 # A twist whose client dies: its deadline in these tests, and the time to brake.
-STOPPED_WITHIN_S = settings_for("a-robot").standstill_s
+STOPPED_WITHIN_S = settings_for("192.168.1.10").standstill_s
 # The timer of a connection in /proc/net/tcp.
 KEPT_ALIVE = "02"
 

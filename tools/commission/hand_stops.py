@@ -144,26 +144,28 @@ def hand_speeds(passed_rad_per_s: Sequence[float], count: int) -> list[float]:
 def stops_by_hand(context: Context, passed_rad_per_s: Sequence[float]) -> tuple[list[Line], float]:
     """Have each layer stop the wrist at speeds that all other layers passed; return the lines and the largest angle."""
     speeds = hand_speeds(passed_rad_per_s, context.counts.stops)
-    lines: list[Line] = []
-    largest_rad = 0.0
-    for layer in LAYERS:
-        shown = ", ".join(f"{speed:g}" for speed in speeds)
-        context.operator.allow(
-            f"wrist 3 turns to and fro within {LARGEST_RAD:g} rad of the pose, {len(speeds)} times until you stop it, "
-            f"at {shown} rad/s; during each turn {layer.action}"
-        )
-        stops: list[HandStop] = []
-        for number, speed in enumerate(speeds, 1):
-            which = f"stop {number} of {len(speeds)}, at {speed:g} rad/s"
-            then = "the arm gets ready" + (" and turns again" if number < len(speeds) else "")
-            stop = _stop(context, layer, speed, which, f": after your word {then}")
-            if stop is None:
-                break
-            stops.append(stop)
-        unseen = "" if len(stops) == len(speeds) else layer.unseen
-        lines.append(judge_hand_stops(layer.what, stops, len(speeds), context.limits.rest_s(context.settings), unseen))
-        largest_rad = max([largest_rad, *(stop.rad for stop in stops)])
-    return lines, largest_rad
+    lines, angles_rad = zip(*(stops_of_layer(context, layer, speeds) for layer in LAYERS), strict=True)
+    return list(lines), max(angles_rad)
+
+
+def stops_of_layer(context: Context, layer: Layer, speeds: Sequence[float]) -> tuple[Line, float]:
+    """Have one layer stop the wrist at each speed; return the line and the largest angle."""
+    shown = ", ".join(f"{speed:g}" for speed in speeds)
+    context.operator.allow(
+        f"wrist 3 turns to and fro within {LARGEST_RAD:g} rad of the pose, {len(speeds)} times until you stop it, "
+        f"at {shown} rad/s; during each turn {layer.action}"
+    )
+    stops: list[HandStop] = []
+    for number, speed in enumerate(speeds, 1):
+        which = f"stop {number} of {len(speeds)}, at {speed:g} rad/s"
+        then = "the arm gets ready" + (" and turns again" if number < len(speeds) else "")
+        stop = _stop(context, layer, speed, which, f": after your word {then}")
+        if stop is None:
+            break
+        stops.append(stop)
+    unseen = "" if len(stops) == len(speeds) else layer.unseen
+    line = judge_hand_stops(layer.what, stops, len(speeds), context.limits.rest_s(context.settings), unseen)
+    return line, max((stop.rad for stop in stops), default=0.0)
 
 
 def _stop(context: Context, layer: Layer, speed: float, which: str, then: str) -> HandStop | None:

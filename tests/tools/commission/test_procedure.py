@@ -16,7 +16,7 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.rig import open_settings
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context, Counts
-from shearloop.tools.commission.hand_stops import stops_by_hand
+from shearloop.tools.commission.hand_stops import LAYERS, stops_of_layer
 from shearloop.tools.commission.mover_process import CAUSES
 from shearloop.tools.commission.operator import DeclinedError
 from shearloop.tools.commission.procedure import STAGES, commission
@@ -101,14 +101,15 @@ class Lab:
 
         self.operator = ScriptedOperator(order, self.rig.stop_program)
 
-    def stopped_by_hand(self) -> dict[str, Line]:
-        """Have the operator stop the wrist by each layer, once; return the lines by their names."""
+    def stopped_by_hand(self, what: str) -> Line:
+        """Have the operator stop the wrist by one layer, once."""
         config = load_daemon_config(self.path)
+        (layer,) = (one for one in LAYERS if one.what == what)
         with ExitStack() as opened:
             settings, controller, operator = open_settings(config), self.rig.controller(), self.operator.operator
             context = Context(config, settings, self.rig, controller, operator, None, COUNTS, opened)
-            lines, _ = stops_by_hand(context, (0.2,))
-        return {line.what: line for line in lines}
+            line, _ = stops_of_layer(context, layer, (0.2,))
+        return line
 
     def run(self, only: str = "", counts: Counts = COUNTS):
         config, out = load_daemon_config(self.path), self.path.with_name("report.yaml")
@@ -308,7 +309,7 @@ def test_a_faster_stop_is_raised_by_five_of_each_layer(lab):
 
 def test_a_cable_whose_samples_come_late_shows_the_whole_stop(lab):
     lab.do_instead("silence robot 1.2", [["robot hold-back 1.2"]])
-    line = lab.stopped_by_hand()["cable pulled"]
+    line = lab.stopped_by_hand("cable pulled")
     assert line.verdict == "passed"
     assert "s to rest" in line.value
 
@@ -318,7 +319,7 @@ def test_a_cable_whose_samples_come_late_shows_the_whole_stop(lab):
 )
 def test_a_cable_that_was_pulled_too_shortly_or_not_at_all_is_asked_for_again(lab, first, verdict):
     lab.do_instead("silence robot 1.2", list(first))
-    line = lab.stopped_by_hand()["cable pulled"]
+    line = lab.stopped_by_hand("cable pulled")
     assert line.verdict == verdict
     assert len([question for question in lab.operator.asked if "Now pull" in question]) == min(3, len(first) + 1)
     assert ("not interrupted" in line.value) == (verdict == "failed")
@@ -327,6 +328,6 @@ def test_a_cable_that_was_pulled_too_shortly_or_not_at_all_is_asked_for_again(la
 def test_an_emergency_stop_of_a_wrist_that_stands_is_none(lab):
     """A swing ends by itself while nobody presses."""
     lab.do_instead("emergency-stop", [["object none"] * 80 + ["emergency-stop"]])
-    line = lab.stopped_by_hand()["emergency stop"]
+    line = lab.stopped_by_hand("emergency stop")
     assert (line.verdict, line.count) == ("passed", 1)
     assert "ended its turn before the stop" in " ".join(lab.operator.said)

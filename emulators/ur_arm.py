@@ -11,8 +11,8 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import constants
-from scipy.spatial.transform import Rotation
+
+from shearloop.drivers.load_cell_calibration import STANDARD_GRAVITY
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -55,13 +55,24 @@ def tool_frames(q_rad: Vector, tool: Matrix) -> list[Matrix]:
 def frame_of_pose(pose: Sequence[float] | Vector) -> Matrix:
     """Return the frame (4, 4) of a pose (6,): position and rotation vector."""
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = Rotation.from_rotvec(np.asarray(pose[3:])).as_matrix(), pose[:3]
+    frame[:3, :3], frame[:3, 3] = rotation_matrix(pose[3:]), pose[:3]
     return frame
 
 
 def _pose_of_frame(frame: Matrix) -> Vector:
     """Return the pose (6,) of a frame (4, 4)."""
     return np.array([*frame[:3, 3].tolist(), *rotation_vector(frame[:3, :3])])
+
+
+def rotation_matrix(vector: Sequence[float] | Vector) -> Matrix:
+    """Return the rotation (3, 3) by a rotation vector (3,) in rad (Rodrigues' formula)."""
+    x, y, z = map(float, vector)
+    angle_rad = math.hypot(x, y, z)
+    # sin(a)/a and (1 − cos(a))/a² are 1 and 1/2 at 0.
+    sine = math.sin(angle_rad) / angle_rad if angle_rad else 1.0
+    versine = 2.0 * (math.sin(angle_rad / 2) / angle_rad) ** 2 if angle_rad else 0.5
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + sine * cross + versine * (cross @ cross))
 
 
 def rotation_vector(rotation: Matrix) -> tuple[float, float, float]:
@@ -187,7 +198,7 @@ class LinearMove:
         frames = tool_frames(q_rad, self.tool)
         here = frames[-1]
         where = self.start[:3, 3] + share * (self.target[:3, 3] - self.start[:3, 3])
-        turned = self.start[:3, :3] @ Rotation.from_rotvec(share * self._turn).as_matrix()
+        turned = self.start[:3, :3] @ rotation_matrix(share * self._turn)
         turn = rotation_vector(turned @ here[:3, :3].T)
         error = np.concatenate([where - here[:3, 3], turn])
         try:
@@ -279,7 +290,7 @@ class Arm:
     @property
     def wrench(self) -> Vector:
         """Force and torque at the tool, relative to the zero."""
-        hung_n = np.array([0.0, 0.0, -constants.g * self.hung_kg])
+        hung_n = np.array([0.0, 0.0, -STANDARD_GRAVITY * self.hung_kg])
         apart = np.concatenate([self.bias_n + hung_n, np.zeros(3)])
         return np.asarray(self.load + self._noise - self._wrench_zero + apart)
 

@@ -799,8 +799,9 @@ def _command(name: str):
 HEAVY = ("scipy", "skfem", "numba", "matplotlib")
 
 
-def test_the_daemon_imports_no_heavy_modules():
-    says = f"import sys, shearloop.daemon.app; print([name for name in {HEAVY} if name in sys.modules])"
+@pytest.mark.parametrize("module", ["daemon.app", "emulators.emulated_rig"])
+def test_what_starts_often_imports_no_heavy_modules(module):
+    says = f"import sys, shearloop.{module}; print([name for name in {HEAVY} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.emulators.ur_arm import jacobian, link_frames, rotation_vector
+from shearloop.emulators.ur_arm import jacobian, link_frames, rotation_matrix, rotation_vector
 
 angles = st.floats(-math.pi, math.pi)
 joints = st.tuples(*[angles] * 6).map(np.array)
@@ -42,11 +42,13 @@ def test_jacobian_is_the_derivative_of_the_pose(q):
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1e-3, 1.0, np.pi - 1e-9, np.pi, 4.0])
-def test_a_rotation_vector_is_scipys_number(angle_rad):
+def test_rotations_are_scipys_numbers(angle_rad):
     rng = np.random.default_rng(0)
     axes = [*np.eye(3), *-np.eye(3), *rng.normal(size=(50, 3))]
     for axis in axes:
-        rotation = Rotation.from_rotvec(angle_rad * axis / np.linalg.norm(axis)).as_matrix()
+        vector = angle_rad * axis / np.linalg.norm(axis)
+        rotation = Rotation.from_rotvec(vector).as_matrix()
+        assert rotation_matrix(vector) == pytest.approx(rotation, rel=1e-12, abs=1e-15)
         assert rotation_vector(rotation) == pytest.approx(
             Rotation.from_matrix(rotation).as_rotvec(), rel=1e-12, abs=1e-12
         )

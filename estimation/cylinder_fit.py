@@ -10,8 +10,8 @@ from shearloop.bank.channels import ChannelTable, smoothed_along_channels
 from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator import MIN_LEFT, CalibrationRows
-from shearloop.estimation.interval_regressor import IntervalRegressor
-from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals, ValueRange
+from shearloop.estimation.interval_fit import MIN_HALF_WIDTH
+from shearloop.estimation.interval_regressor import IntervalRegressor, Intervals, ValueRange
 from shearloop.estimation.ridge import Ridge
 
 # Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.

@@ -1,4 +1,9 @@
-"""Fits a regressor with its intervals, by frames left out of the fit."""
+"""Fits a regressor with its 95 % prediction intervals, by residuals on frames left out of the fit.
+
+The intervals are split-conformal in strata of the prediction (Vovk 2012), namely free of load, about to touch, loaded.
+In each stratum the half width is the 95 % quantile of the absolute residuals with the correction for a finite sample,
+so that many easy frames do not narrow the intervals of few hard ones.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeAlias
@@ -10,8 +15,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
 from shearloop.estimation.gain import GainSpread
-from shearloop.estimation.interval_regressor import IntervalRegressor, Regressor, reported_values
-from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals, ValueRange
+from shearloop.estimation.interval_regressor import IntervalRegressor, Intervals, Regressor, ValueRange, reported_values
 from shearloop.estimation.left_out import LeftOut, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.ridge import STRENGTHS, CensoredRidge, Predictor
 from shearloop.estimation.twists import LOADED_FRACTION, find_twists, first_twists, loaded_log_gain, log_gain
@@ -20,6 +24,9 @@ from shearloop.words import counted
 # The future differs from the past more than one part of a recording from the next.
 INFLATION = 1.05
 MIN_FRAMES = 8
+# Narrowest interval as a fraction of the calibrated range: load cells are noisy too.
+MIN_HALF_WIDTH = 1e-3
+_MIN_RESIDUALS, _MIN_IN_STRATUM = 5, 20
 # This share of the loads must lie within their intervals.
 _MIN_COVERED = 0.75
 # Twists in each half of a grip that shows how the gain drifts: fewer do not determine a fit of the motion.
@@ -27,11 +34,6 @@ _MIN_IN_HALF = 3
 
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
-
-
-def student_inflation(n: int) -> float:
-    """Return the factor on a 95 % interval's width if n values determine it (Student 1908)."""
-    return float(stdtrit(n - 1, (1 + LEVEL) / 2)) / TWO_SIDED_95
 
 
 def check_values(values: FloatArray) -> None:
@@ -83,7 +85,7 @@ def fit_interval_regressor(
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
     least = MIN_HALF_WIDTH * float(np.ptp(values))
-    intervals, widening = Intervals.fit(predicted, residuals, edges, inflation, least, of_loads), 1.0
+    intervals, widening = fit_intervals(predicted, residuals, edges, inflation, least, of_loads), 1.0
     # Before widening for unknown times: a load that is not seen is not seen at any time.
     half = np.array([intervals.half_width(prediction) for prediction in predicted])
     misses_loads = _misses_loads(truth, np.abs(residuals) <= half)
@@ -93,7 +95,7 @@ def fit_interval_regressor(
             inflation = student_inflation(len(blocks))
         errors = np.max([np.abs(truth + residuals - end[rows]) for end in bounds], axis=0)
         known = intervals.half_widths[-1]
-        intervals = Intervals.fit(predicted, errors, edges, inflation, least, of_loads)
+        intervals = fit_intervals(predicted, errors, edges, inflation, least, of_loads)
         widening = float(intervals.half_widths[-1] / known)
     span = ValueRange(float(values.min()), float(values.max()))
     gain = GainSpread()
@@ -102,6 +104,49 @@ def fit_interval_regressor(
         halves = _gains_of_halves(features, values, grips, refit)
         gain = _spread_of_gain(values, grips, rows, reported, gains, halves, fingertips)
     return IntervalRegressor(point, intervals, span, centre, deviation, misses_loads, widening, gain)
+
+
+def fit_intervals(
+    predicted: FloatArray,
+    residuals: FloatArray,
+    edges: tuple[float, ...],
+    inflation: float,
+    least_half_width: float = 0.0,
+    inflation_of_loads: float | None = None,
+) -> Intervals:
+    """Return intervals of (n,) predictions from their residuals on data left out.
+
+    A stratum between two of the edges with few residuals joins the next. The uppermost stratum has an inflation of its
+    own where it is given: loads are fewer. Raises CalibrationError for too few residuals.
+    """
+    if len(residuals) < _MIN_RESIDUALS:
+        raise CalibrationError(
+            f"too few frames left out of the fit to determine the error: {len(residuals)}; record more repeats"
+        )
+    kept: list[float] = []
+    for edge in sorted(edges):
+        low = kept[-1] if kept else -np.inf
+        inside = np.count_nonzero((predicted > low) & (predicted <= edge))
+        above = np.count_nonzero(predicted > edge)
+        if inside >= _MIN_IN_STRATUM and above >= _MIN_IN_STRATUM:
+            kept.append(float(edge))
+    stratum = np.searchsorted(kept, predicted)
+    widths = [_conformal_quantile(np.abs(residuals[stratum == i])) for i in range(len(kept) + 1)]
+    widths[-1] *= (inflation_of_loads or inflation) / inflation
+    return Intervals(np.array(kept), np.maximum(inflation * np.array(widths), least_half_width))
+
+
+def student_inflation(n: int) -> float:
+    """Return the factor on a 95 % interval's width if n values determine it (Student 1908)."""
+    return float(stdtrit(n - 1, (1 + LEVEL) / 2)) / TWO_SIDED_95
+
+
+def _conformal_quantile(absolute: FloatArray) -> float:
+    """Return the conformal quantile; of few residuals the Gaussian one, because their largest says too little."""
+    n = len(absolute)
+    if n < 2 * _MIN_IN_STRATUM:
+        return TWO_SIDED_95 * float(np.sqrt((absolute**2).mean()))
+    return float(np.quantile(absolute, min(LEVEL * (n + 1) / n, 1.0), method="higher"))
 
 
 def _inflation(rows: IntArray, left_out: LeftOut) -> float:

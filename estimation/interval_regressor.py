@@ -1,8 +1,8 @@
 """A regressor with 95 % prediction intervals.
 
-The interval of a value y is y ± hypot(h, r): h is the half width of the residuals on frames left out (`intervals.py`),
-and r the reach of the gain's error, which grows with the torque (`gain.py`). Guards widen it where a prediction may be
-wrong by more.
+The interval of a value y is y ± hypot(h, r): h is the half width of the residuals on frames left out
+(`interval_fit.py`), and r the reach of the gain's error, which grows with the torque (`gain.py`). Guards widen it where
+a prediction may be wrong by more.
 """
 
 import math
@@ -15,7 +15,6 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.gain import GainCorrection, GainSpread
-from shearloop.estimation.intervals import Intervals, ValueRange
 from shearloop.estimation.ridge import CensoredRidge, Predictor, Ridge
 from shearloop.estimation.twists import LOADED_FRACTION, find_twists
 from shearloop.estimation.values import INLINE
@@ -23,6 +22,42 @@ from shearloop.estimation.values import INLINE
 Regressor: TypeAlias = Ridge | CensoredRidge
 # Features larger than any at calibration by this factor are refused.
 _LARGEST_DEVIATION = 1.6
+# Values further beyond the calibrated range, in spans of it, are refused as extrapolation.
+_LARGEST_BEYOND = 0.35
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Intervals:
+    """Half widths (s,) of the strata that the (s − 1,) edges divide the predictions into."""
+
+    edges: FloatArray
+    half_widths: FloatArray
+
+    def half_width(self, predicted: float) -> float:
+        """Return half of the 95 % interval's width at this prediction."""
+        return float(self.half_widths[self.edges.searchsorted(predicted)])
+
+
+@dataclass(frozen=True, slots=True)
+class ValueRange:
+    """The calibrated values, low to high."""
+
+    low: float
+    high: float
+
+    def scaled(self, factor: float) -> "ValueRange":
+        """Return the range of values larger by a factor."""
+        return ValueRange(factor * self.low, factor * self.high)
+
+    def reasons(self, value: float, quantity: str, unit: str) -> tuple[str, ...]:
+        """Return the reason against a value far beyond the range, if there is one."""
+        beyond = _LARGEST_BEYOND * (self.high - self.low)
+        if self.low - beyond <= value <= self.high + beyond:
+            return ()
+        return (
+            f"the {quantity} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to {self.high:.3g} "
+            f"{unit}; tare with nothing gripped, or calibrate further",
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.estimation.interval_fit import MIN_FRAMES
-from shearloop.estimation.intervals import ValueRange
+from shearloop.estimation.interval_regressor import ValueRange
 from shearloop.estimation.ridge import Ridge
 from shearloop.studies.slices.curve import CurveMean
 

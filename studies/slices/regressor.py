@@ -12,8 +12,15 @@ from typing import TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.estimation.interval_fit import INFLATION, best_strength, check_values, student_inflation
-from shearloop.estimation.intervals import MIN_HALF_WIDTH, Intervals
+from shearloop.estimation.interval_fit import (
+    INFLATION,
+    MIN_HALF_WIDTH,
+    best_strength,
+    check_values,
+    fit_intervals,
+    student_inflation,
+)
+from shearloop.estimation.interval_regressor import Intervals
 from shearloop.estimation.left_out import LeftOut, left_out_blocks
 from shearloop.estimation.values import INLINE
 from shearloop.studies.slices.curve import CurveMean
@@ -96,7 +103,7 @@ def fit_slice_regressor(
     rows = np.concatenate([later for _, later in blocks])
     point, centre = fit(features, values, strength), features.mean(axis=0)
     least = MIN_HALF_WIDTH * float(np.ptp(values))
-    intervals = Intervals.fit(predicted, predicted - values[rows], (), _inflation(point, rows, left_out), least)
+    intervals = fit_intervals(predicted, predicted - values[rows], (), _inflation(point, rows, left_out), least)
     if fit_line is None:
         return SliceRegressor(point, intervals, SliceRange(float(values.min()), float(values.max())), centre)
     span, line = range_of_slices(point, features, values, refit, None if full_range else refit_line)

@@ -795,13 +795,16 @@ def _command(name: str):
     return parts_of(full_parser())[name]
 
 
-# Each costs tens of megabytes and tenths of a second, and none is needed to run.
+# Each costs tens of megabytes and tenths of a second. Without a bank and a shear skin none is needed to run.
 HEAVY = ("scipy", "skfem", "numba", "matplotlib")
+# What `shearloop run` loads for a rig with a robot and a calibration of the default estimator.
+RUN = ("cli.run", "daemon.app", "daemon.rig", "daemon.configured_experiment", "estimation.motion_regression")
 
 
-@pytest.mark.parametrize("module", ["daemon.app", "emulators.emulated_rig"])
-def test_what_starts_often_imports_no_heavy_modules(module):
-    says = f"import sys, shearloop.{module}; print([name for name in {HEAVY} if name in sys.modules])"
+@pytest.mark.parametrize("modules", [RUN, ("emulators.emulated_rig",)])
+def test_what_starts_often_imports_no_heavy_modules(modules):
+    imported = ", ".join(f"shearloop.{name}" for name in modules)
+    says = f"import sys, {imported}; print([name for name in {HEAVY} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 

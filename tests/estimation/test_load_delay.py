@@ -9,7 +9,7 @@ import pytest
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import TRUSTED, fit, load_delay
 from shearloop.estimation.grips import segment_grip
-from shearloop.estimation.intervals import student_inflation
+from shearloop.estimation.interval_fit import student_inflation
 from shearloop.estimation.load_delay import (
     LoadDelay,
     find_load_delay,

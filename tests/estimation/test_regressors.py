@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.interval_fit import best_strength, fit_interval_regressor, student_inflation
-from shearloop.estimation.intervals import Intervals
+from shearloop.estimation.interval_fit import best_strength, fit_interval_regressor, fit_intervals, student_inflation
 from shearloop.estimation.left_out import later_origins, later_splits, left_out_blocks
 from shearloop.estimation.ridge import CensoredRidge, Ridge
 from shearloop.studies.slices.curve import InverseCalibration
@@ -176,7 +175,7 @@ def test_each_stratum_covers_its_own_future():
     def residuals(predicted):
         return rng.normal(size=len(predicted)) * np.where(predicted > 0, 0.01, 1e-4)
 
-    intervals = Intervals.fit(past, residuals(past), (0.0,), 1.0)
+    intervals = fit_intervals(past, residuals(past), (0.0,), 1.0)
     inside = np.abs(residuals(future)) <= [intervals.half_width(one) for one in future]
     for stratum in (future > 0, future <= 0):
         assert 0.92 < inside[stratum].mean() < 0.98
@@ -185,7 +184,7 @@ def test_each_stratum_covers_its_own_future():
 def test_strata_with_few_residuals_join():
     rng = np.random.default_rng(1)
     predicted = np.concatenate([rng.uniform(-1, 0, 100), [0.5, 0.6]])
-    intervals = Intervals.fit(predicted, rng.normal(size=102), (0.0, 0.4), 1.1)
+    intervals = fit_intervals(predicted, rng.normal(size=102), (0.0, 0.4), 1.1)
     assert len(intervals.edges) == 0
     assert intervals.half_width(-5) == intervals.half_width(5)
 
@@ -197,7 +196,7 @@ def test_of_few_values_an_interval_is_as_wide_as_students(n, students_t):
 
 def test_too_few_residuals_are_refused():
     with pytest.raises(CalibrationError, match="record more repeats"):
-        Intervals.fit(np.zeros(3), np.zeros(3), (), 1.0)
+        fit_intervals(np.zeros(3), np.zeros(3), (), 1.0)
 
 
 def loads(frames):

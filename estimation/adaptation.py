@@ -33,7 +33,7 @@ class LoadedFit:
     @classmethod
     def of(cls, model: OutputModel, features: FloatArray, torque_nm: FloatArray) -> Self:
         """Compare the model on (n, d) features with the torques (n,)."""
-        found = np.array([model.regressor.predict(row)[0] for row in features])
+        found = np.array([model.regressor.predict(row).value for row in features])
         gain = float((found * np.sign(torque_nm)).sum() / np.abs(torque_nm).sum())
         return cls(gain, float(np.sqrt(((found - torque_nm) ** 2).mean())), model.regressor.gain.between)
 

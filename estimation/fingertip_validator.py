@@ -8,11 +8,12 @@ discriminant detects the grip. It ignores the motion of a frame by twisting and 
 import math
 from collections import deque
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.estimation.grip_strength import CalibratedStrength, GripStrength
+from shearloop.estimation.grip_strength import CalibratedStrength
 
 # One step of the board's converter, measured on recorded frames. Its rounding is the smallest noise.
 _CONVERTER_STEP_V = 0.00215
@@ -24,7 +25,7 @@ LARGEST_DEVIATION = 0.12
 SMALL_V = 0.01
 # Channels that are compared, and the minimum fraction of them.
 _WELL_ABOVE_NOISE_V, _MIN_COMPARED_FRACTION = 0.03, 0.25
-LARGEST_JUMPING_FRACTION = 0.12
+_LARGEST_JUMPING_FRACTION = 0.12
 LARGEST_UNUSABLE_FRACTION = 0.25
 # A channel that moves between frames by more than both of these is disturbed.
 _JUMP_NOISES, _JUMP_V = 6.0, 0.008
@@ -40,6 +41,8 @@ STEP_FRAMES = 4
 _CLEARLY_NEARER, _SAME_SESSION, _GRIPPED_SCORE = 0.8, 0.01, 0.5
 # A grip ends when its score falls below this fraction of its mean over this many frames.
 _LOOSE_FRACTION, _LEVEL_FRAMES = 0.4, 60
+# The latest frames in the median strength of a grip, 65 s of them: the grip closes, and twists come and go, within it.
+_STRENGTH_FRAMES = 120
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,23 +154,27 @@ class FingertipSet:
                 )
         return reasons, lost[:, 0] & lost[:, 1]
 
-    def jumping_shares(self, frame: FloatArray, before: FloatArray, usable: BoolArray) -> FloatArray:
+    def jumping_fractions(self, frame: FloatArray, before: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the fraction of each side's usable channels that moved further than noise explains; 1 without any."""
         jumping = (np.abs(frame - before) > self._jump_limits_v) & usable
         counts = np.count_nonzero(usable, axis=1)
         return np.where(counts > 0, np.count_nonzero(jumping, axis=1) / np.maximum(counts, 1), 1.0)
 
-    def disturbance(self, jumping_shares: FloatArray) -> str:
-        """Return why fractions of jumping channels mean a disturbance."""
-        number = int(np.argmax(jumping_shares > LARGEST_JUMPING_FRACTION))
+    def disturbance(self, frame: FloatArray, before: FloatArray, usable: BoolArray) -> str:
+        """Return why a frame is disturbed against the one before, empty where it is not."""
+        fractions = self.jumping_fractions(frame, before, usable)
+        disturbed = fractions > _LARGEST_JUMPING_FRACTION
+        if not disturbed.any():
+            return ""
+        number = int(np.argmax(disturbed))
         return (
-            f"{self.sides[number].side} fingertip: {100 * jumping_shares[number]:.0f} % of the channels jumped since "
+            f"{self.sides[number].side} fingertip: {100 * fractions[number]:.0f} % of the channels jumped since "
             "the last frame; the tool was gripped, released or knocked, or the board is disturbed"
         )
 
 
 class GripDetector:
-    """Detects whether one fingertip is gripped, from its grip score and its steps, frame by frame.
+    """Detects whether one fingertip is gripped, from its grip score and its steps, and how strongly, frame by frame.
 
     A grip starts when the score rises by the threshold above the lowest score since the last grip, because a gel that
     recovers from a release scores less and less. It ends below half of that rise, or below a fraction of this grip's
@@ -177,7 +184,7 @@ class GripDetector:
     def __init__(self, side: FingertipValidator) -> None:
         """Start without a grip."""
         self._side = side
-        self.strength = GripStrength(side.strength)
+        self._strengths: deque[float] = deque(maxlen=_STRENGTH_FRAMES)
         self._floor = 0.0
         self._level: float | None = None
         self._frames = 0
@@ -207,11 +214,18 @@ class GripDetector:
             self._frames = min(self._frames + 1, _LEVEL_FRAMES)
             self._level += (score - self._level) / self._frames
         gripped = self._level is not None and not self._released
-        if gripped:
-            self.strength.add(relative_change(frame, idle))
-        else:
-            self.strength.forget()
+        if not gripped:
+            self._strengths.clear()
+        elif side.strength is not None:
+            self._strengths.append(float(relative_change(frame, idle) @ side.strength.weights))
         return gripped
+
+    @property
+    def strength_ratio(self) -> float:
+        """The grip's strength as a ratio of the nearest calibrated one, 1 where it is unknown."""
+        if self._side.strength is None or not self._strengths:
+            return 1.0
+        return self._side.strength.ratio(median(self._strengths))
 
 
 def relative_change(frame: FloatArray, idle: FloatArray) -> FloatArray:

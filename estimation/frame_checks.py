@@ -1,11 +1,12 @@
 """Checks of a frame against the frames before it: times, channels that are lost, and disturbances."""
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.estimation.fingertip_validator import LARGEST_JUMPING_FRACTION, FingertipSet, mask_unmeasured
+from shearloop.estimation.fingertip_validator import FingertipSet, mask_unmeasured
 from shearloop.estimation.grip_memory import Motion
 from shearloop.estimation.values import TactileFrame
 
@@ -48,6 +49,19 @@ class FrameTimer:
         return int(step_s > _MISSING_PERIODS * period_s)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedFrame:
+    """A frame's (m, c) channels, unusable ones filled in, the usable ones, and the reasons against the frame.
+
+    `disturbance` is why its channels jumped since the last frame, empty where they did not.
+    """
+
+    channels: FloatArray
+    usable: BoolArray
+    reasons: tuple[str, ...]
+    disturbance: str
+
+
 class ChannelChecks:
     """Which channels of a frame count, and whether it is disturbed, by the frames before it."""
 
@@ -66,25 +80,22 @@ class ChannelChecks:
         """Compare the next frame with this one instead of the last."""
         self.before, self._disturbed = before, None
 
-    def check(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, list[str], FloatArray]:
-        """Return the filled channels, the usable ones, each side's reason, and its fraction of jumping channels.
-
-        There are no shares without an earlier frame.
-        """
+    def check(self, frame: TactileFrame) -> CheckedFrame:
+        """Return the frame's channels and what speaks against it; without an earlier frame there is no disturbance."""
         usable = mask_unmeasured(frame.channels, frame.usable)
         channels = frame.channels if usable.all() else self._fill(frame.channels, usable)
         reasons, lost = self._fingertips.check(channels, usable)
         # Channels that stay lost are left out; while they are being lost they count as jumping.
         judged = usable & ~((lost & self._lost) | self.unknown)
-        shares = np.zeros(0)
+        disturbance = ""
         if self.before is not None:
-            shares = self._fingertips.jumping_shares(channels, self.before, judged)
+            disturbance = self._fingertips.disturbance(channels, self.before, judged)
         self._lost = lost
         if self.unknown.any() or lost.any():
             usable = usable & ~(lost | self.unknown)
             reasons = reasons if any(reasons) else self._fingertips.too_few_channels(usable)
             channels = self._fill(frame.channels, usable)
-        return channels, usable, reasons, shares
+        return CheckedFrame(channels, usable, tuple(filter(None, reasons)), disturbance)
 
     def _fill(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the channels with unusable ones moved on from the last frame as the usable ones moved."""
@@ -101,8 +112,7 @@ class ChannelChecks:
         """Return whether a frame that jumped agrees with one before it that jumped too; then the change is real."""
         confirmed = False
         if self._disturbed is not None:
-            shares = self._fingertips.jumping_shares(channels, self._disturbed, self._fingertips.alive)
-            confirmed = bool((shares <= LARGEST_JUMPING_FRACTION).all())
+            confirmed = not self._fingertips.disturbance(channels, self._disturbed, self._fingertips.alive)
         if confirmed:
             self._disturbed, self.before = None, channels
         else:

@@ -53,6 +53,7 @@ class GripMemory:
     def __init__(self, motion: Motion, shape: tuple[int, ...]) -> None:
         """Begin without a grip; frames have the shape (m, c)."""
         self._motion = motion
+        self._n_needed = motion.n_needed
         self.positions: deque[FloatArray] = deque(maxlen=motion.n_lags + 1)
         self._bridged: deque[bool] = deque(maxlen=motion.n_lags + 1)
         self._skipped_in_a_row = 0
@@ -95,7 +96,7 @@ class GripMemory:
                 self.positions[i - 1 - between] = begin + i / (between + 1) * (position - begin)
         self.positions.append(position)
         self._bridged.append(False)
-        if len(self.positions) < self._motion.n_needed:
+        if len(self.positions) < self._n_needed:
             return self.waits()
         if sum(self._bridged) > max(_LARGEST_BRIDGED, _LARGEST_BRIDGED_FRACTION * (len(self.positions) - 1)):
             return "too many of the last frames were disturbed or are missing"
@@ -106,7 +107,7 @@ class GripMemory:
 
     def waits(self) -> str:
         """Return the reason against an estimate while frames are missing."""
-        wanted = self._motion.n_needed - len(self.positions)
+        wanted = self._n_needed - len(self.positions)
         return f"{self._why or 'gripped too recently'}: {counted(wanted, 'more frame is', 'more frames are')} needed"
 
     @property

@@ -5,7 +5,6 @@ about the same strength, so they miss the truth in a much stronger or weaker gri
 grip's discriminant, which ignores twists.
 """
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -16,8 +15,6 @@ from shearloop.bank.arrays import FloatArray
 # On pairs of recorded grips where the calibration of one carries over to the other, the strength is 0.43 to 2.07 times
 # the calibrated one; on others at most 0.17 or at least 2.47 (docs/decisions/0048). The limits lie between.
 WEAKEST_RATIO, STRONGEST_RATIO = 0.25, 2.25
-# The latest frames in the median strength of a grip, 65 s of them: the grip closes, and twists come and go, within it.
-_FRAMES = 120
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,31 +41,6 @@ class CalibratedStrength:
             return strength / self.strongest
         # Fingertips that grip tools of several shapes may leave no direction of strength in common.
         return strength / self.weakest if self.weakest > 0.0 and strength < self.weakest else 1.0
-
-
-class GripStrength:
-    """The strength of one fingertip's grip over its last frames."""
-
-    def __init__(self, calibrated: CalibratedStrength | None) -> None:
-        """Begin without a grip; nothing is compared without calibrated strengths."""
-        self._calibrated = calibrated
-        self._strengths: deque[float] = deque(maxlen=_FRAMES)
-
-    def add(self, relative_change: FloatArray) -> None:
-        """Take the (c,) relative change from idle of the grip's next frame."""
-        if self._calibrated is not None:
-            self._strengths.append(float(relative_change @ self._calibrated.weights))
-
-    def forget(self) -> None:
-        """Forget the grip."""
-        self._strengths.clear()
-
-    @property
-    def ratio(self) -> float:
-        """The strength as a ratio of the nearest calibrated one, 1 where it is unknown."""
-        if self._calibrated is None or not self._strengths:
-            return 1.0
-        return self._calibrated.ratio(median(self._strengths))
 
 
 def strength_reasons(ratios: dict[str, float]) -> tuple[str, ...]:

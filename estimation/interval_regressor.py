@@ -7,7 +7,7 @@ a prediction may be wrong by more.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -60,6 +60,28 @@ class ValueRange:
         )
 
 
+class Predicted(NamedTuple):
+    """A value, and how far its 95 % interval extends below and above it."""
+
+    value: float
+    below: float
+    above: float
+
+    @property
+    def low(self) -> float:
+        """The lower end of the interval."""
+        return self.value - self.below
+
+    @property
+    def high(self) -> float:
+        """The upper end of the interval."""
+        return self.value + self.above
+
+    def widened(self, error: float) -> "Predicted":
+        """Return the value with a further 95 % error, which is independent of the others."""
+        return Predicted(self.value, math.hypot(self.below, error), math.hypot(self.above, error))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class IntervalRegressor:
     """A point regressor with intervals, the range of values, and the range of features that it was calibrated on.
@@ -79,8 +101,8 @@ class IntervalRegressor:
     timing_widening: float = 1.0
     gain: GainSpread = field(default=GainSpread(), metadata=INLINE)
 
-    def predict(self, features: FloatArray, usable_share: float = 1.0) -> tuple[float, float, float]:
-        """Return the value of (d,) features and how far its 95 % interval extends below and above it.
+    def predict(self, features: FloatArray, usable_share: float = 1.0) -> Predicted:
+        """Return the value of (d,) features with its interval.
 
         With a fraction of the channels unusable, the interval grows by the root of it.
         """
@@ -89,7 +111,8 @@ class IntervalRegressor:
         widening = 1.0 / math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
         down, up = self.gain.reach(value)
-        return value, *self._guarded(raw, value, widening, math.hypot(half, down), math.hypot(half, up))
+        below, above = self._guarded(raw, value, widening, math.hypot(half, down), math.hypot(half, up))
+        return Predicted(value, below, above)
 
     def _guarded(self, raw: float, value: float, widening: float, below: float, above: float) -> tuple[float, float]:
         """Return the interval's reach below and above a value, widened where the prediction may be wrong by more.

@@ -18,16 +18,12 @@ from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading, match_reasons
-from shearloop.estimation.fingertip_validator import (
-    LARGEST_JUMPING_FRACTION,
-    FingertipSet,
-    FingertipValidator,
-    GripDetector,
-)
+from shearloop.estimation.fingertip_validator import FingertipSet, FingertipValidator, GripDetector
 from shearloop.estimation.frame_checks import ChannelChecks, FrameTimer
 from shearloop.estimation.grip_memory import GripMemory
 from shearloop.estimation.grip_strength import strength_reasons
 from shearloop.estimation.idle_frames import IdleFrames
+from shearloop.estimation.interval_regressor import Predicted
 from shearloop.estimation.values import BeforeFrame, Estimate, GripState, Measured, ProcessedFrame, TactileFrame
 from shearloop.words import counted
 
@@ -44,10 +40,6 @@ UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}
 _UNKNOWN = (None, None, None)
 _UNCALIBRATED = ("no calibration is configured: k and sigma have no torque",)
 AMBIGUOUS = ("two positions of the bank far apart fit the frame equally well",)
-
-# A value, and its 95 % interval: how far it extends below and above, or its ends.
-Interval = tuple[float, float, float]
-
 
 # A frame is read half a period after its middle. One that is read this long after it waited for a reader that stood
 # still, and the next frame is there, or nearly.
@@ -81,7 +73,9 @@ class Session:
         self._period_s = period_s
         self._baseline_frames = baseline_frames
         self._matcher = matcher or calibration.matcher(bank)
-        self._tool_reasons: tuple[str, ...]
+        # Why the held tool leaves no torque, though there may be a diameter; empty where it does not.
+        self.why_no_torque = ""
+        self._gain = GripGain()
         self.set_tool(None)
         self.reset()
 
@@ -97,21 +91,26 @@ class Session:
             self.give_up_tare()
         if before.tool is not None:
             self.set_tool(before.tool.diameter)
-            if conflict := before.tool.conflict:
-                self._tool_reasons = (conflict,)
+            self.why_no_torque = before.tool.conflict or self.why_no_torque
 
     def set_tool(self, tool: Measured | None) -> None:
         """Set the diameter in mm of the held tool, None where unknown."""
         self._tool = tool
-        self._tool_reasons = ()
+        self.why_no_torque = ""
         try:
             self._calibration = self.calibration.for_tool(tool)
         except CalibrationError as error:
-            self._calibration, self._tool_reasons = self.calibration, (str(error),)
+            self._calibration, self.why_no_torque = self.calibration, str(error)
+        self._update_models()
 
-    def tool_note(self, source: str) -> str:
-        """Return what a torque, under the name of its source, rests on that nothing checks about the held tool."""
-        return self.calibration.tool_note(source, tool_known=self._tool is not None)
+    def _update_models(self) -> None:
+        """Choose the model of each quantity, for the held tool and with the grip's gain."""
+        self._models = self._gain.models(self._calibration, self._tool, self.calibration)
+
+    def _forget_gain(self) -> None:
+        """Forget the gain of the last grip, and its frames."""
+        self._gain = GripGain()
+        self._update_models()
 
     def tare(self, frames: int | None = None) -> None:
         """Forget the session; the next `frames` usable frames, of untouched fingertips, make the idle frame."""
@@ -124,9 +123,9 @@ class Session:
         # The (m, c) difference to the idle frame behind the last estimate, None where there was none.
         self.difference: FloatArray | None = None
         self._latest: FloatArray = np.full(self.calibration.estimator.scale.shape, np.nan)
-        self._gain = GripGain()
+        self._forget_gain()
         # The strength of the last grip by side, as a ratio of the calibrated ones.
-        self._strengths: dict[str, float] = {}
+        self.grip_strengths: dict[str, float] = {}
 
     def _begin(self, idle_frames: int) -> None:
         """Forget all frames."""
@@ -150,11 +149,6 @@ class Session:
         return {"calibration": self.calibration, "matcher": self._matcher, "search": self.search}
 
     @property
-    def why_no_torque(self) -> str:
-        """Why the held tool leaves no torque, though there may be a diameter; empty where it does not."""
-        return "; ".join(self._tool_reasons)
-
-    @property
     def taring(self) -> bool:
         """Whether frames are being averaged into the idle frame."""
         return self._idle.taring and not self._lacks_idle_frame
@@ -175,16 +169,13 @@ class Session:
                 f"{len(torque_nm)} known torques do not match the {len(self._gain.frames)} frames of this grip; twist "
                 "again, then adapt"
             )
-        if self._tool_reasons:
-            raise CalibrationError(self._tool_reasons[0])
-        if reasons := strength_reasons(self._strengths):
+        if self.why_no_torque:
+            raise CalibrationError(self.why_no_torque)
+        if reasons := strength_reasons(self.grip_strengths):
             raise CalibrationError(reasons[0])
-        return self._gain.correct(self._calibration, self._tool, self.calibration, torque_nm)
-
-    @property
-    def grip_strengths(self) -> dict[str, float]:
-        """The strength of the last grip by side, as a ratio of the calibrated ones."""
-        return dict(self._strengths)
+        adaptation = self._gain.correct(self._calibration, self._tool, self.calibration, torque_nm)
+        self._update_models()
+        return adaptation
 
     def heatmap(self) -> FloatArray | None:
         """Return the (K, S) scores of the first side's last difference, None without a bank or a difference."""
@@ -214,13 +205,13 @@ class Session:
             return Estimate(valid=False, reasons=_NO_IDLE_FRAME)
         processed = self.process(frame)
         if processed.grip is GripState.NONE:
-            self._gain = GripGain()
+            self._forget_gain()
         if processed.reasons:
             return Estimate(valid=False, reasons=processed.reasons)
         self.difference = processed.difference
         estimate = self._predict(processed, frame.t_s)
-        if not self.is_old(frame):
-            estimate = self._with_position(estimate)
+        if self.search is not None and not self.is_old(frame):
+            estimate = self._with_position(estimate, self.search)
         return replace(estimate, lag_s=processed.lag_s) if processed.lag_s else estimate
 
     def process(self, frame: TactileFrame) -> ProcessedFrame:
@@ -259,15 +250,16 @@ class Session:
                 grip.forget_steps()
             checks.restart(idle.last_tare_frame())
             missing = 0
-        channels, usable, reasons, jumping_shares = checks.check(frame)
-        if any(reasons):
+        checked = checks.check(frame)
+        channels, usable = checked.channels, checked.usable
+        if checked.reasons:
             # One garbled frame is no other fingertip: skip it like a disturbed one.
             checks.skip()
             self._memory.skip(missing)
-            return ProcessedFrame.refused(usable, *filter(None, reasons))
-        if (jumping_shares > LARGEST_JUMPING_FRACTION).any():
+            return ProcessedFrame.refused(usable, *checked.reasons)
+        if checked.disturbance:
             self._bridge(channels, missing)
-            return ProcessedFrame.refused(usable, self._fingertips.disturbance(jumping_shares))
+            return ProcessedFrame.refused(usable, checked.disturbance)
         is_first = checks.before is None
         if is_first and not idle.begun:
             checks.begin(usable)
@@ -318,10 +310,10 @@ class Session:
         memory = self._memory
         # Motion is read in volts: after a release a gel's idle voltages recover for minutes, which is no gain.
         recent = memory.remember(channels, from_idle, difference, missing)
-        self._strengths = {
-            validator.side: grip.strength.ratio for validator, grip in zip(sides, self._grips, strict=True)
+        self.grip_strengths = {
+            validator.side: grip.strength_ratio for validator, grip in zip(sides, self._grips, strict=True)
         }
-        if reasons := (recent,) if recent else strength_reasons(self._strengths):
+        if reasons := (recent,) if recent else strength_reasons(self.grip_strengths):
             return ProcessedFrame(difference, reasons, usable, GripState.HELD)
         return ProcessedFrame(
             difference,
@@ -337,19 +329,18 @@ class Session:
     def _first_difference(self) -> FloatArray | None:
         return self.difference[0] if self.difference is not None and self.difference[0].any() else None
 
-    def _with_position(self, estimate: Estimate) -> Estimate:
+    def _with_position(self, estimate: Estimate, search: "BankSearch") -> Estimate:
         """Return an estimate with its position in the searched bank."""
-        if self.search is None or not estimate.valid or estimate.k is not None:
+        difference = self._first_difference()
+        if not estimate.valid or estimate.k is not None or difference is None:
             return estimate
-        if (difference := self._first_difference()) is None:
-            return estimate
-        match = self.search.match(difference)
+        match = search.match(difference)
         return replace(estimate, k=match.k, sigma=match.sigma, score=match.score, runner_up=match.runner_up)
 
     def _predict(self, frame: ProcessedFrame, t_s: float) -> Estimate:
         calibration = self.calibration
         outputs, reasons = self._select_outputs(frame)
-        if not outputs and calibration.outputs:
+        if not outputs and self._models:
             return Estimate(valid=False, reasons=tuple(reasons))
         errors = NO_ERRORS
         if not frame.usable.all():
@@ -361,14 +352,14 @@ class Session:
             return estimate_of({}, AMBIGUOUS, match)
         if "torque" in outputs:
             self._gain.frames.append((t_s, features[calibration.estimator.columns["torque"]]))
-        values: dict[Quantity, Interval] = {}
+        values: dict[Quantity, Predicted] = {}
         for quantity, model in outputs.items():
-            value, against = self._predict_quantity(quantity, model, reading, features, errors)
+            predicted, against = self._predict_quantity(quantity, model, reading, features, errors)
             reasons |= dict.fromkeys(against)
             if not against:
-                values[quantity] = value[0], value[0] - value[1], value[0] + value[2]
+                values[quantity] = predicted
         # Tools of several diameters have a diameter where they have no torque.
-        several = calibration.tools is not None and bool(self._tool_reasons)
+        several = calibration.tools is not None and self.why_no_torque != ""
         torque_missing = calibration.torque is not None and "torque" not in values and not several
         if torque_missing:
             # A frame beyond the calibrated torques is beyond the calibrated diameters too.
@@ -377,21 +368,18 @@ class Session:
 
     def _select_outputs(self, frame: ProcessedFrame) -> tuple[dict[Quantity, OutputModel], dict[str, None]]:
         """Return the models to apply to a frame, and the reasons against the others, in order."""
-        outputs: dict[Quantity, OutputModel] = {}
-        reasons: dict[str, None] = dict.fromkeys(() if self.calibration.outputs else _UNCALIBRATED)
-        for quantity, model in self._gain.models(self._calibration, self._tool, self.calibration).items():
-            if quantity == "diameter" and not frame.has_baseline:
-                # The gel's position means nothing without its idle position.
-                continue
-            against = self._tool_reasons if quantity == "torque" else ()
-            reasons |= dict.fromkeys(against)
-            if not against:
-                outputs[quantity] = model
+        outputs = dict(self._models)
+        reasons: dict[str, None] = dict.fromkeys(() if outputs else _UNCALIBRATED)
+        if not frame.has_baseline:
+            # The gel's position means nothing without its idle position.
+            outputs.pop("diameter", None)
+        if self.why_no_torque and outputs.pop("torque", None) is not None:
+            reasons[self.why_no_torque] = None
         return outputs, reasons
 
     def _predict_quantity(
         self, quantity: Quantity, model: OutputModel, reading: Reading, features: FloatArray, errors: FloatArray
-    ) -> tuple[Interval, tuple[str, ...]]:
+    ) -> tuple[Predicted, tuple[str, ...]]:
         """Return one quantity with its interval, and the reasons against it.
 
         Imputed channels have the (k, m, c) errors, one standard deviation each.
@@ -399,23 +387,26 @@ class Session:
         frame, estimator = reading.frame, self.calibration.estimator
         features = estimator.inputs(quantity, features, reading)
         usable_share = np.count_nonzero(frame.usable) / frame.usable.size
-        value = model.regressor.predict(features, usable_share)
+        predicted = model.regressor.predict(features, usable_share)
         dead: tuple[str, ...] = ()
         if len(errors):
             changed = [self._regressor_inputs(quantity, reading, frame.difference + error) for error in errors]
-            error = TWO_SIDED_95 * math.hypot(*(model.regressor.predict(inputs)[0] - value[0] for inputs in changed))
+            moved = (model.regressor.predict(inputs).value - predicted.value for inputs in changed)
+            error = TWO_SIDED_95 * math.hypot(*moved)
             # The gain's error is the same with all channels.
-            reach = model.regressor.gain.reach(value[0])
-            own = [math.sqrt(max(ends[0] ** 2 - ends[1] ** 2, 0.0)) for ends in zip(value[1:], reach, strict=True)]
-            if 2 * error > sum(own):
+            down, up = model.regressor.gain.reach(predicted.value)
+            own_below = math.sqrt(max(predicted.below**2 - down**2, 0.0))
+            own_above = math.sqrt(max(predicted.above**2 - up**2, 0.0))
+            if 2 * error > own_below + own_above:
                 # The dead channels carried the value; the imputed ones are a guess.
                 dead = _dead_channel_reasons(self.calibration.validators, frame.usable)
-            value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)
+            predicted = predicted.widened(error)
         if quantity == "diameter":
-            error = estimator.position_noise_mm(model.regressor) / math.sqrt(frame.held_frames)
-            value = value[0], math.hypot(value[1], error), math.hypot(value[2], error)
+            noise_mm = estimator.position_noise_mm(model.regressor) / math.sqrt(frame.held_frames)
+            predicted = predicted.widened(noise_mm)
         against = dead or tuple(why for match in reading.matches[:1] for why in match_reasons(model.k_range, match))
-        return value, against or model.regressor.range_reasons(value[0], features, quantity, UNITS[quantity])
+        beyond = model.regressor.range_reasons(predicted.value, features, quantity, UNITS[quantity])
+        return predicted, against or beyond
 
     def _regressor_inputs(self, quantity: Quantity, reading: Reading, difference: FloatArray) -> FloatArray:
         """Return the regressor's inputs if this were the frame's difference."""
@@ -438,9 +429,10 @@ def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: Bo
     )
 
 
-def estimate_of(values: Mapping[Quantity, Interval], reasons: Iterable[str], match: "BankMatch | None") -> Estimate:
+def estimate_of(values: Mapping[Quantity, Predicted], reasons: Iterable[str], match: "BankMatch | None") -> Estimate:
     """Return the estimate of values with the ends of their intervals."""
-    torque, diameter = values.get("torque", _UNKNOWN), values.get("diameter", _UNKNOWN)
+    ends = {quantity: (one.value, one.low, one.high) for quantity, one in values.items()}
+    torque, diameter = ends.get("torque", _UNKNOWN), ends.get("diameter", _UNKNOWN)
     estimate = Estimate(bool(values), () if values else tuple(reasons), *torque, *diameter)
     if match is None:
         return estimate

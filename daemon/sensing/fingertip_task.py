@@ -97,6 +97,8 @@ class FingertipTask:
     # Why the frames of the present tare gave no estimate.
     _refused: CountedReasons = field(default_factory=CountedReasons)
     _held: HeldTool = field(default_factory=lambda: HeldTool(None))
+    # What the torque rests on that nothing checks about the held tool.
+    _tool_note: str = field(init=False)
     # Whether an idle frame was taken without a request, before the gripper has reported that it held nothing.
     _unconfirmed: bool = field(init=False)
     # The step that waits for a correction of the gain, which the next frame makes.
@@ -105,6 +107,7 @@ class FingertipTask:
     def __post_init__(self) -> None:
         """Begin: a session of the paper's method takes an idle frame without a request."""
         self._unconfirmed = self.session.taring
+        self._tool_note = self._note_of(self._held)
 
     async def process(self, *frames: Frame) -> None:
         """Estimate from the frames of one time, hand the estimate to the control loop, and publish it."""
@@ -125,7 +128,7 @@ class FingertipTask:
             t_mid_ns = message.t_mono_ns - round(1e9 * estimate.lag_s)
             # An estimate is valid also with a diameter alone.
             reason = message.reason or self.session.why_no_torque
-            note = "" if estimate.torque_nm is None else self.session.tool_note(self.name)
+            note = "" if estimate.torque_nm is None else self._tool_note
             self.loop.on_torque(TorqueSample(self.name, estimate.torque_nm, reason, t_mid_ns, now_ns, note=note))
         if self.gripper is not None:
             self.gripper.diameters.update(self.name, estimate, now_ns)
@@ -202,7 +205,13 @@ class FingertipTask:
         before = self._held
         measured = self.gripper.held_tool(now_ns) if self.gripper is not None else None
         self._held = HeldTool(measured, self.loop.stated_tool_mm if self.loop is not None else None)
-        return None if self._held == before else self._held
+        if self._held == before:
+            return None
+        self._tool_note = self._note_of(self._held)
+        return self._held
+
+    def _note_of(self, tool: HeldTool) -> str:
+        return self.session.calibration.tool_note(self.name, tool_known=tool.diameter is not None)
 
     def _fingers_moved(self, frames: tuple[Frame, ...]) -> bool:
         """Return whether the fingers moved during any part of the frames' acquisition."""

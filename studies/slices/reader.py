@@ -9,7 +9,8 @@ from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import Estimate, TactileFrame
 from shearloop.estimation.estimator import Quantity, Reading, match_reasons
-from shearloop.estimation.session import AMBIGUOUS, UNITS, Interval, estimate_of
+from shearloop.estimation.interval_regressor import Predicted
+from shearloop.estimation.session import AMBIGUOUS, UNITS, estimate_of
 from shearloop.estimation.values import ProcessedFrame
 from shearloop.studies.slices.calibration import SliceCalibration, SliceModel
 from shearloop.studies.slices.estimators import ignores_nan, uses_amplitude
@@ -49,21 +50,21 @@ class SliceReader:
         match = next(iter(reading.matches), None)
         if reading.is_ambiguous:
             return estimate_of({}, AMBIGUOUS, match)
-        values: dict[Quantity, Interval] = {}
+        values: dict[Quantity, Predicted] = {}
         for quantity, model in models.items():
-            value, below, above = self._predict(quantity, model, reading)
+            predicted = self._predict(quantity, model, reading)
             against = () if match is None else match_reasons(model.k_range, match)
-            against = against or model.regressor.range.reasons(value, quantity, UNITS[quantity])
+            against = against or model.regressor.range.reasons(predicted.value, quantity, UNITS[quantity])
             reasons |= dict.fromkeys(against)
             if not against:
-                values[quantity] = value, value - below, value + above
+                values[quantity] = predicted
         return estimate_of(values, reasons, match)
 
     def _read(self, differences: FloatArray, usable: BoolArray, t_s: float) -> Reading:
         return Reading.of(ProcessedFrame(differences, (), usable), t_s, self._matcher)
 
-    def _predict(self, quantity: Quantity, model: SliceModel, reading: Reading) -> Interval:
-        """Return one quantity, and how far its 95 % interval extends below and above."""
+    def _predict(self, quantity: Quantity, model: SliceModel, reading: Reading) -> Predicted:
+        """Return one quantity with its interval."""
         estimator, frame = self.calibration.estimator, reading.frame
         features, complete = estimator.inputs(quantity, estimator.features(reading), reading), None
         if quantity == "torque" and uses_amplitude(estimator):

@@ -20,7 +20,7 @@ from shearloop.estimation.interval_fit import (
     fit_intervals,
     student_inflation,
 )
-from shearloop.estimation.interval_regressor import Intervals
+from shearloop.estimation.interval_regressor import Intervals, Predicted
 from shearloop.estimation.left_out import LeftOut, left_out_blocks
 from shearloop.estimation.values import INLINE
 from shearloop.studies.slices.curve import CurveMean
@@ -42,10 +42,8 @@ class SliceRegressor:
     mean_feature: FloatArray
     line: SlicePoint | None = None
 
-    def predict(
-        self, features: FloatArray, usable_share: float = 1.0, complete: FloatArray | None = None
-    ) -> tuple[float, float, float]:
-        """Return the value of (d,) features and how far its 95 % interval extends below and above it.
+    def predict(self, features: FloatArray, usable_share: float = 1.0, complete: FloatArray | None = None) -> Predicted:
+        """Return the value of (d,) features with its interval.
 
         With a fraction of the channels unusable, the interval grows by the root of it. `complete` (d,) are the features
         with a response that may be missing: the interval extends to their value.
@@ -55,7 +53,8 @@ class SliceRegressor:
         widening = 1.0 / math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(value)
         moved = others[0] - value if others else 0.0
-        return value, *self._guarded(features, value, half + max(-moved, 0.0), half + max(moved, 0.0))
+        below, above = self._guarded(features, value, half + max(-moved, 0.0), half + max(moved, 0.0))
+        return Predicted(value, below, above)
 
     def _guarded(self, features: FloatArray, value: float, below: float, above: float) -> tuple[float, float]:
         """Return the interval's reach below and above a value, widened for values that the prediction may hide."""

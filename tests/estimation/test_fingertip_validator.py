@@ -67,14 +67,14 @@ def test_each_side_is_compared_with_its_own_fingertip_whatever_the_other_says(re
         frame[1] = frame[1, ::-1] if number % 4 == 0 else frame[1]
         frame[:, :40] += 0.05 * random.random()
         why, lost = both.check(frame, usable)
-        jumps = both.jumping_shares(frame, before, usable)
+        jumps = both.jumping_fractions(frame, before, usable)
         for layer, (one, side) in enumerate(zip(alone, sides, strict=True)):
             own = slice(layer, layer + 1)
             own_why, own_lost = one.check(frame[own], usable[own])
             assert own_why == why[own]
             np.testing.assert_array_equal(own_lost, lost[own])
             np.testing.assert_array_equal(lost[layer], lost_channels(side, frame[layer], usable[layer]))
-            assert one.jumping_shares(frame[own], before[own], usable[own]) == jumps[own]
+            assert one.jumping_fractions(frame[own], before[own], usable[own]) == jumps[own]
             moved = np.abs(frame[layer] - before[layer])[usable[layer]]
             limit = np.maximum(_JUMP_NOISES * np.sqrt(2.0) * side.noise, _JUMP_V)[usable[layer]]
             assert jumps[layer] == np.mean(moved > limit)

@@ -249,9 +249,8 @@ def test_a_tool_that_is_stated_or_measured_has_a_torque_only_if_it_is_the_calibr
     ],
 )
 def test_what_nothing_checks_about_the_tool_is_said(motion_calibration, calibrated_mm, held, said):
-    session = Session(replace(motion_calibration, tool_mm=calibrated_mm))
-    session.prepare(BeforeFrame(tool=held))
-    note = session.tool_note("right")
+    calibration = replace(motion_calibration, tool_mm=calibrated_mm)
+    note = calibration.tool_note("right", tool_known=held.diameter is not None)
     assert said in note
     assert bool(note) is bool(said)
 

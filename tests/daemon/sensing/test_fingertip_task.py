@@ -63,6 +63,10 @@ class RecordingPublisher:
         return [number for *found, number in self.messages if found == [topic, source]]
 
 
+def note_of(source: str, *, tool_known: bool) -> str:
+    return "" if tool_known else f"the tool of {source} is not known"
+
+
 class FakeSession:
     """Estimates nothing; frame `fails` raises, frame `waits` waits for `go_on`. Keeps the frames after tares.
 
@@ -72,7 +76,7 @@ class FakeSession:
     taring = False
     reason = "nothing"
     why_no_torque = ""
-    calibration = SimpleNamespace(sides=("right", "left"), table=PAPER_TABLE)
+    calibration = SimpleNamespace(sides=("right", "left"), table=PAPER_TABLE, tool_note=note_of)
     fixed: Mapping[str, object] = MappingProxyType({})
 
     def __init__(self, fails: int = -1, waits: int = -1) -> None:
@@ -196,6 +200,24 @@ async def test_the_loop_gets_the_reason_why_a_valid_estimate_has_no_torque():
     loop = SimpleNamespace(on_torque=heard.append, stated_tool_mm=None)
     await estimates("right", RecordingPublisher(), DiameterAlone(), loop=loop).process(frame(0))
     assert [(one.torque_nm, one.reason) for one in heard] == [(None, "there is no torque without the tool's diameter")]
+
+
+async def test_a_torque_notes_that_the_tool_is_not_known_until_an_experiment_states_it():
+    class Torque(FakeSession):
+        def set_tool(self, tool: Measured | None) -> None:
+            pass
+
+        def estimate(self, _frame: TactileFrame) -> Estimate:
+            return Estimate(valid=True, torque_nm=0.1, torque_low_nm=0.0, torque_high_nm=0.2)
+
+    heard: list[TorqueSample] = []
+    loop = SimpleNamespace(on_torque=heard.append, stated_tool_mm=None)
+    task = estimates("right", RecordingPublisher(), Torque(), loop=loop)
+    for number, stated_mm in enumerate((None, 20.0, 20.0, None)):
+        loop.stated_tool_mm = stated_mm
+        await task.process(frame(number))
+    unknown = "the tool of right is not known"
+    assert [one.note for one in heard] == [unknown, "", "", unknown]
 
 
 async def test_the_tool_that_an_experiment_states_is_known_before_a_frame_and_recorded_once():

@@ -30,7 +30,7 @@ from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.errors import UserError
 from shearloop.files import read_file
-from shearloop.mistakes import shown
+from shearloop.models import shown
 from shearloop.timeouts import timeout
 from shearloop.words import counted
 from shearloop.yaml_files import Document

@@ -24,7 +24,7 @@ from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import Six
 from shearloop.files import read_file, replace_file
-from shearloop.mistakes import validated
+from shearloop.models import validated
 
 VERSION = 1
 # The file is written at this interval, and at the start of each experiment.

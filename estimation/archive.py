@@ -23,7 +23,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.estimator import Estimator
 from shearloop.estimation.values import INLINE
 from shearloop.files import open_file, refusing_damage, replace_file
-from shearloop.mistakes import shown
+from shearloop.models import shown
 from shearloop.yaml_files import parse_yaml
 
 # First bytes of a zip that is not empty.

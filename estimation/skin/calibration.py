@@ -28,7 +28,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.skin.membrane import PAPER_SECTION, UNSTRETCHED, Belt, Direction, ShearInterval, direction_of
 from shearloop.files import open_file
-from shearloop.mistakes import validated
+from shearloop.models import validated
 from shearloop.words import counted
 from shearloop.yaml_files import read_yaml, save_yaml
 

@@ -1,4 +1,4 @@
-"""Loads outside data into pydantic models, and describes each of its mistakes in one line of plain words.
+"""Describes each mistake of outside data in one line of plain words.
 
 A line names the key, the present value, the allowed values, and the probable intention if that helps: `loop.kp: 'a' is
 not a number; allowed: from 0 to 10`. With the nodes of a YAML file it begins with the file's line.
@@ -6,30 +6,24 @@ not a number; allowed: from 0 to 10`. With the nodes of a YAML file it begins wi
 
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import yaml
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from shearloop.models import adapter_of, shown
 from shearloop.units import unit_hint, unit_of
 from shearloop.words import counted
 
-Model = TypeVar("Model")
-
-_LONGEST_VALUE = 60
 # A decimal with a comma, as German and French have it, and the cure.
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
 _POINT = "; the decimal sign is a point: 0.1, not 0,1"
 # The largest number of mistakes that are shown for one file.
 _MAX_MISTAKES = 100
-
-# Making an adapter takes longer than reading a file.
-_adapter_of: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
 
 # The library's words for frequent mistakes, and ours.
 _WRONG = (
@@ -56,20 +50,6 @@ _WRONG = (
 )
 
 
-def validated(content: object, model: type[Model], where: str, raises: type[Exception], *, cure: str = "") -> Model:
-    """Return the content as a model; each line of the message begins with `where`, and the last ends with `cure`."""
-    try:
-        return as_model(content, model)
-    except ValidationError as error:
-        raise raises("\n".join(mistake_lines(error, model, content, where)) + cure) from error
-
-
-def as_model(content: object, model: type[Model], folder: Path | None = None) -> Model:
-    """Return the content as a model; raises ValidationError. Its validators get the `folder`."""
-    adapter: TypeAdapter[Model] = _adapter_of(model)
-    return adapter.validate_python(content, context=folder and {"folder": folder})
-
-
 def first_key(model: type) -> str:
     """Return the first key of a model, as an example."""
     return next(iter(_schema_of(model)["properties"]), "key")
@@ -84,7 +64,7 @@ def keys_of(model: type) -> Collection[str]:
 @cache
 def _schema_of(model: type) -> dict[str, Any]:
     """Return the JSON Schema of a model; callers must not change it."""
-    return _adapter_of(model).json_schema()
+    return adapter_of(model).json_schema()
 
 
 def mistake_lines(
@@ -260,9 +240,3 @@ def _allowed(schema: Mapping[str, Any]) -> str:
         return ", ".join(map(str, schema["enum"]))
     bounds = {"exclusiveMinimum": "above", "minimum": "from", "exclusiveMaximum": "below", "maximum": "to"}
     return " ".join(f"{word} {schema[name]:g}" for name, word in bounds.items() if name in schema)
-
-
-def shown(value: object) -> str:
-    """Return a value of a file for a message, at most 60 characters."""
-    text = repr(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"

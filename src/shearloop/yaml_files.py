@@ -1,14 +1,13 @@
 """YAML files: read with unique keys, checked by pydantic, and replaced at once when written.
 
 Each caller names the exception to raise. Its message has a line for each mistake: `file:line: key: the mistake;
-allowed: …; did you mean …?`.
+allowed: …; did you mean …?`. The modules that tell mistakes are imported where one is told.
 """
 
 import copy
 import re
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,11 +15,8 @@ import yaml
 from pydantic import ValidationError
 
 from shearloop.files import read_file, replace_file
-from shearloop.mistakes import Model, as_model, first_key, keys_of, mistake_lines, place_of, shown
+from shearloop.models import Model, as_model, shown
 
-_SUFFIXES = (".yaml", ".yml")
-# So many files with near names are looked into, to see which may be meant.
-_LOOKED_AT = 5
 # Of Linux.
 _LONGEST_NAME, _LONGEST_PATH = 255, 4096
 # Bounds on what a file may cost: its bytes, and its values with every alias written out.
@@ -119,7 +115,9 @@ class Document:
         try:
             data = read_file(path, most_bytes)
         except OSError as error:
-            raise raises(f"{path}: the {what} cannot be read: {error.strerror}{_meant(path, model)}{cure}") from error
+            from shearloop.yaml_mistakes import meant
+
+            raise raises(f"{path}: the {what} cannot be read: {error.strerror}{meant(path, model)}{cure}") from error
         return cls.parse(path, data, raises, what)
 
     @classmethod
@@ -130,14 +128,15 @@ class Document:
             root = loader.get_single_node()
             content = loader.construct_document(root) if root is not None else None
         except UnicodeDecodeError as error:
-            # Only this mistake needs the module.
             from shearloop.binary_files import why_no_text
 
             raise raises(f"{path}: the {what} {why_no_text(data, error.start)}") from error
         except yaml.MarkedYAMLError as error:
+            from shearloop.yaml_mistakes import syntax
+
             mark = error.problem_mark or error.context_mark
             where = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
-            raise raises(f"{where}: {_syntax(error)}") from error
+            raise raises(f"{where}: {syntax(error)}") from error
         except yaml.YAMLError as error:
             raise raises(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
         except RecursionError as error:
@@ -149,30 +148,33 @@ class Document:
     def model(self, model: type[Model]) -> Model:
         """Return the content as a pydantic model or dataclass; its validators get the file's `folder`."""
         if not isinstance(self.content, dict):
+            from shearloop.mistakes import first_key
+
             raise self.raises(f"{self.path}: expected keys and values such as `{first_key(model)}: …`")
+        content = self._with_expected_texts(model)
         try:
-            return as_model(self.content, model, self.path.resolve().parent)
+            return as_model(content, model, self.path.resolve().parent)
         except ValidationError as error:
-            if texts := self._expected_texts(error):
-                return self._with_texts(texts).model(model)
-            raise self.raises(
-                "\n".join(mistake_lines(error, model, self.content, str(self.path), self._root))
-            ) from error
+            from shearloop.mistakes import mistake_lines
 
-    def _expected_texts(self, error: ValidationError) -> dict[tuple[int | str, ...], str]:
-        """Return the given values, as they were written, where a text or a path is expected."""
-        places = [one["loc"] for one in error.errors() if one["type"] in ("string_type", "path_type")]
-        return {place: self._given[place] for place in places if place in self._given}
+            lines = mistake_lines(error, model, content, str(self.path), self._root)
+            raise self.raises("\n".join(lines)) from error
 
-    def _with_texts(self, texts: Mapping[tuple[int | str, ...], str]) -> Self:
-        content = copy.deepcopy(self.content)
-        for place, text in texts.items():
-            section = content
-            for part in place[:-1]:
-                section = section[part]
-            section[place[-1]] = text
-        others = {place: text for place, text in self._given.items() if place not in texts}
-        return type(self)(self.path, content, self.raises, self._root, others)
+    def _with_expected_texts(self, model: type[Any]) -> Any:
+        """Return the content with the values that were given as they were written, where the model expects a text."""
+        content, given = self.content, dict(self._given)
+        while given:
+            try:
+                as_model(content, model, self.path.resolve().parent)
+            except ValidationError as error:
+                places = [one["loc"] for one in error.errors() if one["type"] in ("string_type", "path_type")]
+            else:
+                break
+            texts = {place: given.pop(place) for place in places if place in given}
+            if not texts:
+                break
+            content = _with_texts(content, texts)
+        return content
 
     def with_values(self, values: Mapping[str, str]) -> Self:
         """Return the document with other values, given as YAML by their keys, such as `loop.kp` or `steps.0`.
@@ -185,7 +187,9 @@ class Document:
             try:
                 value = yaml.load(text, _Loader)  # noqa: S506 - it is a SafeLoader
             except yaml.MarkedYAMLError as error:
-                raise self.raises(f"{key}={text}: the value is not YAML: {_syntax(error)}") from error
+                from shearloop.yaml_mistakes import syntax
+
+                raise self.raises(f"{key}={text}: the value is not YAML: {syntax(error)}") from error
             *sections, last = key.split(".")
             section = content
             for number, name in enumerate(sections):
@@ -214,8 +218,12 @@ class Document:
             raise self.raises(f"{self.path}: {key} is a list of {len(section)}, so {name} is not one of its numbers")
         return int(name)
 
-    def located(self, mistakes: Iterable[tuple[tuple[int | str, ...], str]]) -> list[str]:
+    def located(self, mistakes: Sequence[tuple[tuple[int | str, ...], str]]) -> list[str]:
         """Return `file:line: key: sentence` for each mistake, given by its location in the content."""
+        if not mistakes:
+            return []
+        from shearloop.mistakes import place_of
+
         found = []
         for location, sentence in mistakes:
             key, line = place_of(location, self.content, self._root, missing=True)
@@ -223,33 +231,15 @@ class Document:
         return [text for _, text in sorted(found)]
 
 
-def _meant(path: Path, model: type[Any] | None) -> str:
-    """Return which YAML file was probably meant by the path of a folder, or of no file; empty where none is near."""
-    folder = path if path.is_dir() else path.parent
-    try:
-        names = sorted(one.name for one in folder.iterdir() if one.suffix in _SUFFIXES)
-    except OSError:
-        return ""
-    if folder is path:
-        # A folder of `init` has its configuration under this name.
-        near = ["rig.yaml"] if "rig.yaml" in names else names
-    else:
-        near = get_close_matches(path.name, [name for name in names if name != path.name], _LOOKED_AT)
-    near = [name for name in near[:_LOOKED_AT] if model is None or _may_be(folder / name, model)]
-    return f"; did you mean {folder / near[0]}?" if near else ""
-
-
-def _may_be(path: Path, model: type[Any]) -> bool:
-    """Return whether a file may be meant for a model: most of its keys are the model's, or it cannot be known."""
-    try:
-        content = parse_yaml(read_file(path, MAX_BYTES))
-    except OSError:
-        return False
-    except (yaml.YAMLError, ValueError, RecursionError):
-        return True
-    if content is None:
-        return True
-    return isinstance(content, dict) and 2 * sum(key in keys_of(model) for key in content) >= len(content)
+def _with_texts(content: Any, texts: Mapping[tuple[int | str, ...], str]) -> Any:
+    """Return the content with these texts at their places."""
+    changed = copy.deepcopy(content)
+    for place, text in texts.items():
+        section = changed
+        for part in place[:-1]:
+            section = section[part]
+        section[place[-1]] = text
+    return changed
 
 
 def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Any:
@@ -278,23 +268,3 @@ def save_yaml(path: Path, content: Mapping[str, Any], raises: type[Exception]) -
             file.write(yaml.safe_dump(content, sort_keys=False, allow_unicode=True).encode())
     except OSError as error:
         raise raises(f"{path}: the calibration cannot be written: {error.strerror}") from error
-
-
-# The library's words for frequent mistakes, and ours.
-_SYNTAX = (
-    ("found character '\\t'", "a tab indents this line; use spaces"),
-    ("mapping values are not allowed", "a second `:` stands in this line, or the line before is indented otherwise"),
-    ("could not find expected ':'", "a key without its `:`"),
-    ("expected <block end>", "this line is indented otherwise than those above"),
-    ("expected ',' or ']'", "a list is not closed: `,` or `]` is missing"),
-    ("expected ',' or '}'", "a section is not closed: `,` or `}` is missing"),
-    ("found unhashable key", "a key is a list or a section; a name is expected"),
-    ("could not determine a constructor", "the keys `<<` and `=` are not supported"),
-    ("but found another document", "a second document begins here; a file has one"),
-    ("found undefined alias", "an alias `*name` without its anchor `&name`"),
-)
-
-
-def _syntax(error: yaml.MarkedYAMLError) -> str:
-    problem = str(error.problem or error.context)
-    return next((words for begin, words in _SYNTAX if problem.startswith(begin)), problem)

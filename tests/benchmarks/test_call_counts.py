@@ -22,6 +22,8 @@ def test_the_daemon_loads_nothing_but_what_runs_on_the_robots_pc():
     unneeded = [f"shearloop.daemon.{name}" for name in ("recorder", "sensing.snapshots", "sensing.session_inputs")]
     assert set(unneeded).isdisjoint(loaded.modules), "without a recording nothing of the recorder's is loaded"
     assert "shearloop.drivers.ur.receiver" not in loaded.modules, "the worker talks to the control box"
+    of_mistakes = ("shearloop.mistakes", "shearloop.units", "shearloop.yaml_mistakes")
+    assert not set(of_mistakes) & set(loaded.modules), "only a mistake in a file needs them"
 
 
 def test_sensors_alone_load_neither_control_loop_nor_drivers_of_robot_and_gripper():

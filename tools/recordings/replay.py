@@ -43,7 +43,7 @@ from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.estimation import BeforeFrame, HeldTool, Session
-from shearloop.mistakes import validated
+from shearloop.models import validated
 from shearloop.tools.recordings.before_frame import SESSION_KINDS, before_frame
 from shearloop.tools.recordings.message_content import ContentError
 from shearloop.tools.recordings.reader import open_recording, reading

@@ -3,6 +3,7 @@
 It imports little: the worker has to answer within seconds.
 """
 
+import inspect
 import json
 import sys
 import threading
@@ -86,9 +87,14 @@ class WayTrace(Trace):
 
 
 def functions_of(calls: Iterable[CodeType]) -> Way:
-    """Return the package's functions among calls, in the order of their first calls."""
+    """Return the package's functions among calls, in the order of their first calls.
+
+    A module that is imported late calls the bodies of its classes too, which are no functions.
+    """
     found: dict[Function, None] = {}
     for code in calls:
+        if not code.co_flags & inspect.CO_OPTIMIZED:
+            continue
         module = module_of(code.co_filename)
         if module is not None and not code.co_name.startswith("<"):
             found[module, code.co_qualname] = None

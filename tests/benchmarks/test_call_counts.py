@@ -1,9 +1,11 @@
 """What `shearloop run` loads of the package, and what the benchmark counts."""
 
+from types import CodeType
+
 import pytest
 
 from benchmarks.call_counts import counts, loaded_by_run
-from benchmarks.call_trace import Trace, WayTrace
+from benchmarks.call_trace import Trace, WayTrace, functions_of
 from shearloop import units
 
 # Of the package, in all modules that `shearloop run` loads: for sensors alone, and with a robot.
@@ -61,6 +63,13 @@ def test_each_function_of_the_package_counts_once(installed):
     assert way == (("shearloop/units.py", "unit_of"),)
     assert counts(way) == {"functions": 1, "modules": 1}
     assert trace.take() == ()
+
+
+def test_the_body_of_a_class_is_no_function():
+    module = compile("class Late:\n    def method(self): pass", units.__file__, "exec")
+    (body, *_) = [constant for constant in module.co_consts if isinstance(constant, CodeType)]
+    (method, *_) = [constant for constant in body.co_consts if isinstance(constant, CodeType)]
+    assert functions_of([module, body, method]) == (("shearloop/units.py", "Late.method"),)
 
 
 def test_a_way_continues_in_other_functions_until_its_end(installed):

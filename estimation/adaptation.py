@@ -11,7 +11,7 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.estimator import OutputModel, Quantity
-from shearloop.estimation.gain import GainCorrection
+from shearloop.estimation.gain_correction import GainCorrection
 from shearloop.estimation.twists import find_twists, first_twists
 from shearloop.estimation.values import Measured
 

@@ -14,7 +14,8 @@ from shearloop.estimation.archive import Format
 from shearloop.estimation.estimator import Estimator, OutputModel, Quantity
 from shearloop.estimation.estimator_names import estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator
-from shearloop.estimation.gain import GainCorrection, ToolLaw
+from shearloop.estimation.gain import ToolLaw
+from shearloop.estimation.gain_correction import GainCorrection, adapt_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import UNKNOWN_FRAMES, LearnedFrames
 from shearloop.estimation.ridge import CensoredRidge
@@ -127,7 +128,7 @@ class Calibration:
         """
         torque, regressor = self.torque, self.gain_regressor()
         sides = self.estimator.side_of_features(len(regressor.mean_feature))
-        adapted, correction = regressor.adapt(features, torque_nm, sides, first)
+        adapted, correction = adapt_regressor(regressor, features, torque_nm, sides, first)
         return replace(self, torque=torque and replace(torque, regressor=adapted)), correction
 
     @classmethod

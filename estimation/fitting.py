@@ -26,7 +26,9 @@ from shearloop.estimation.estimator import (
     Reading,
 )
 from shearloop.estimation.estimator_names import EstimatorName, estimator_class
-from shearloop.estimation.gain import GainCorrection, ToolLaw
+from shearloop.estimation.gain import ToolLaw
+from shearloop.estimation.gain_correction import GainCorrection
+from shearloop.estimation.gain_fit import fit_tool_law
 from shearloop.estimation.grips import Grip, find_grips
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import LearnedFrames
@@ -218,7 +220,7 @@ def _fit_tools(
         return None
     gains = np.array([np.sqrt((torque_nm[rows] ** 2).mean()) for rows in each])
     estimator, regressor, _ = estimator.fit_torque(features, sign * torque_nm / gains[recording], None, rows.grip)
-    return estimator, regressor, ToolLaw.fit(diameters_mm, gains)
+    return estimator, regressor, fit_tool_law(diameters_mm, gains)
 
 
 def _have_torque_in_common(features: FloatArray, torque_nm: FloatArray, each: Sequence[IntArray]) -> bool:

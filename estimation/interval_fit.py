@@ -15,6 +15,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
 from shearloop.estimation.gain import GainSpread
+from shearloop.estimation.gain_fit import fit_gain_spread
 from shearloop.estimation.interval_regressor import IntervalRegressor, Intervals, Regressor, ValueRange, reported_values
 from shearloop.estimation.left_out import LeftOut, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.ridge import STRENGTHS, CensoredRidge, Predictor
@@ -215,7 +216,7 @@ def _spread_of_gain(
     order = np.argsort(rows, kind="stable")
     rows, predicted = rows[order], predicted[order]
     is_first = first_twists(values, grips)
-    return GainSpread.fit(predicted, values[rows], grips[rows], is_first[rows], gains, halves, fingertips)
+    return fit_gain_spread(predicted, values[rows], grips[rows], is_first[rows], gains, halves, fingertips)
 
 
 def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:

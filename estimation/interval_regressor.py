@@ -11,12 +11,10 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.bank.errors import CalibrationError
+from shearloop.bank.arrays import FloatArray
 from shearloop.estimation.confidence import TWO_SIDED_95
-from shearloop.estimation.gain import GainCorrection, GainSpread
+from shearloop.estimation.gain import GainSpread
 from shearloop.estimation.ridge import CensoredRidge, Predictor, Ridge
-from shearloop.estimation.twists import LOADED_FRACTION, find_twists
 from shearloop.estimation.values import INLINE
 
 Regressor: TypeAlias = Ridge | CensoredRidge
@@ -136,44 +134,6 @@ class IntervalRegressor:
             range=self.range.scaled(factor),
             gain=replace(self.gain, between=spread, zero=spread, noise_nm=factor * self.gain.noise_nm),
         )
-
-    def adapt(
-        self, features: FloatArray, torque_nm: FloatArray, sides: IntArray, first: BoolArray | None = None
-    ) -> "tuple[IntervalRegressor, GainCorrection]":
-        """Return the regressor with each side's gain corrected by (n, d) features of known torques (n,).
-
-        `sides` (d,) is the side of each feature, `first` (n,) marks frames of the first twist after a grip. Raises
-        CalibrationError without a load that is large enough to show the gain.
-        """
-        point = self.point
-        least_nm = LOADED_FRACTION * max(abs(self.range.low), abs(self.range.high))
-        twists = [twist for twist in find_twists(torque_nm) if np.abs(torque_nm[twist]).max() >= least_nm]
-        if not twists:
-            raise CalibrationError(
-                f"no twist reaches {least_nm:.3g} N·m while an estimate is possible; twist further, some seconds "
-                "after the grip"
-            )
-        sign = point.sign if isinstance(point, CensoredRidge) else 1.0
-        m, weighted = int(sides.max()) + 1, features * point.weights
-        constant = point.offset - float(point.mean @ point.weights)
-        parts = np.array([weighted[:, sides == side].sum(axis=1) + constant / m for side in range(m)]).T
-        correction = self.gain.correct(
-            parts, sign * torque_nm, twists, first=first, bounded=isinstance(point, CensoredRidge)
-        )
-        factors, loaded = correction.factors, np.concatenate(twists)
-        # Torques of both directions would cancel in a sum.
-        before = parts[loaded].sum(axis=1)
-        total = float(parts[loaded] @ factors @ before / (before @ before))
-        weights, larger = point.weights * factors[sides], max(total, 1.0)
-        offset = constant * float(factors.mean()) + float(point.mean @ weights) + correction.offset_nm
-        adapted = replace(
-            self,
-            point=replace(point, weights=weights, offset=offset),
-            intervals=Intervals(self.intervals.edges * total, self.intervals.half_widths * larger),
-            range=self.range.scaled(larger),
-            gain=correction.spread,
-        )
-        return adapted, correction
 
     def range_reasons(self, value: float, features: FloatArray, quantity: str, unit: str) -> tuple[str, ...]:
         """Return the reason against a value or features beyond the calibration, if there is one."""

@@ -11,7 +11,7 @@ from shearloop.bank.bank_file import Bank
 from shearloop.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
 from shearloop.estimation.bank_match import find_numberings
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.estimation.gain import GainCorrection
+from shearloop.estimation.gain_correction import GainCorrection
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.series import distinct
 from shearloop.estimation.values import Measured

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.gain import FIRST_SPREAD, PRIOR_SPREADS, TOOL_SPREAD, GainSpread, ToolLaw
+from shearloop.estimation.gain import FIRST_SPREAD, GainSpread
+from shearloop.estimation.gain_correction import adapt_regressor, correct_gain
+from shearloop.estimation.gain_fit import PRIOR_SPREADS, TOOL_SPREAD, fit_gain_spread, fit_tool_law
 from shearloop.estimation.interval_fit import fit_interval_regressor
 from shearloop.estimation.ridge import CensoredRidge, Ridge
 from shearloop.estimation.twists import find_twists, first_twists, loaded_log_gain
@@ -49,7 +51,7 @@ def spread_of(factors, left_out=(), first=1.0, halves=()):
     truth = np.concatenate([factor * TWISTS[:8] for factor in (first, *factors)])
     predicted = np.tile(TWISTS[:8], 1 + len(factors))
     grips = np.zeros(len(truth), dtype=int)
-    return GainSpread.fit(predicted, truth, grips, first_twists(truth, grips), left_out, halves, 1)
+    return fit_gain_spread(predicted, truth, grips, first_twists(truth, grips), left_out, halves, 1)
 
 
 @pytest.mark.parametrize(("gains", "bounds"), [([1.0] * 6, (0.0, 0.7)), ([0.4, 2.5] * 3, (1.5, 6.0))])
@@ -63,7 +65,7 @@ def test_the_gain_of_a_tool_does_not_count_as_a_difference_between_twists():
     factors = np.repeat([0.5, 1.0, 2.0], 5 * 8)
     predicted = np.tile(TWISTS[:8], 15)
     truth, grips = factors * predicted, np.repeat([0, 1, 2], 5 * 8)
-    spread = GainSpread.fit(predicted, truth, grips, first_twists(truth, grips), [], [], 1)
+    spread = fit_gain_spread(predicted, truth, grips, first_twists(truth, grips), [], [], 1)
     assert spread.within <= 0.05
 
 
@@ -78,7 +80,7 @@ def test_the_first_twist_corrects_less_than_a_later_one_and_only_from_its_own_me
     spread = GainSpread(between=0.28, within=0.05, noise_nm=0.001)
     parts, truth = TWISTS[:8, None] / 1.4, TWISTS[:8]
     ordinary, first, expected = (
-        float(one.correct(parts, truth, find_twists(truth), first=mark, bounded=False).factors[0])
+        float(correct_gain(one, parts, truth, find_twists(truth), first=mark, bounded=False).factors[0])
         for one, mark in ((spread, truth < 0), (spread, truth > 0), (replace(spread, first=math.log(1.4)), truth > 0))
     )
     assert ordinary == pytest.approx(1.4, abs=0.05)
@@ -91,7 +93,7 @@ def test_a_first_twist_whose_deviation_may_be_chance_changes_nothing(gain):
     """First twists deviate by 20 %. Following one on a grip with the calibration's gain would add that error."""
     spread = GainSpread(between=0.28, within=0.05, noise_nm=0.001)
     parts, truth = TWISTS[:8, None] / gain, TWISTS[:8]
-    found = spread.correct(parts, truth, find_twists(truth), first=truth > 0, bounded=False)
+    found = correct_gain(spread, parts, truth, find_twists(truth), first=truth > 0, bounded=False)
     assert found.factors[0] == pytest.approx(1.0, abs=0.001)
     # It does not show either that the gain is the calibration's.
     assert found.spread.between > 0.2
@@ -100,14 +102,14 @@ def test_a_first_twist_whose_deviation_may_be_chance_changes_nothing(gain):
 def test_a_first_twist_that_deviates_further_than_first_twists_do_is_followed():
     spread = GainSpread(between=0.28, within=0.05, noise_nm=0.001)
     parts, truth = TWISTS[:8, None] / 2.0, TWISTS[:8]
-    found = spread.correct(parts, truth, find_twists(truth), first=truth > 0, bounded=False)
+    found = correct_gain(spread, parts, truth, find_twists(truth), first=truth > 0, bounded=False)
     assert 1.5 < found.factors[0] < 2.0
     assert found.spread.between < 0.22
 
 
 def test_later_twists_that_agree_with_the_calibration_narrow_the_interval():
     spread = GainSpread(between=0.28, within=0.05, noise_nm=0.001)
-    found = spread.correct(TWISTS[:24, None] / 1.03, TWISTS[:24], find_twists(TWISTS[:24]), bounded=False)
+    found = correct_gain(spread, TWISTS[:24, None] / 1.03, TWISTS[:24], find_twists(TWISTS[:24]), bounded=False)
     assert found.factors[0] == pytest.approx(1.0, abs=0.001)
     assert found.spread.between < 0.08
 
@@ -121,7 +123,7 @@ def test_every_grip_has_a_first_twist():
 def test_one_twist_corrects_the_gain_and_narrows_the_interval(gain):
     before = calibrated()
     features, torque_nm = twisted([gain, gain], 1)
-    after, correction = before.adapt(features[:8], torque_nm[:8], np.array([0, 1]))
+    after, correction = adapt_regressor(before, features[:8], torque_nm[:8], np.array([0, 1]))
     assert rmse(after, features, torque_nm) < max(0.3 * rmse(before, features, torque_nm), 0.0015)
     assert correction.twists == 1
     assert after.gain.between < 0.5 * before.gain.between
@@ -133,7 +135,7 @@ def test_each_fingertip_has_its_own_gain():
     rng = np.random.default_rng(3)
     shares = rng.uniform(0.0, 2.0, 80)
     features = np.column_stack([shares * TWISTS / 1.3, (2 - shares) * TWISTS / 0.8])
-    _, correction = before.adapt(features, TWISTS, np.array([0, 1]))
+    _, correction = adapt_regressor(before, features, TWISTS, np.array([0, 1]))
     np.testing.assert_allclose(correction.factors, [1.3, 0.8], atol=0.1)
 
 
@@ -144,7 +146,7 @@ def test_intervals_grow_with_the_gain_where_twists_go_both_ways(seed):
     share = rng.uniform(0.5, 1.5, len(torque_nm))
     features = np.column_stack([share, 2 - share]) * torque_nm[:, None] / 1.5 + rng.normal(0, 0.001, (32, 2))
     before = calibrated()
-    after, _ = before.adapt(features, torque_nm, np.array([0, 1]))
+    after, _ = adapt_regressor(before, features, torque_nm, np.array([0, 1]))
     assert after.intervals.half_widths / before.intervals.half_widths == pytest.approx(1.5, rel=0.05)
 
 
@@ -153,12 +155,12 @@ def test_twists_that_disagree_correct_little_or_are_refused():
     spread = GainSpread(between=0.3, within=0.05, noise_nm=0.001)
     parts, twists = TWISTS[:8, None] / 1.5, find_twists(TWISTS[:8])
     factors = [
-        float(replace(spread, within=within).correct(parts, TWISTS[:8], twists, bounded=False).factors[0])
+        float(correct_gain(replace(spread, within=within), parts, TWISTS[:8], twists, bounded=False).factors[0])
         for within in (0.05, 0.2, 0.4)
     ]
     assert factors[0] > 1.4 > factors[1] > factors[2] > 1.0
     with pytest.raises(CalibrationError, match="leave the gain as uncertain as it was"):
-        replace(spread, within=1.5).correct(parts, TWISTS[:8], twists, bounded=False)
+        correct_gain(replace(spread, within=1.5), parts, TWISTS[:8], twists, bounded=False)
 
 
 def test_halves_of_a_grip_that_differ_more_than_grips_do_show_a_drift():
@@ -174,7 +176,7 @@ def test_several_twists_of_a_gain_that_drifts_are_followed_less_and_the_first_on
     parts, first = TWISTS[:24, None] / 1.7, np.arange(24) < 8
     found, alone = (
         [
-            one.correct(parts[:end], TWISTS[:end], twists[:n], first=first[:end], bounded=False)
+            correct_gain(one, parts[:end], TWISTS[:end], twists[:n], first=first[:end], bounded=False)
             for one in (steady, drifting)
         ]
         for end, n in ((24, 3), (8, 1))
@@ -201,7 +203,7 @@ def test_a_gain_that_falls_over_a_grip_is_a_drift(begins_at, drifts):
 def test_a_gain_far_from_the_prior_is_not_clipped():
     """Another tool's torque can be wrong by more than a factor of five."""
     spread = GainSpread(between=TOOL_SPREAD, within=0.05, noise_nm=0.001, zero=TOOL_SPREAD)
-    found = spread.correct(TWISTS[:24, None] / 12.0, TWISTS[:24], find_twists(TWISTS[:24]), bounded=False)
+    found = correct_gain(spread, TWISTS[:24, None] / 12.0, TWISTS[:24], find_twists(TWISTS[:24]), bounded=False)
     assert found.factors[0] == pytest.approx(12.0, rel=0.1)
     assert found.spread.between < 0.15
 
@@ -209,8 +211,12 @@ def test_a_gain_far_from_the_prior_is_not_clipped():
 @pytest.mark.parametrize("factor", [0.0, -1.0])
 def test_estimates_that_do_not_follow_the_torque_are_refused(factor):
     with pytest.raises(CalibrationError, match="do not follow the known torque"):
-        GainSpread(between=0.3, noise_nm=0.001).correct(
-            factor * TWISTS[:8, None], TWISTS[:8], find_twists(TWISTS[:8]), bounded=False
+        correct_gain(
+            GainSpread(between=0.3, noise_nm=0.001),
+            factor * TWISTS[:8, None],
+            TWISTS[:8],
+            find_twists(TWISTS[:8]),
+            bounded=False,
         )
 
 
@@ -221,7 +227,7 @@ def test_corrections_lower_the_error_in_expectation():
     for _ in range(400):
         gain, scatter = np.exp(0.3 * rng.normal()), np.exp(0.3 * rng.normal(size=2))
         parts = TWISTS[:8, None] / (gain * scatter[0]) + rng.normal(0.0, 0.003, (8, 1))
-        factor = spread.correct(parts, TWISTS[:8], find_twists(TWISTS[:8]), bounded=False).factors[0]
+        factor = correct_gain(spread, parts, TWISTS[:8], find_twists(TWISTS[:8]), bounded=False).factors[0]
         later = 1.0 / (gain * scatter[1])
         before.append((later - 1) ** 2)
         after.append((factor * later - 1) ** 2)
@@ -234,14 +240,14 @@ def test_bounds_that_do_not_bind_count_for_nothing():
     regressor = fit_interval_regressor(
         features, TWISTS, CensoredRidge.fit, strengths=(1e-6,), grips=np.zeros(80, dtype=int)
     )
-    _, correction = regressor.adapt(features[:16] / 1.4, TWISTS[:16], np.array([0]))
+    _, correction = adapt_regressor(regressor, features[:16] / 1.4, TWISTS[:16], np.array([0]))
     assert correction.factors[0] == pytest.approx(1.4, abs=0.06)
 
 
 def test_loads_too_small_to_show_a_gain_are_refused():
     features, torque_nm = twisted([1.0, 1.0], 1)
     with pytest.raises(CalibrationError, match=r"no twist reaches 0\.005 N·m"):
-        calibrated().adapt(features, 0.05 * torque_nm, np.array([0, 1]))
+        adapt_regressor(calibrated(), features, 0.05 * torque_nm, np.array([0, 1]))
 
 
 def test_a_missed_load_has_no_gain():
@@ -252,12 +258,12 @@ def test_a_missed_load_has_no_gain():
 
 def test_a_law_over_tools_predicts_those_left_out_and_says_how_far_it_is_off():
     diameters_mm = np.array([10.0, 20.0, 30.0, 40.0])
-    exact = ToolLaw.fit(diameters_mm, 5.0 * diameters_mm**-3.0)
+    exact = fit_tool_law(diameters_mm, 5.0 * diameters_mm**-3.0)
     assert exact.gain(25.0) == pytest.approx(5.0 * 25.0**-3)
     assert exact.factor == pytest.approx(4.0, rel=0.02), "a few tools on a line are chance"
-    scattered = ToolLaw.fit(diameters_mm, 5.0 * diameters_mm**-3.0 * [3.0, 1 / 3.0, 3.0, 1 / 3.0])
+    scattered = fit_tool_law(diameters_mm, 5.0 * diameters_mm**-3.0 * [3.0, 1 / 3.0, 3.0, 1 / 3.0])
     assert scattered.spread > 1.5 * exact.spread
-    assert ToolLaw.fit(diameters_mm[1:], diameters_mm[1:]).gain(10.0) is None
+    assert fit_tool_law(diameters_mm[1:], diameters_mm[1:]).gain(10.0) is None
 
 
 def test_the_shape_of_a_twist_does_not_count_as_gain():
@@ -266,5 +272,5 @@ def test_the_shape_of_a_twist_does_not_count_as_gain():
     early = np.array([0.0, 0.050, 0.058, 0.057, 0.033, 0.005, 0.0])
     spread = GainSpread(between=0.3, within=0.2, noise_nm=0.006)
     assert loaded_log_gain(early, truth) == pytest.approx(0.0, abs=0.06)
-    factor = spread.correct(early[:, None], truth, find_twists(truth), bounded=True).factors[0]
+    factor = correct_gain(spread, early[:, None], truth, find_twists(truth), bounded=True).factors[0]
     assert factor == pytest.approx(1.0, abs=0.1)

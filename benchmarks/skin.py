@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks.common import parser_of, table_head, table_row
 from shearloop.bank.arrays import FloatArray
-from shearloop.estimation.skin.calibration import CalibrationTable, fit_calibration
+from shearloop.estimation.skin.calibration_fit import CalibrationTable, fit_calibration
 from shearloop.estimation.skin.membrane import (
     GAUGE_FACTOR,
     PAPER_SECTION,

@@ -68,7 +68,8 @@ def _table(rows: "tuple[FigureOfMerit, ...]") -> str:
 
 def _calibrate(args: argparse.Namespace) -> int:
     from shearloop.bank.errors import CalibrationError
-    from shearloop.estimation.skin.calibration import fit_calibration, read_table, save_calibration
+    from shearloop.estimation.skin.calibration import save_calibration
+    from shearloop.estimation.skin.calibration_fit import fit_calibration, read_table
 
     check_overwrite(args.out, "a calibration file", YAML_KEYS)
     recorded = read_table(args.table)

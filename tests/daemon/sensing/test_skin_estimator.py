@@ -12,7 +12,8 @@ import pytest
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
 from shearloop.emulators.synthetic_skin import CONTACT_N_PER_MM, REST_OHM, SyntheticSkin
-from shearloop.estimation.skin.calibration import CalibrationTable, SkinCalibration, fit_calibration, load_calibration
+from shearloop.estimation.skin.calibration import SkinCalibration, load_calibration
+from shearloop.estimation.skin.calibration_fit import CalibrationTable, fit_calibration
 from shearloop.estimation.skin.membrane import Direction
 from shearloop.studies.skin.characterisation import loop
 

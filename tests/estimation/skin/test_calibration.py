@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.skin.calibration import (
     MEMORY_S,
-    CalibrationTable,
     DirectionFinder,
     ForceFollower,
     SkinCalibration,
-    fit_calibration,
     load_calibration,
-    read_table,
     save_calibration,
     turned_rad,
 )
+from shearloop.estimation.skin.calibration_fit import CalibrationTable, fit_calibration, read_table
 from shearloop.estimation.skin.membrane import (
     PAPER_SECTION,
     THICK_SECTION,

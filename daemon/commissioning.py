@@ -307,7 +307,10 @@ def measured_widths(found: Supplied, model: ModelName) -> WidthCalibration | Non
     """Return the gripper's calibration by a report's table, or None without one."""
     if found.widths is None:
         return None
+    # Most rigs have a calibration of their own, or no table.
+    from shearloop.drivers.robotiq.width_fit import fit_width
+
     try:
-        return WidthCalibration.of_gauges(found.widths, model)
+        return fit_width(found.widths, model)
     except DriverError as error:
         raise UserError(f"the report's table of widths: {error}") from error

@@ -51,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
     from shearloop.drivers.robotiq.socket_client import SocketClient
+    from shearloop.drivers.robotiq.width_fit import fit_width
     from shearloop.drivers.robotiq.widths import WidthCalibration
 
     if len(set(args.diameter_mm)) < 2:
@@ -72,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         gripper = RobotiqGripper(client, WidthCalibration.nominal(args.model))
         operator = Operator(stdout_is_for_json=args.json)
         gauges = asyncio.run(_grip(gripper, args.diameter_mm, operator, left))
-    calibration = WidthCalibration.of_gauges(gauges, args.model)
+    calibration = fit_width(gauges, args.model)
     save_calibration(args.out, calibration)
     report = {
         "path": str(args.out),

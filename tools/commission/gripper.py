@@ -9,7 +9,7 @@ from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.robotiq.gripper import ACTIVATION_DEADLINE_NS, PAUSE_NS, RESET_DEADLINE_NS
 from shearloop.drivers.robotiq.messages import GripperState
 from shearloop.drivers.robotiq.models import MODELS, ModelName
-from shearloop.drivers.robotiq.widths import WidthCalibration
+from shearloop.drivers.robotiq.width_fit import fit_width
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.fingers import FINGERS_MM_PER_S, GENTLE_N, Gripper, close_fingers, open_fingers
 from shearloop.tools.commission.operator import Played
@@ -130,7 +130,7 @@ def _error_mm(gauge: tuple[float, float], gauges: Sequence[tuple[float, float]],
     others = [other for other in gauges if other[1] != width_mm]
     widths_mm = [width_mm for _, width_mm in gauges]
     between = min(widths_mm) < width_mm < max(widths_mm)
-    table = WidthCalibration.of_gauges(others if between else gauges, model)
+    table = fit_width(others if between else gauges, model)
     return abs(table.width_mm(counts) - width_mm)
 
 

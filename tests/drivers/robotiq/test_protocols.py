@@ -13,6 +13,7 @@ from shearloop.drivers.robotiq import messages, modbus_client
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.socket_client import SocketClient, readout_of, set_lines, take_answer, value_of
+from shearloop.drivers.robotiq.width_fit import fit_width
 from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.emulators.gripper import Fingers
 
@@ -121,12 +122,12 @@ def test_width_round_trips_within_half_a_count(opened, closed, width):
 def test_gauges_give_the_line_they_were_measured_on_and_its_scatter():
     truth = WidthCalibration(open_counts=5.0, open_mm=140.0, closed_counts=225.0, std_mm=1.0)
     gauges = [(truth.closed_counts + width / truth.mm_per_count, width) for width in (10.0, 20.0, 30.0, 40.0)]
-    found = WidthCalibration.of_gauges(gauges)
+    found = fit_width(gauges)
     assert [found.width_mm(counts) for counts in (0, 100, 255)] == pytest.approx(
         [truth.width_mm(counts) for counts in (0, 100, 255)]
     )
     assert found.std_mm == pytest.approx(140 / 220)
-    off = WidthCalibration.of_gauges([(counts + (2 if width == 20 else 0), width) for counts, width in gauges])
+    off = fit_width([(counts + (2 if width == 20 else 0), width) for counts, width in gauges])
     # A bump of 2 counts in the second of four even points leaves 2² (1 − 1/4 − 1/20), over two degrees of freedom, and
     # tilts the line by 2 · (−5 mm) / 500 mm².
     assert off.std_mm == pytest.approx(2 * (0.7 / 2) ** 0.5 / (220 / 140 + 0.02))
@@ -138,7 +139,7 @@ def test_gauges_of_each_model_give_its_stroke_its_first_count_and_its_bow(model,
     stroke_mm = MODELS[model].stroke_mm
     fingers = Fingers(MODELS[model], open_counts=opened, bow_mm=bow * stroke_mm)
     widths = [part * stroke_mm for part in (0.1, 0.3, 0.5, 0.7, 0.9)]
-    found = WidthCalibration.of_gauges([(round(fingers.counts(width)), width) for width in widths], model)
+    found = fit_width([(round(fingers.counts(width)), width) for width in widths], model)
     errors_mm = [found.width_mm(fingers.counts(part * stroke_mm)) - part * stroke_mm for part in np.linspace(0, 1, 50)]
     step_mm = stroke_mm / (fingers.closed_counts - opened)
     assert found.model == model
@@ -157,26 +158,26 @@ def test_straight_gauges_make_no_other_curve_than_their_line(opened, closed, wid
     """The bow of the best parabola is rounding noise there, which differs between processors."""
     truth = WidthCalibration(model="2F-140", open_counts=opened, open_mm=140.0, closed_counts=closed, std_mm=1.0)
     gauges = [(truth.closed_counts + width / truth.mm_per_count, float(width)) for width in widths_mm]
-    found = WidthCalibration.of_gauges(gauges, "2F-140")
+    found = fit_width(gauges, "2F-140")
     counts = np.linspace(opened, closed, 20)
     assert [found.width_mm(one) for one in counts] == pytest.approx([truth.width_mm(one) for one in counts], abs=1e-6)
 
 
 def test_few_gauges_cannot_see_a_bow_and_say_so():
     fingers = Fingers(MODELS["2F-85"], bow_mm=2.0)
-    found = WidthCalibration.of_gauges([(fingers.counts(width), width) for width in (5.0, 80.0)], "2F-85")
+    found = fit_width([(fingers.counts(width), width) for width in (5.0, 80.0)], "2F-85")
     assert found.width_std_mm > abs(found.width_mm(fingers.counts(42.5)) - 42.5)
 
 
 def test_an_object_that_does_not_fit_between_the_fingers_is_refused():
     with pytest.raises(DeviceCalibrationError, match="60 mm does not fit between the fingers of a Hand-E"):
-        WidthCalibration.of_gauges([(100.0, 20.0), (3.0, 60.0)], "Hand-E")
+        fit_width([(100.0, 20.0), (3.0, 60.0)], "Hand-E")
 
 
 def test_diameters_in_centimetres_are_refused():
     gauges = [(round(Fingers(MODELS["2F-140"]).counts(width)), width / 10) for width in (10.0, 20.0, 30.0)]
     with pytest.raises(DeviceCalibrationError, match=r"moved 9\.\d times as far as a 2F-140 does"):
-        WidthCalibration.of_gauges(gauges)
+        fit_width(gauges)
 
 
 @pytest.mark.parametrize("model", sorted(MODELS))
@@ -203,7 +204,7 @@ def test_counts_of_speed_and_force_are_those_of_the_model(model):
 )
 def test_gauges_that_make_no_line_are_refused(gauges, said):
     with pytest.raises(DeviceCalibrationError, match=said):
-        WidthCalibration.of_gauges(gauges)
+        fit_width(gauges)
 
 
 def test_pymodbus_logs_nothing():

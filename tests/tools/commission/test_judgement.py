@@ -16,7 +16,7 @@ from shearloop.daemon.commissioning import NOTHING_SUPPLIED
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
-from shearloop.drivers.robotiq.widths import WidthCalibration
+from shearloop.drivers.robotiq.width_fit import fit_width
 from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.emulators.synthetic_skin import SyntheticSkin
@@ -570,7 +570,7 @@ def test_a_gauge_is_judged_by_the_table_of_the_others():
     """One that is 1.6 mm off draws its own table along, so that this table is only 0.9 mm off there."""
     gauges = [(10.0 + 40.0 * number, 100.0 - 20.0 * number) for number in range(5)]
     gauges[2] = (90.0, 61.6)
-    own = WidthCalibration.of_gauges(gauges, "2F-140")
+    own = fit_width(gauges, "2F-140")
     assert max(abs(own.width_mm(counts) - width_mm) for counts, width_mm in gauges) < 1.0
     line, supplied = judge_widths(gauges, SimpleNamespace(model="2F-140"))
     assert (failed([line]), supplied.widths) == (["widths"], None)

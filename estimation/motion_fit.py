@@ -17,10 +17,14 @@ from typing import TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.estimation.interval_regressor import reported_values
-from shearloop.estimation.left_out import LeftOut, left_out_groups
-from shearloop.estimation.ridge import CensoredRidge, Ridge
-from shearloop.estimation.twists import find_twists
+from shearloop.estimation.estimator import Bounds
+from shearloop.estimation.fingertip_validator import FingertipValidator
+from shearloop.estimation.interval_fit import fit_interval_regressor
+from shearloop.estimation.interval_regressor import IntervalRegressor, reported_values
+from shearloop.estimation.left_out import LeftOut, left_out_blocks, left_out_groups
+from shearloop.estimation.motion_regression import TemporalFeatures
+from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
+from shearloop.estimation.twists import LOADED_FRACTION, find_twists
 
 # Ends of the steps of the memory in frames back: 18 frames are 10 s, and the gel creeps for some seconds.
 MEMORY_EDGES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 16, 19)
@@ -33,8 +37,82 @@ _STEPS_WITH_POSITION = (8,)
 _MIN_TWISTS, _MAX_PARTS = 3, 10
 # Below this fraction of loaded frames, the frames left out hold few twists.
 _RARE_LOAD, _FRAMES_OF_FEW_TWISTS = 0.5, 2
+# The directions of the motion over this many frames, 4 s. Over 6 frames the first twists after a grip err
+# more, over 12 frames later twists do (docs/decisions/0044). A nested choice tries all three.
+_DIRECTION_FRAMES, _NESTED_DIRECTION_FRAMES = (8,), (8, 6, 12)
+# Positions drift between recordings, motion does not. So the position must lower motion's squared error on frames left
+# out to the second fraction where motion leaves more than the first of the torque's variance, else to the third. On
+# recorded fingertips, which were twisted one way, the fraction is 0.54 to 18, on emulated ones 0.01 to 0.4.
+_MOTION_MAY_LEAVE, _POSITION_GAINS, _POSITION_GAINS_MUCH = 0.5, 0.5, 0.3
+# Of twists both ways, motion may learn the order, which is another one next time, and twists left out do not show it.
+# There the position also serves where it leaves this fraction of the torque's variance at most.
+_POSITION_MAY_LEAVE = 0.1
 # Fits (n, d) features to (n,) values with a penalty.
 LinearFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Ridge]
+
+
+def fit_directions(
+    parts: Sequence[FloatArray], validators: tuple[FingertipValidator, ...], *, nested: bool = False
+) -> TemporalFeatures:
+    """Fit the main directions of motion to each recording's (n, m, c) gripped frames.
+
+    With `nested` they are of the motion over several times, for the fit to choose.
+    """
+    windows = _NESTED_DIRECTION_FRAMES if nested else _DIRECTION_FRAMES
+    directions = []
+    for layer, validator in enumerate(validators):
+        of_side = [part[:, layer] for part in parts]
+        directions.append(np.vstack([main_directions(of_side, validator.noise, frames) for frames in windows]))
+    return TemporalFeatures(np.array(directions), np.array(MEMORY_EDGES), uses_position=True)
+
+
+def fit_motion(
+    temporal: TemporalFeatures, features: FloatArray, torque_nm: FloatArray, bounds: Bounds | None, grips: IntArray
+) -> tuple[TemporalFeatures, IntervalRegressor, float]:
+    """Return the features that a torque is fitted to, their regressor, and the unexplained fraction of its variance.
+
+    The torques (n,) belong to all (n, d) `features`. The fraction is on frames left out.
+    """
+    m, p, _ = temporal.directions.shape
+    layout = Layout(len(temporal.edges) - 1, m, p)
+    fit_one: LinearFit = CensoredRidge.fit if is_one_sided(torque_nm) else Ridge.fit_scaled
+    twists, variance = twists_left_out(torque_nm), float(torque_nm.var())
+    left_out = twists or left_out_blocks(len(torque_nm))
+    alone, with_position = (
+        choose_motion(features, torque_nm, layout, fit_one, left_out, position=used) for used in (False, True)
+    )
+    chosen = with_position if _reads_position(alone, with_position, torque_nm) else alone
+    regressor = fit_interval_regressor(
+        features[:, chosen.columns],
+        torque_nm,
+        chosen.fit_used,
+        strengths=(0.0,),
+        limit_features=True,
+        twists=twists,
+        bounds=bounds,
+        grips=grips,
+        fingertips=len(temporal.directions),
+    )
+    return _reduced(temporal, chosen), regressor, chosen.squared_error / variance
+
+
+def _reads_position(alone: "MotionFit", with_position: "MotionFit", torque_nm: FloatArray) -> bool:
+    """Return whether torques (n,) are fitted to the gel's position too, by both fits' errors on frames left out."""
+    variance = float(torque_nm.var())
+    leaves_much = alone.squared_error > _MOTION_MAY_LEAVE * variance
+    share = _POSITION_GAINS if leaves_much else _POSITION_GAINS_MUCH
+    if with_position.squared_error < share * alone.squared_error:
+        return True
+    loaded_nm = LOADED_FRACTION * float(np.abs(torque_nm).max())
+    both_ways = bool(torque_nm.min() < -loaded_nm and torque_nm.max() > loaded_nm)
+    return both_ways and with_position.squared_error < _POSITION_MAY_LEAVE * variance
+
+
+def _reduced(temporal: TemporalFeatures, to: "MotionFit") -> TemporalFeatures:
+    """Return the features that a fit uses."""
+    first = to.first_direction
+    directions = temporal.directions[:, first : first + to.n_directions].copy()
+    return replace(temporal, directions=directions, edges=temporal.edges[: to.n_steps + 1], uses_position=to.position)
 
 
 @dataclass(frozen=True, slots=True)

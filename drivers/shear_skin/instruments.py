@@ -7,8 +7,8 @@ import asyncio
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
-from contextlib import aclosing, suppress
+from collections.abc import AsyncGenerator, Sequence
+from contextlib import aclosing
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from time import monotonic_ns
@@ -239,28 +239,6 @@ class SourceReading:
     voltage_v: float = float("nan")
     current_a: float = float("nan")
     compliance: bool = False
-
-
-class ReplayedInstrument(Generic[ReadingT]):
-    """Parses an instrument's recorded replies. No I/O."""
-
-    def __init__(self, parsers: Mapping[str, Callable[[Reply], ReadingT | None]]) -> None:
-        """Parse the replies to these queries."""
-        self._parsers = parsers
-        self._asked: RawEvent | None = None
-
-    def handle(self, event: RawEvent) -> list[ReadingT]:
-        """Return the readings that an event completes; invalid replies give none, as they did live."""
-        if event.kind is InputKind.ASKED:
-            self._asked = event
-        elif event.kind is InputKind.DATA and self._asked is not None:
-            asked, self._asked = self._asked, None
-            reply = Reply(event.data.decode("latin-1"), asked.t_ns, event.t_ns)
-            if parse := self._parsers.get(asked.data.decode("latin-1")):
-                with suppress(ProtocolError):
-                    reading = parse(reply)
-                    return [] if reading is None else [reading]
-        return []
 
 
 def read_elements(reply: Reply) -> SourceReading:

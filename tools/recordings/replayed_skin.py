@@ -1,5 +1,9 @@
 """The skin's part of a replay: its parsers, validator and estimator, fed with recorded inputs."""
 
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Generic
+
 from shearloop.daemon.config import SkinConfig
 from shearloop.daemon.messaging.messages import SkinShear
 from shearloop.daemon.sensing.skin_task import (
@@ -13,6 +17,7 @@ from shearloop.daemon.sensing.skin_task import (
     zero_timeout_s,
 )
 from shearloop.daemon.sensing.snapshots import restored
+from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.drivers.shear_skin.instruments import (
     OUTPUT,
@@ -20,7 +25,8 @@ from shearloop.drivers.shear_skin.instruments import (
     SCAN,
     SOURCE_PERIOD_S,
     PairParser,
-    ReplayedInstrument,
+    ReadingT,
+    Reply,
     SourceReading,
     Voltages,
     read_elements,
@@ -29,6 +35,28 @@ from shearloop.drivers.shear_skin.instruments import (
 )
 from shearloop.drivers.shear_skin.skin import SampleAverager, SampleValidator
 from shearloop.estimation.skin.calibration import load_calibration
+
+
+class ReplayedInstrument(Generic[ReadingT]):
+    """Parses an instrument's recorded replies. No I/O."""
+
+    def __init__(self, parsers: Mapping[str, Callable[[Reply], ReadingT | None]]) -> None:
+        """Parse the replies to these queries."""
+        self._parsers = parsers
+        self._asked: RawEvent | None = None
+
+    def handle(self, event: RawEvent) -> list[ReadingT]:
+        """Return the readings that an event completes; invalid replies give none, as they did live."""
+        if event.kind is InputKind.ASKED:
+            self._asked = event
+        elif event.kind is InputKind.DATA and self._asked is not None:
+            asked, self._asked = self._asked, None
+            reply = Reply(event.data.decode("latin-1"), asked.t_ns, event.t_ns)
+            if parse := self._parsers.get(asked.data.decode("latin-1")):
+                with suppress(ProtocolError):
+                    reading = parse(reply)
+                    return [] if reading is None else [reading]
+        return []
 
 
 class ReplayedSkin:

@@ -61,16 +61,11 @@ class SampleParser:
         Raises:
             ProtocolError: a package is invalid, so that the start of the next one is unknown.
         """
-        data, starts = self._split(data)
-        return _outputs_at(data, starts[-1]) if starts else None
+        data, starts = self.split(data)
+        return outputs_at(data, starts[-1]) if starts else None
 
-    def feed_all(self, data: bytes) -> list[RtdeOutputs]:
-        """Return every sample that `data` completes, oldest first; raises as `feed` does."""
-        data, starts = self._split(data)
-        return [_outputs_at(data, start) for start in starts]
-
-    def _split(self, data: bytes) -> tuple[bytes, list[int]]:
-        """Return all bytes, and where a whole sample begins in them; keep the rest for later."""
+    def split(self, data: bytes) -> tuple[bytes, list[int]]:
+        """Return all bytes, and where a whole sample begins in them; keep the rest for later. Raises as `feed` does."""
         data = self._buffer + data
         start, starts, received = 0, [], len(data)
         while received - start >= HEADER.size:
@@ -86,7 +81,7 @@ class SampleParser:
         return data, starts
 
 
-def _outputs_at(data: bytes, start: int) -> RtdeOutputs:
+def outputs_at(data: bytes, start: int) -> RtdeOutputs:
     """Return the sample in the package that begins at `start`."""
     (size, _), start = HEADER.unpack_from(data, start), start + HEADER.size + 1
     v = _VALUES.unpack_from(data, start)
@@ -104,9 +99,18 @@ class RtdeReceiver:
     """
 
     def __init__(
-        self, host: str, rate_hz: float, timeout_s: float, registers: ScriptRegisters = UPPER, *, writes: bool = True
+        self,
+        host: str,
+        rate_hz: float,
+        timeout_s: float,
+        registers: ScriptRegisters = UPPER,
+        *,
+        writes: bool = True,
+        parser: SampleParser | None = None,
     ) -> None:
         """Connect and wait for the first sample. One that only observes leaves our register to others.
+
+        `parser` gets all bytes; without one, only the newest samples are read.
 
         Raises:
             RobotLostError: the controller is absent or silent, does not send the outputs, or our register is in use.
@@ -114,7 +118,7 @@ class RtdeReceiver:
         self._host, self._writes = host, writes
         self._registers = registers
         self._recipe = 0
-        self._parser = SampleParser()
+        self._parser = parser or SampleParser()
         self.connected = True
         with explain_failure(host, timeout_s, "asking for its state"):
             self.connection = socket.create_connection((host, RTDE_PORT), timeout=timeout_s)
@@ -173,23 +177,13 @@ class RtdeReceiver:
         """Wait for data, at most this long, and return whether there is any."""
         return self.connected and bool(select.select([self.connection], [], [], max(0.0, seconds))[0])
 
-    def receive_all(self) -> list[RtdeOutputs]:
-        """Return every sample received since the last call, oldest first, without waiting."""
-        samples: list[RtdeOutputs] = []
-        if self.connected:
-            self._receive(samples)
-        return samples
-
-    def _receive(self, every: list[RtdeOutputs] | None = None) -> RtdeOutputs | None:
-        """Return the newest sample received, if any; `every` gets all."""
+    def _receive(self) -> RtdeOutputs | None:
+        """Return the newest sample received, if any."""
         newest, more = None, True
         while more:
             try:
                 data = self.connection.recv(_READ_BYTES)
-                if every is None:
-                    newest = self._parser.feed(data) or newest
-                else:
-                    every += self._parser.feed_all(data)
+                newest = self._parser.feed(data) or newest
             except BlockingIOError:
                 break
             except (OSError, ProtocolError) as error:

@@ -11,7 +11,7 @@ import time
 from pydantic import TypeAdapter
 
 from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
-from shearloop.drivers.ur.receiver import RtdeReceiver
+from shearloop.drivers.ur.receiver import RtdeReceiver, SampleParser, outputs_at
 from shearloop.drivers.ur.sample_age import SampleAge
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.errors import UserError
@@ -22,6 +22,26 @@ _OUTPUTS = TypeAdapter(RtdeOutputs)
 _CONNECTS_WITHIN_S = 10.0
 # An observer that lost its connection connects again after this time.
 _AGAIN_S = 0.2
+
+
+class EverySample(SampleParser):
+    """Keeps every sample, not only the newest one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._samples: list[RtdeOutputs] = []
+
+    def feed(self, data: bytes) -> RtdeOutputs | None:
+        """Keep every sample that `data` completes, and return the newest one, or None; raises ProtocolError."""
+        data, starts = self.split(data)
+        samples = [outputs_at(data, start) for start in starts]
+        self._samples += samples
+        return samples[-1] if samples else None
+
+    def take(self) -> list[RtdeOutputs]:
+        """Return every sample since the last call, oldest first."""
+        samples, self._samples = self._samples, []
+        return samples
 
 
 class ObserverProcess(Observer, Opened):
@@ -67,15 +87,17 @@ class ObserverProcess(Observer, Opened):
 def main(host: str, rate_hz: float, registers: ScriptRegisters) -> None:
     """Print the samples until the reader is gone; connect again after a loss."""
     while True:
+        parser = EverySample()
         try:
-            receiver = RtdeReceiver(host, rate_hz, _CONNECTS_WITHIN_S / 2, registers, writes=False)
+            receiver = RtdeReceiver(host, rate_hz, _CONNECTS_WITHIN_S / 2, registers, writes=False, parser=parser)
         except RobotLostError:
             time.sleep(_AGAIN_S)
             continue
         age = SampleAge()
         while receiver.connected:
             receiver.wait(1.0)
-            for outputs in receiver.receive_all():
+            receiver.latest()
+            for outputs in parser.take():
                 now_ns = time.monotonic_ns()
                 made_ns = now_ns - age.age_ns(outputs.timestamp_s, now_ns)
                 sys.stdout.buffer.write(b"%d %d %s\n" % (made_ns, now_ns, _OUTPUTS.dump_json(outputs)))

@@ -112,37 +112,47 @@ class MotionExecutor:
 
     def begin(self, motion_id: int, asked: WristSpeed | MoveLinear, sample: RtdeSample, now_ns: int) -> str:
         """Turn the wrist at a speed from now on, or begin a straight move; return why not, or the empty string."""
-        match asked, self._motion:
-            case WristSpeed(decided_ns=decided_ns), _ if decided_ns and self._left_s(decided_ns, now_ns) < 0:
-                return f"The wrist speed was decided {(now_ns - decided_ns) / 1e9:.2f} s ago: the computer is too busy."
-            case WristSpeed(_, acceleration), _ if acceleration <= 0:
-                return f"An acceleration of {acceleration:g} rad/s² is not above 0."
-            case WristSpeed(), None if self._is_old(sample):
-                return f"T{_old(sample)[1:]}: the wrist does not begin to turn."
-            case WristSpeed(), _Braking():
-                return f"The arm is still stopping ({self.end_reason})."
-            case WristSpeed(), _Move():
-                return "A straight move is under way: stop it."
-            case MoveLinear(pose), _ if outside := self._settings.limits.box.why_outside(pose[:3]):
-                return f"The straight move would end at {outside}; nothing moves."
-            case MoveLinear(_, speed, acceleration), _ if min(speed, acceleration) <= 0:
-                return "A straight move needs a speed and an acceleration above 0."
-            case MoveLinear(), motion if isinstance(motion, _Move | _Braking) or not sample.rests:
-                return "The arm moves: stop it before a straight move."
+        if refused := self._why_not_begun(asked, sample, now_ns):
+            return refused
         self.motion_id, self.end_reason = motion_id, ""
         if isinstance(asked, WristSpeed):
             self._motion = replace(asked, decided_ns=asked.decided_ns or now_ns)
             self._keep_turning(self._motion, sample, now_ns)
         else:
-            self._end_speed_thread()
-            sent, self.clipped = clip_linear(asked, sample.tcp_pose, self._settings.limits)
-            self.sent = sent
-            slack_s = max(MOVE_SLACK_S, MOVE_SILENCES * self._settings.silence_timeout_s)
-            deadline_ns = _deadline_ns(now_ns, _nominal_move_s(sent, sample), slack_s, sample)
-            self._motion = _Move(sent.pose, now_ns, deadline_ns)
-            if not self._arm.move(sent):
-                self._reject("straight move")
+            self._begin_move(asked, sample, now_ns)
         return self.why_not_ours
+
+    def _why_not_begun(self, asked: WristSpeed | MoveLinear, sample: RtdeSample, now_ns: int) -> str:
+        """Return why a wrist speed or a straight move cannot begin now, or the empty string."""
+        motion = self._motion
+        if isinstance(asked, WristSpeed):
+            if asked.decided_ns and self._left_s(asked.decided_ns, now_ns) < 0:
+                age_s = (now_ns - asked.decided_ns) / 1e9
+                return f"The wrist speed was decided {age_s:.2f} s ago: the computer is too busy."
+            if asked.acceleration_rad_per_s2 <= 0:
+                return f"An acceleration of {asked.acceleration_rad_per_s2:g} rad/s² is not above 0."
+            if motion is None and self._is_old(sample):
+                return f"T{_old(sample)[1:]}: the wrist does not begin to turn."
+            if isinstance(motion, _Braking):
+                return f"The arm is still stopping ({self.end_reason})."
+            return "A straight move is under way: stop it." if isinstance(motion, _Move) else ""
+        if outside := self._settings.limits.box.why_outside(asked.pose[:3]):
+            return f"The straight move would end at {outside}; nothing moves."
+        if min(asked.speed_m_per_s, asked.acceleration_m_per_s2) <= 0:
+            return "A straight move needs a speed and an acceleration above 0."
+        moves = isinstance(motion, _Move | _Braking) or not sample.rests
+        return "The arm moves: stop it before a straight move." if moves else ""
+
+    def _begin_move(self, asked: MoveLinear, sample: RtdeSample, now_ns: int) -> None:
+        """Begin a straight move within the limits."""
+        self._end_speed_thread()
+        sent, self.clipped = clip_linear(asked, sample.tcp_pose, self._settings.limits)
+        self.sent = sent
+        slack_s = max(MOVE_SLACK_S, MOVE_SILENCES * self._settings.silence_timeout_s)
+        deadline_ns = _deadline_ns(now_ns, _nominal_move_s(sent, sample), slack_s, sample)
+        self._motion = _Move(sent.pose, now_ns, deadline_ns)
+        if not self._arm.move(sent):
+            self._reject("straight move")
 
     def stop_on_command(self, motion_id: int, asked: Stop, sample: RtdeSample, now_ns: int) -> str:
         """Stop at once, as hard as commanded within the needed and the allowed deceleration; return why not."""

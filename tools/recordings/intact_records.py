@@ -191,7 +191,7 @@ class IntactRecords:
 
     def _use_index(self, file: BinaryIO) -> list[int]:
         """Take channels and numbers from the index of a closed file; return the places of its records, rising."""
-        summary = _intact_index(file, self.size)
+        summary = intact_index(file, self.size)
         if summary is None:
             return []
         index, begins = summary
@@ -310,7 +310,7 @@ def _was_chunk(file: BinaryIO, at: int) -> bool:
     return head[0] == Opcode.CHUNK or head[_COMPRESSION_AT:].startswith(_COMPRESSIONS)
 
 
-def _intact_index(file: BinaryIO, size: int) -> tuple[Summary, int] | None:
+def intact_index(file: BinaryIO, size: int) -> tuple[Summary, int] | None:
     """Return the index of a closed file and its place, or None where it is missing or damaged."""
     footer_bytes = _HEAD_BYTES + 20
     footer_at = size - len(MCAP0_MAGIC) - footer_bytes

@@ -6,17 +6,15 @@ by its index.
 
 import shlex
 import struct
-import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, BinaryIO
 
 from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, McapRecord, Message
 from mcap.stream_reader import CRCValidationError, StreamReader
-from mcap.writer import MCAP0_MAGIC
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.recorder import schema
@@ -30,6 +28,7 @@ from shearloop.tools.recordings.intact_records import (
     Progress,
     check_magic,
     check_size,
+    intact_index,
 )
 from shearloop.tools.recordings.message_content import ContentError, OtherKeysError, check_time, read_content
 from shearloop.tools.recordings.monotonic_times import Messages, has_one_offset, in_monotonic_order
@@ -40,7 +39,7 @@ _OTHER_PROGRAM = "another program made or changed this recording: record or impo
 class OpenRecording:
     """An open recording: its topics with their numbers of messages, metadata, channels, attachments and messages."""
 
-    def __init__(self, path: Path, file: IO[bytes]) -> None:
+    def __init__(self, path: Path, file: BinaryIO) -> None:
         """Check that the file was closed, matches its checksums and is usable; raises many types of errors."""
         file.seek(0)
         ends: list[McapRecord] = []
@@ -58,16 +57,18 @@ class OpenRecording:
                         raise ValueError(f"it has the attachment {name[:40]!r}")
                     case DataEnd() | Footer():
                         ends.append(record)
-        match ends:
-            case DataEnd(), Footer() as footer if not file.read(1):
-                _check_index(file, footer)
-            case _:
-                raise McapError("it has no index at its end")
+        is_last = not file.read(1)
+        if not is_last or list(map(type, ends)) != [DataEnd, Footer]:
+            raise McapError("it has no index at its end")
+        # The mcap library does not check the checksum of the index.
+        found = intact_index(file, file.tell())
+        if found is None:
+            raise McapError("its index is missing, or does not match its checksum")
+        summary, _ = found
+        if summary.statistics is None:
+            raise McapError("its index counts no messages")
         file.seek(0)
         self._reader = make_reader(file, validate_crcs=True)
-        summary = self._reader.get_summary()
-        if summary is None or summary.statistics is None:
-            raise McapError("it has no index")
         counts = summary.statistics.channel_message_counts
         self.counts = {channel.topic: counts.get(channel.id, 0) for channel in summary.channels.values()}
         # By the records' names.
@@ -198,15 +199,6 @@ def _checked_identity(path: Path, identity: dict[str, str] | None) -> tuple[dict
     if (found := str(identity.get("channel_table_hash"))) != table.digest:
         raise unusable(path, f"it has the channel table {found[:12]}…, expected {table.digest[:12]}…")
     return identity, table
-
-
-def _check_index(file: IO[bytes], footer: Footer) -> None:
-    """Raise McapError for an index that does not match its checksum, which the mcap library does not check."""
-    # The checksum covers the footer up to itself, four bytes before the magic ones.
-    index_end = file.tell() - len(MCAP0_MAGIC) - 4
-    file.seek(footer.summary_start)
-    if footer.summary_crc and zlib.crc32(file.read(index_end - footer.summary_start)) != footer.summary_crc:
-        raise McapError("its index does not match its checksum")
 
 
 def unusable(path: Path, reason: str) -> UserError:

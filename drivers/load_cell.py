@@ -17,7 +17,6 @@ from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.line_parser import LineParser, TimedLine
 
 BAUD_RATE = 115200
-PERIOD_NS = round(1e9 / LOAD_CELL_RATE_HZ)
 # The ends of the converter's range (HX711 data sheet, "Output data": 24 bits, two's complement).
 COUNTS_MAX, COUNTS_MIN = 8388607, -8388608
 # "-8388608" has 8 characters, a float printed by an Uno at most 15.

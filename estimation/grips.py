@@ -14,10 +14,9 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.fingertip_validator import STEP_FRAMES
 from shearloop.estimation.series import FrameSeries
+from shearloop.estimation.twists import LOADED_FRACTION
 from shearloop.estimation.validator_fit import channel_noise, frame_steps
 
-# Torques above this fraction of the largest one count as a load.
-_LOADED_FRACTION = 0.1
 # A large step exceeds the steps of twisting under load by this factor.
 _LARGE_STEP = 1.4
 # Frames below this fraction of the way from idle to loaded, in this running median, are idle. Gripped and not twisted
@@ -62,7 +61,7 @@ def find_grips(series: FrameSeries) -> list[Grip]:
         others = f", and left out: {'; '.join(series.left_out)}" if series.left_out else ""
         raise CalibrationError(f"no torque is known for these frames{others}; record the load cell with them")
     torque = np.abs(np.nan_to_num(known))
-    is_loaded = torque > _LOADED_FRACTION * torque.max(initial=np.finfo(np.float64).tiny)
+    is_loaded = torque > LOADED_FRACTION * torque.max(initial=np.finfo(np.float64).tiny)
     loaded = np.flatnonzero(is_loaded)
     if len(loaded) == 0:
         raise CalibrationError("the torque is 0 at all of these frames; record twists that the load cell measures")

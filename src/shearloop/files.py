@@ -49,16 +49,10 @@ def replace_file(path: Path) -> Iterator[BinaryIO]:
 
     Raises OSError where it cannot be written; `path` is then unchanged, but for a folder that the disk cannot flush.
     """
-    with replaced_path(path) as written, written.open("wb") as file:
-        yield file
-
-
-@contextmanager
-def replaced_path(path: Path) -> Iterator[Path]:
-    """Yield the path of a file to write, as `replace_file` does, for a library that opens it itself."""
     if path.exists() and not path.is_file():
         # A pipe or /dev/stdout is written to, not replaced; a folder raises OSError.
-        yield path
+        with path.open("wb") as file:
+            yield file
         return
     given = path
     # The target of a link is replaced, and the link stays.
@@ -68,9 +62,10 @@ def replaced_path(path: Path) -> Iterator[Path]:
     try:
         with sole_writer(temporary):
             try:
-                yield temporary
-                with temporary.open("rb") as file:
-                    os.fsync(file.fileno())
+                with temporary.open("wb") as file:
+                    yield file
+                with temporary.open("rb") as written:
+                    os.fsync(written.fileno())
                 temporary.replace(path)
                 sync_directory(path.parent)
             except BaseException:

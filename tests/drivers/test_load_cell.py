@@ -17,7 +17,6 @@ from shearloop.drivers.load_cell import (
     COUNTS_MAX,
     COUNTS_MIN,
     COUNTS_REASON,
-    PERIOD_NS,
     STUCK_AFTER,
     TORQUES_FOR_COUNTS,
     LoadCalibration,
@@ -27,6 +26,7 @@ from shearloop.drivers.refused_lines import refusal_sentence
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.slices import slices
 
+PERIOD_NS = round(1e9 / LOAD_CELL_RATE_HZ)
 TORQUE_LINES = LoadCalibration.of_torque_lines()
 STREAMS = {
     "glitch_20241202_173837/load.mat": "plotthis3",

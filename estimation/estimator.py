@@ -199,7 +199,7 @@ class Estimator(ABC):
         The third value is the fraction of the torque's variance that a tool's motion leaves unexplained on frames left
         out, 0 where that is not tested.
         """
-        from shearloop.estimation.interval_fit import fit_interval_regressor
+        from shearloop.estimation.interval_fit import Validation, fit_interval_regressor
         from shearloop.estimation.left_out import later_origins
 
         # Without memory the gel's drift enters the torque, so validation uses later frames only.
@@ -209,7 +209,7 @@ class Estimator(ABC):
             self.ridge,
             strengths=self.strengths,
             limit_features=self.limits_features,
-            left_out=later_origins(len(torque_nm)),
+            validation=Validation.by_parts(later_origins(len(torque_nm)), len(torque_nm)),
             bounds=bounds,
             grips=grips,
             fingertips=len(self.scale),
@@ -226,7 +226,7 @@ class Estimator(ABC):
 
     def fit_diameter(self, rows: CalibrationRows) -> OutputModel:
         """Return the diameter's model from rows of known diameters, by age."""
-        from shearloop.estimation.interval_fit import fit_interval_regressor
+        from shearloop.estimation.interval_fit import Validation, fit_interval_regressor
         from shearloop.estimation.left_out import left_out_groups
 
         n = len(rows.age_s)
@@ -239,7 +239,7 @@ class Estimator(ABC):
             rows.diameter_mm,
             self.ridge,
             strengths=self.strengths,
-            left_out=left_out,
+            validation=Validation.by_parts(left_out, len(rows.age_s)),
         )
         return OutputModel(regressor, self.k_range(rows.features))
 

@@ -18,6 +18,7 @@ from shearloop.estimation.calibration import Calibration, check_bank_table
 from shearloop.estimation.channel_imputer import ChannelImputer
 from shearloop.estimation.estimator import (
     MIN_DIAMETERS,
+    Bounds,
     CalibrationRows,
     Estimator,
     Material,
@@ -161,42 +162,49 @@ def _fit_outputs(
     rows = _replay(calibration, matcher, recordings)
     if rows is None:
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
-    bounds = None
-    if timing_uncertainty_s:
-        each = [torque_bounds(recording, timing_uncertainty_s) for recording in recordings]
-        places = zip(rows.recording.tolist(), rows.frame.tolist(), strict=True)
-        least_nm, largest_nm = np.array([[end[frame] for end in each[recording]] for recording, frame in places]).T
-        bounds = least_nm, largest_nm
     estimator = calibration.estimator
     if not estimator.imputes_by_motion:
         estimator = replace(estimator, imputer=ChannelImputer.fit(rows.position, calibration.validators))
     prepared = estimator
+    bounds = _torque_bounds(rows, recordings, timing_uncertainty_s)
     estimator, regressor, unexplained = prepared.fit_torque(rows.features, rows.torque_nm, bounds, rows.grip)
     # By age within the recordings, so that every part has all tools.
     order = np.argsort(rows.age_s, kind="stable")
     known = rows.where(order[np.isfinite(rows.diameter_mm[order])])
-    enough = len(np.unique(known.diameter_mm)) >= MIN_DIAMETERS
-    diameter = estimator.fit_diameter(known) if enough else None
+    has_diameter = len(np.unique(known.diameter_mm)) >= MIN_DIAMETERS
+    diameter = estimator.fit_diameter(known) if has_diameter else None
     law = None
     if len(tools := _tools_of(recordings)) > 1:
-        diameters_mm = np.array(
-            [np.nan if recording.tool_mm is None else recording.tool_mm.value for recording in recordings]
-        )
-        fitted = _fit_tools(prepared, rows, diameters_mm) if enough else None
+        fitted = _fit_tools(prepared, rows, recordings) if has_diameter else None
         if fitted is not None:
             estimator, regressor, law = fitted
         elif unexplained > _TOOLS_MAY_LEAVE:
-            cure = "with twists of every tool in one direction" if enough else "on three diameters"
-            raise CalibrationError(
-                f"the tools of {' and '.join(f'{tool.value:.3g}' for tool in tools)} mm turn so differently that they "
-                f"have no torque in common; calibrate on each alone, or {cure}"
-            )
+            raise _tools_differ(tools, has_diameter=has_diameter)
     torque = OutputModel(regressor, estimator.k_range(rows.features))
     return replace(calibration, estimator=estimator, torque=torque, diameter=diameter, tools=law)
 
 
+def _torque_bounds(rows: CalibrationRows, recordings: list[FrameSeries], uncertainty_s: float) -> Bounds | None:
+    """Return the least and the largest torque of each row where its time is uncertain; None without uncertainty."""
+    if not uncertainty_s:
+        return None
+    each = [torque_bounds(recording, uncertainty_s) for recording in recordings]
+    places = zip(rows.recording.tolist(), rows.frame.tolist(), strict=True)
+    least_nm, largest_nm = np.array([[end[frame] for end in each[recording]] for recording, frame in places]).T
+    return least_nm, largest_nm
+
+
+def _tools_differ(tools: list[Measured], *, has_diameter: bool) -> CalibrationError:
+    """Return the refusal of tools that have no torque in common."""
+    cure = "with twists of every tool in one direction" if has_diameter else "on three diameters"
+    return CalibrationError(
+        f"the tools of {' and '.join(f'{tool.value:.3g}' for tool in tools)} mm turn so differently that they "
+        f"have no torque in common; calibrate on each alone, or {cure}"
+    )
+
+
 def _fit_tools(
-    estimator: Estimator, rows: CalibrationRows, diameters_mm: FloatArray
+    estimator: Estimator, rows: CalibrationRows, recordings: Sequence[FrameSeries]
 ) -> tuple[Estimator, IntervalRegressor, ToolLaw] | None:
     """Return the regressor of torques in units of each recording's gain, and the law of these gains over the tools.
 
@@ -204,6 +212,9 @@ def _fit_tools(
     tools have the torque in common, or were twisted both ways. Motion shows how torque changes after the grip, so a
     recording counts from its least torque on.
     """
+    diameters_mm = np.array(
+        [np.nan if recording.tool_mm is None else recording.tool_mm.value for recording in recordings]
+    )
     rows = rows.where(np.isfinite(diameters_mm)[rows.recording])
     # The sign of a torque only says how the load cell is mounted: from here on the loads are positive.
     sign = sign_of_loads(rows.torque_nm)

@@ -6,7 +6,8 @@ so that many easy frames do not narrow the intervals of few hard ones.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import Self, TypeAlias
 
 import numpy as np
 from scipy.special import stdtrit
@@ -37,6 +38,47 @@ RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 Refit: TypeAlias = Callable[[IntArray], Regressor]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """Rows that are left out of a fit in turn, and the factors from their residuals to intervals.
+
+    `pairs` are rows to fit to and rows to validate on. `inflation_of_loads` is of the uppermost stratum, where it has
+    one of its own, `inflation_of_unknown_times` of residuals from bounds.
+    """
+
+    pairs: LeftOut
+    inflation: float
+    inflation_of_unknown_times: float
+    inflation_of_loads: float | None = None
+
+    @classmethod
+    def by_blocks(cls, n: int) -> Self:
+        """Leave out blocks of time of n rows."""
+        pairs = left_out_blocks(n)
+        # Unknown times mean few loads, in a block or two each.
+        return cls(pairs, INFLATION, student_inflation(len(pairs)))
+
+    @classmethod
+    def by_parts(cls, pairs: LeftOut, n: int) -> Self:
+        """Leave out parts of n rows, each row as one error; blocks of time where there are no pairs."""
+        if not pairs:
+            return cls.by_blocks(n)
+        inflation = student_inflation(len(np.unique(np.concatenate([part for _, part in pairs]))))
+        return cls(pairs, inflation, inflation)
+
+    @classmethod
+    def by_twists(cls, pairs: LeftOut, values: FloatArray) -> Self:
+        """Leave out twists of (n,) values; blocks of time where there are no pairs.
+
+        Each part with a load counts as one error, because the frames of a twist err alike.
+        """
+        if not pairs:
+            return cls.by_blocks(len(values))
+        loads = np.concatenate(find_twists(values))
+        n_loaded = sum(bool(np.isin(part, loads).any()) for _, part in pairs)
+        return cls(pairs, INFLATION, INFLATION, student_inflation(n_loaded))
+
+
 def check_values(values: FloatArray) -> None:
     """Raise CalibrationError for (n,) values that are few, or all alike."""
     if len(values) < MIN_FRAMES or np.ptp(values) == 0:
@@ -53,23 +95,22 @@ def fit_interval_regressor(
     *,
     strengths: tuple[float, ...] = STRENGTHS,
     limit_features: bool = False,
-    left_out: LeftOut = (),
-    twists: LeftOut = (),
+    validation: "Validation | None" = None,
     bounds: tuple[FloatArray, FloatArray] | None = None,
     grips: IntArray | None = None,
     fingertips: int = 1,
 ) -> IntervalRegressor:
     """Fit to (n, d) features and (n,) values in time order.
 
-    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With `twists`
-    instead each pair with a load counts as one error, because the frames of a twist err alike. `bounds` are the least
-    and largest value (n,) that each frame may have: intervals extend to the further one. With the number of each row's
-    grip, `grips` (n,), intervals allow for the gain of another grip of as many `fingertips`. Raises CalibrationError
-    where the data does not determine the fit.
+    The `validation` is by blocks of time if it is not given. `bounds` are the least and largest value (n,) that each
+    frame may have: intervals extend to the further one. With the number of each row's grip, `grips` (n,), intervals
+    allow for the gain of another grip of as many `fingertips`. Raises CalibrationError where the data does not
+    determine the fit.
     """
     check_values(values)
     strength = strengths[0] if len(strengths) == 1 else best_strength(features, values, fit, strengths)[0]
-    blocks = list(twists or left_out or left_out_blocks(len(values)))
+    validation = validation or Validation.by_blocks(len(values))
+    blocks = validation.pairs
 
     def refit(rows: IntArray) -> Regressor:
         return fit(features[rows], values[rows], strength)
@@ -81,8 +122,7 @@ def fit_interval_regressor(
     point, truth = fit(features, values, strength), values[rows]
     residuals = reported - truth
     edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, CensoredRidge) else ()
-    inflation = _inflation(rows, left_out)
-    of_loads = _inflation_of_twists(values, twists) if twists else None
+    inflation, of_loads = validation.inflation, validation.inflation_of_loads
     centre = features.mean(axis=0)
     deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
     least = MIN_HALF_WIDTH * float(np.ptp(values))
@@ -91,9 +131,7 @@ def fit_interval_regressor(
     half = np.array([intervals.half_width(prediction) for prediction in predicted])
     misses_loads = _misses_loads(truth, np.abs(residuals) <= half)
     if bounds is not None:
-        if not (twists or left_out):
-            # Unknown times mean few loads, in a block or two each.
-            inflation = student_inflation(len(blocks))
+        inflation = validation.inflation_of_unknown_times
         errors = np.max([np.abs(truth + residuals - end[rows]) for end in bounds], axis=0)
         known = intervals.half_widths[-1]
         intervals = fit_intervals(predicted, errors, edges, inflation, least, of_loads)
@@ -148,19 +186,6 @@ def _conformal_quantile(absolute: FloatArray) -> float:
     if n < 2 * _MIN_IN_STRATUM:
         return TWO_SIDED_95 * float(np.sqrt((absolute**2).mean()))
     return float(np.quantile(absolute, min(LEVEL * (n + 1) / n, 1.0), method="higher"))
-
-
-def _inflation(rows: IntArray, left_out: LeftOut) -> float:
-    """Return the factor that widens the residuals of the left-out rows."""
-    if left_out:
-        return student_inflation(len(np.unique(rows)))
-    return INFLATION
-
-
-def _inflation_of_twists(values: FloatArray, twists: LeftOut) -> float:
-    """Return Student's factor for as many errors as parts of the (n,) values have a load."""
-    loads = np.concatenate(find_twists(values))
-    return student_inflation(sum(bool(np.isin(part, loads).any()) for _, part in twists))
 
 
 def _gains_of_grips(features: FloatArray, values: FloatArray, grips: IntArray, refit: Refit) -> list[float]:

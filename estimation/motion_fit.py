@@ -19,7 +19,7 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.estimation.estimator import Bounds
 from shearloop.estimation.fingertip_validator import FingertipValidator
-from shearloop.estimation.interval_fit import fit_interval_regressor
+from shearloop.estimation.interval_fit import Validation, fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor, reported_values
 from shearloop.estimation.left_out import LeftOut, left_out_blocks, left_out_groups
 from shearloop.estimation.motion_regression import TemporalFeatures
@@ -88,7 +88,7 @@ def fit_motion(
         chosen.fit_used,
         strengths=(0.0,),
         limit_features=True,
-        twists=twists,
+        validation=Validation.by_twists(twists, torque_nm),
         bounds=bounds,
         grips=grips,
         fingertips=len(temporal.directions),

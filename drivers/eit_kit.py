@@ -18,7 +18,7 @@ from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.frame_clock import LATE_NS, LONGEST_GAP, FrameClock
 from shearloop.drivers.refused_lines import refusal_sentence
-from shearloop.drivers.serial_sensor import InputKind, InputRecorder, Parser, RawEvent, SerialSensor
+from shearloop.drivers.serial_sensor import InputRecorder, Parser, SerialSensor
 
 CELL_BYTES = len(b"0.1234, ")
 # Twice a line of 32 electrodes: a line with a wrong count is shorter, a stream without newlines is longer.
@@ -168,34 +168,21 @@ class FrameParser(Parser[Frame]):
         self._first_line = True
         # Lines; None once bytes were lost, which may be those of many.
         self._rejected_since_frame: int | None = 0
-        # Since when the next bytes may have waited for their reader; None if it was not away.
-        self._waited_since_ns: int | None = None
         # When the last frame of this connection was sent, by the clock, and when it can have been sent at the earliest.
         self._sent_ns = self._earliest_ns = NEVER_NS
         self._last_mid_ns = NEVER_NS
         self._last_channels = np.full(np.count_nonzero(~zero_slots), np.nan)
         self._equal_readings = np.zeros(len(self._last_channels), np.int64)
 
-    def handle(self, event: RawEvent) -> list[Frame]:
-        """Process a live or recorded event; return the frames that it completes."""
-        match event.kind:
-            case InputKind.OPENED:
-                self._open(event.t_ns)
-                self._sent_ns = NEVER_NS
-                self._first_line, self._rejected_since_frame, self._waited_since_ns = True, 0, None
-                self.clock.restart()
-            case InputKind.WAITED:
-                self._waited_since_ns = int(event.data)
-            case InputKind.DATA:
-                frames = self.feed(event.data, event.t_ns)
-                self._waited_since_ns = None
-                return frames
-        return []
+    def restart(self) -> None:
+        """Begin with a connection, perhaps in the middle of a line."""
+        self._sent_ns = NEVER_NS
+        self._first_line, self._rejected_since_frame = True, 0
+        self.clock.restart()
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[Frame]:
         """Return the frames that `data` completes, in order; all of it had arrived at `t_arrival_ns`."""
-        earliest_ns = t_arrival_ns if self._waited_since_ns is None else self._waited_since_ns
-        read = [self._read(line) for line in self._split(data, earliest_ns, self.clock.period_ns)]
+        read = [self._read(line) for line in self._split(data, t_arrival_ns, self.clock.period_ns)]
         behind = sum(isinstance(one, np.ndarray) for one in read)
         frames = []
         for one in read:

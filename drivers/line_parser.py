@@ -7,7 +7,7 @@ from typing import ClassVar, TypeVar
 
 from shearloop.drivers.line_clock import LineClock
 from shearloop.drivers.refused_lines import BoardKind, refusal_sentence
-from shearloop.drivers.serial_sensor import InputKind, Parser, RawEvent
+from shearloop.drivers.serial_sensor import Parser
 
 ValueT = TypeVar("ValueT")
 
@@ -42,38 +42,20 @@ class LineParser(Parser[ValueT]):
         self._clock = LineClock(self._period_ns)
         self._last_mid_ns = -(2**63)
         self._first = True
-        # Since when the next bytes may have waited for their reader; None if it was not away.
-        self._waited_since_ns: int | None = None
 
     @abstractmethod
     def _value(self, line: TimedLine) -> ValueT | None:
         """Return the value in a line that matches the pattern, or None where that is not certain."""
 
-    def handle(self, event: RawEvent) -> list[ValueT]:
-        """Process a live or recorded event; return the values that it completes."""
-        match event.kind:
-            case InputKind.OPENED:
-                self._open(event.t_ns)
-                self.restart()
-            case InputKind.WAITED:
-                self._waited_since_ns = int(event.data)
-            case InputKind.DATA:
-                values = self.feed(event.data, event.t_ns)
-                self._waited_since_ns = None
-                return values
-        return []
-
     def restart(self) -> None:
-        """Drop a half-received line: the port was opened, perhaps in the middle of one."""
-        self._lines.restart()
+        """Begin with a connection, perhaps in the middle of a line."""
         self._clock.restart()
-        self._first, self._waited_since_ns = True, None
+        self._first = True
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[ValueT]:
         """Return the values that `data` completes; of several lines each is a period older than the next."""
         values = []
-        earliest_ns = t_arrival_ns if self._waited_since_ns is None else self._waited_since_ns
-        lines = self._split(data, earliest_ns, self._clock.period_ns)
+        lines = self._split(data, t_arrival_ns, self._clock.period_ns)
         for waiting, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
             partial, self._first = self._first, False
             if line is None:

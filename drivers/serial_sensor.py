@@ -131,6 +131,8 @@ class Parser(ABC, Generic[ValueT]):
         # When the port was opened, until all that waited before has come; and when the last line came since.
         self._opened_ns: int | None = None
         self._before_ns = 0
+        # Since when the next bytes may have waited for their reader; None if it was not away.
+        self._waited_since_ns: int | None = None
 
     @property
     def refused(self) -> int:
@@ -142,18 +144,32 @@ class Parser(ABC, Generic[ValueT]):
         """The received beginning of the next line."""
         return self._lines.partial
 
-    @abstractmethod
-    def handle(self, event: RawEvent) -> Sequence[ValueT]:
+    def handle(self, event: RawEvent) -> list[ValueT]:
         """Process a live or recorded event; return the values that it completes."""
+        match event.kind:
+            case InputKind.OPENED:
+                self._lines.restart()
+                self._opened_ns = self._before_ns = event.t_ns
+                self._refused_in_a_row, self._waited_since_ns = 0, None
+                self.restart()
+            case InputKind.WAITED:
+                self._waited_since_ns = int(event.data)
+            case InputKind.DATA:
+                values = self.feed(event.data, event.t_ns)
+                self._waited_since_ns = None
+                return values
+        return []
 
-    def _open(self, t_ns: int) -> None:
-        """Begin with a port that was opened then."""
-        self._lines.restart()
-        self._opened_ns = self._before_ns = t_ns
-        self._refused_in_a_row = 0
+    @abstractmethod
+    def restart(self) -> None:
+        """Forget what belongs to the connection before: the port was opened, perhaps in the middle of a line."""
 
-    def _split(self, data: bytes, arrival_ns: int, period_ns: int) -> list[bytes | None]:
-        """Return the lines that `data` completes; it arrived then at the earliest.
+    @abstractmethod
+    def feed(self, data: bytes, t_arrival_ns: int) -> list[ValueT]:
+        """Return the values that `data` completes, in order; all of it had arrived then."""
+
+    def _split(self, data: bytes, t_arrival_ns: int, period_ns: int) -> list[bytes | None]:
+        """Return the lines that `data` completes; all of it had arrived then.
 
         Lines that may have waited before the opening have no known time and are dropped. They come at once. What comes
         half a period after the opening or the line before is new, and so is everything a period after the opening.
@@ -161,6 +177,7 @@ class Parser(ABC, Generic[ValueT]):
         lines = self._lines.feed(data)
         if self._opened_ns is None or not lines:
             return lines
+        arrival_ns = t_arrival_ns if self._waited_since_ns is None else self._waited_since_ns
         first_ns = arrival_ns - (len(lines) - 1) * period_ns
         if first_ns - self._before_ns >= period_ns / 2 or first_ns - self._opened_ns >= period_ns:
             self._opened_ns = None

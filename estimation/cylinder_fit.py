@@ -7,12 +7,12 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.channels import ChannelTable, smoothed_along_channels
-from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator import MIN_LEFT, CalibrationRows
 from shearloop.estimation.interval_fit import MIN_HALF_WIDTH
 from shearloop.estimation.interval_regressor import IntervalRegressor, Intervals, ValueRange
 from shearloop.estimation.ridge import Ridge
+from shearloop.estimation.values import TWO_SIDED_95
 
 # Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.
 _N_NUISANCE, _MAX_FRAMES = 16, 500

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
-from shearloop.estimation.confidence import TWO_SIDED_95
+from shearloop.estimation.values import TWO_SIDED_95
 
 # As many recordings as a prior counts as.
 PRIOR_RECORDINGS = 3

@@ -14,13 +14,13 @@ from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.confidence import LEVEL, TWO_SIDED_95
 from shearloop.estimation.gain import GainSpread
 from shearloop.estimation.gain_fit import fit_gain_spread
 from shearloop.estimation.interval_regressor import IntervalRegressor, Intervals, Regressor, ValueRange, reported_values
 from shearloop.estimation.left_out import LeftOut, later_splits, left_out_blocks, left_out_groups
 from shearloop.estimation.ridge import STRENGTHS, CensoredRidge, Predictor
 from shearloop.estimation.twists import LOADED_FRACTION, find_twists, first_twists, loaded_log_gain, log_gain
+from shearloop.estimation.values import LEVEL, TWO_SIDED_95
 from shearloop.words import counted
 
 # The future differs from the past more than one part of a recording from the next.

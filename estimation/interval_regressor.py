@@ -12,10 +12,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.gain import GainSpread
 from shearloop.estimation.ridge import CensoredRidge, Predictor, Ridge
-from shearloop.estimation.values import INLINE
+from shearloop.estimation.values import INLINE, TWO_SIDED_95
 
 Regressor: TypeAlias = Ridge | CensoredRidge
 # Features larger than any at calibration by this factor are refused.

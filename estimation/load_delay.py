@@ -16,11 +16,11 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.grips import segment_grip
 from shearloop.estimation.left_out import left_out_blocks
 from shearloop.estimation.series import FrameSeries, check_finite
 from shearloop.estimation.validator_fit import channel_noise
+from shearloop.estimation.values import TWO_SIDED_95
 
 _STEP_S = 0.06
 _SHIFTS_S = np.round(np.arange(-6.0, 6.01, _STEP_S), 2)

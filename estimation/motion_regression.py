@@ -14,11 +14,11 @@ from typing import ClassVar, Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.estimator import Bounds, CalibrationRows, Estimator, Material, OutputModel, Quantity, Reading
 from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.grip_memory import Motion
 from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.values import TWO_SIDED_95
 
 # An estimate needs this many frames of the grip before its own, 6.5 s. An older part of the memory counts as the oldest
 # of them, so that the memory costs no twist.

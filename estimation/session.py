@@ -15,7 +15,6 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.adaptation import Adaptation, GripGain
 from shearloop.estimation.calibration import Calibration
-from shearloop.estimation.confidence import TWO_SIDED_95
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator import NO_ERRORS, OutputModel, Quantity, Reading, match_reasons
 from shearloop.estimation.fingertip_validator import FingertipSet, FingertipValidator, GripDetector
@@ -24,7 +23,15 @@ from shearloop.estimation.grip_memory import GripMemory
 from shearloop.estimation.grip_strength import strength_reasons
 from shearloop.estimation.idle_frames import IdleFrames
 from shearloop.estimation.interval_regressor import Predicted
-from shearloop.estimation.values import BeforeFrame, Estimate, GripState, Measured, ProcessedFrame, TactileFrame
+from shearloop.estimation.values import (
+    TWO_SIDED_95,
+    BeforeFrame,
+    Estimate,
+    GripState,
+    Measured,
+    ProcessedFrame,
+    TactileFrame,
+)
 from shearloop.words import counted
 
 if TYPE_CHECKING:

@@ -8,8 +8,9 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.estimation.confidence import TWO_SIDED_95
 
+# Of 95 % intervals. So many standard deviations to either side of a Gaussian's mean hold 95 %.
+LEVEL, TWO_SIDED_95 = 0.95, 1.96
 # Metadata of a dataclass's field: in the calibration's file its fields join the other fields of the dataclass.
 INLINE = {"inline": True}
 # Load cells on a lever bear some N·m; larger readings come from a damaged line.

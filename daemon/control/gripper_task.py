@@ -28,7 +28,7 @@ from shearloop.drivers.robotiq.messages import (
 from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM
 from shearloop.errors import ActionError, NotBegunError
 from shearloop.estimation import Measured, combine
-from shearloop.estimation.confidence import TWO_SIDED_95
+from shearloop.estimation.values import TWO_SIDED_95
 
 # Every model opens as wide as it can, and as gently.
 OPENING = opening(LARGEST_STROKE_MM, 100.0)

@@ -11,7 +11,6 @@ from scipy.special import stdtrit
 from scipy.stats import linregress
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.estimation.confidence import LEVEL
 from shearloop.estimation.skin.membrane import (
     EXCITATION_A,
     GAUGE_RESISTANCE_OHM,
@@ -32,6 +31,7 @@ from shearloop.estimation.skin.plane_strain import (
     states_along,
     unloaded,
 )
+from shearloop.estimation.values import LEVEL
 from shearloop.studies.skin.finite_strain import FiniteStrainSkin
 
 # The paper's response is straight up to here.

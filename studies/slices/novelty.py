@@ -14,9 +14,9 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.channels import ChannelTable
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation.confidence import LEVEL
 from shearloop.estimation.fingertip_validator import LARGEST_UNUSABLE_FRACTION
 from shearloop.estimation.left_out import later_origins, left_out_blocks
+from shearloop.estimation.values import LEVEL
 
 # Margins beyond the largest Q and T² of blocks left out. Later recorded slices stay within 1.37 and 1.5 times of them
 # after two repeats, and within once after four.

@@ -25,7 +25,7 @@ from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.emulators.gripper import Fingers
 from shearloop.errors import ActionError, NotBegunError
-from shearloop.estimation.confidence import TWO_SIDED_95
+from shearloop.estimation.values import TWO_SIDED_95
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 from tests.fixtures.daemons import DEADLINE_S
 

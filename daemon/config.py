@@ -37,7 +37,7 @@ from shearloop.drivers.hosts import is_loopback_host, one_spelling, why_no_addre
 from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.models import shown
+from shearloop.words import shown
 
 # Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = {

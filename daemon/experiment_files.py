@@ -30,9 +30,8 @@ from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.errors import UserError
 from shearloop.files import read_file
-from shearloop.models import shown
 from shearloop.timeouts import timeout
-from shearloop.words import counted
+from shearloop.words import counted, shown
 from shearloop.yaml_files import Document
 
 # A file on a network drive may never answer.

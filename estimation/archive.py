@@ -23,8 +23,8 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.estimator import Estimator
 from shearloop.estimation.values import INLINE
 from shearloop.files import open_file, refusing_damage, replace_file
-from shearloop.models import shown
-from shearloop.yaml_files import parse_yaml
+from shearloop.words import shown
+from shearloop.yaml_loader import parse_yaml
 
 # First bytes of a zip that is not empty.
 ARCHIVE_MAGIC = b"PK\x03\x04"

@@ -12,7 +12,7 @@ from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, FileKind, eit
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
 from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_PER_S
-from shearloop.models import shown
+from shearloop.words import shown
 
 MAX_ANGLES = 1000
 # Bounds on what an experiment costs: its plan is made in the loop that moves the robot.

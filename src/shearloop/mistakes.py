@@ -12,12 +12,11 @@ from functools import cache
 from typing import Any
 
 import yaml
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from shearloop.models import adapter_of, shown
 from shearloop.units import unit_hint, unit_of
-from shearloop.words import counted
+from shearloop.words import counted, shown
 
 # A decimal with a comma, as German and French have it, and the cure.
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
@@ -64,7 +63,7 @@ def keys_of(model: type) -> Collection[str]:
 @cache
 def _schema_of(model: type) -> dict[str, Any]:
     """Return the JSON Schema of a model; callers must not change it."""
-    return adapter_of(model).json_schema()
+    return TypeAdapter(model).json_schema()
 
 
 def mistake_lines(

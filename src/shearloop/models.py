@@ -9,10 +9,8 @@ from pydantic import TypeAdapter, ValidationError
 
 Model = TypeVar("Model")
 
-_LONGEST_VALUE = 60
-
 # Making an adapter takes longer than reading a file.
-adapter_of: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
+_adapter_of: Callable[[type], TypeAdapter[Any]] = cache(TypeAdapter)
 
 
 def validated(content: object, model: type[Model], where: str, raises: type[Exception], *, cure: str = "") -> Model:
@@ -28,11 +26,5 @@ def validated(content: object, model: type[Model], where: str, raises: type[Exce
 
 def as_model(content: object, model: type[Model], folder: Path | None = None) -> Model:
     """Return the content as a model; raises ValidationError. Its validators get the `folder`."""
-    adapter: TypeAdapter[Model] = adapter_of(model)
+    adapter: TypeAdapter[Model] = _adapter_of(model)
     return adapter.validate_python(content, context=folder and {"folder": folder})
-
-
-def shown(value: object) -> str:
-    """Return a value of a file for a message, at most 60 characters."""
-    text = repr(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"

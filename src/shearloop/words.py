@@ -1,4 +1,6 @@
-"""Numbers in words and in digits, and sentences that differ in their numbers alone."""
+"""Numbers and values in words and in digits, and sentences that differ in their numbers alone."""
+
+_LONGEST_VALUE = 60
 
 
 def times(count: int) -> str:
@@ -9,6 +11,12 @@ def times(count: int) -> str:
 def counted(count: int, one: str, many: str = "") -> str:
     """Return a number with its noun, and the verb if the noun brings one: 1 frame is, 2 frames are."""
     return f"{count} {one if count == 1 else many or f'{one}s'}"
+
+
+def shown(value: object) -> str:
+    """Return a value of a file for a message, at most 60 characters."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"
 
 
 def is_whole_number(text: str, most_digits: int) -> bool:

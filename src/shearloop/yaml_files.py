@@ -5,8 +5,7 @@ allowed: …; did you mean …?`. The modules that tell mistakes are imported wh
 """
 
 import copy
-import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -15,73 +14,12 @@ import yaml
 from pydantic import ValidationError
 
 from shearloop.files import read_file, replace_file
-from shearloop.models import Model, as_model, shown
+from shearloop.models import Model, as_model
+from shearloop.words import shown
+from shearloop.yaml_loader import MAX_BYTES, Loader
 
 # Of Linux.
 _LONGEST_NAME, _LONGEST_PATH = 255, 4096
-# Bounds on what a file may cost: its bytes, and its values with every alias written out.
-MAX_BYTES, _MAX_VALUES = 1 << 17, 20_000
-
-
-class _Loader(yaml.SafeLoader):
-    """A SafeLoader that refuses duplicate keys and type tags, bounds aliases, and knows neither dates nor base 60.
-
-    Of two equal keys YAML would silently keep the last.
-    """
-
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        # How many values each node holds, its aliases written out.
-        self._sizes: dict[yaml.Node, int] = {}
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        event: yaml.NodeEvent = self.peek_event()  # type: ignore[no-untyped-call]
-        tag = getattr(event, "tag", None)
-        if tag not in (None, "!"):
-            raise self._refusal(f"the type tag {tag} is not supported", event)
-        node = super().compose_node(parent, index)
-        if node is None:
-            return None
-        if node not in self._sizes:
-            if isinstance(event, yaml.AliasEvent):
-                raise self._refusal("an alias stands within its anchor", event)
-            pairs = node.value if isinstance(node, yaml.MappingNode) else [node.value]
-            inside = [] if isinstance(node, yaml.ScalarNode) else [each for pair in pairs for each in pair]
-            self._sizes[node] = 1 + sum(self._sizes[each] for each in inside)
-        if self._sizes[node] > _MAX_VALUES:
-            raise self._refusal(f"more than {_MAX_VALUES} values, with every alias written out", event)
-        return node
-
-    @staticmethod
-    def _refusal(problem: str, event: yaml.NodeEvent) -> yaml.MarkedYAMLError:
-        mark: Any = event.start_mark  # typed as C's marks too
-        return yaml.composer.ComposerError(None, None, problem, mark)
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[Hashable] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, Hashable):
-                if key in seen:
-                    problem = f"the key `{key}` is given twice"
-                    raise yaml.constructor.ConstructorError(None, None, problem, key_node.start_mark)
-                seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-_INT, _FLOAT, _DATE = (f"tag:yaml.org,2002:{kind}" for kind in ("int", "float", "timestamp"))
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INT, _FLOAT, _DATE)]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_Loader.add_implicit_resolver(_INT, re.compile(r"[-+]?(0|[1-9][0-9]{0,30})$"), list("-+0123456789"))
-_Loader.add_implicit_resolver(
-    _FLOAT,
-    re.compile(
-        r"(?=.{1,40}$)[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"
-    ),
-    list("-+.0123456789"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +62,7 @@ class Document:
     def parse(cls, path: Path, data: bytes, raises: type[Exception], what: str = "configuration") -> Self:
         """Parse the bytes of a file, which is not read again."""
         try:
-            loader = _Loader(data.decode("utf-8"))
+            loader = Loader(data.decode("utf-8"))
             root = loader.get_single_node()
             content = loader.construct_document(root) if root is not None else None
         except UnicodeDecodeError as error:
@@ -185,7 +123,7 @@ class Document:
         content, given = copy.deepcopy(self.content), dict(self._given)
         for key, text in values.items():
             try:
-                value = yaml.load(text, _Loader)  # noqa: S506 - it is a SafeLoader
+                value = yaml.load(text, Loader)  # noqa: S506 - it is a SafeLoader
             except yaml.MarkedYAMLError as error:
                 from shearloop.yaml_mistakes import syntax
 
@@ -245,13 +183,6 @@ def _with_texts(content: Any, texts: Mapping[tuple[int | str, ...], str]) -> Any
 def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Any:
     """Return the content of a YAML file that is neither missing nor empty; `cure` ends the message of a missing one."""
     return Document.read(path, raises, what, cure).content
-
-
-def parse_yaml(text: bytes) -> Any:
-    """Return the content of a YAML text; raises yaml.YAMLError, ValueError or RecursionError."""
-    if len(text) > MAX_BYTES:
-        raise ValueError(f"its header is larger than {MAX_BYTES >> 10} kB")
-    return yaml.load(text.decode(), _Loader)  # noqa: S506 - it is a SafeLoader
 
 
 def load_model(

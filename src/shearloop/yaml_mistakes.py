@@ -8,7 +8,7 @@ import yaml
 
 from shearloop.files import read_file
 from shearloop.mistakes import keys_of
-from shearloop.yaml_files import MAX_BYTES, parse_yaml
+from shearloop.yaml_loader import MAX_BYTES, parse_yaml
 
 _SUFFIXES = (".yaml", ".yml")
 # So many files with near names are looked into, to see which may be meant.

@@ -22,7 +22,7 @@ from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.interval_fit import Validation, fit_interval_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor, reported_values
 from shearloop.estimation.left_out import LeftOut, left_out_blocks, left_out_groups
-from shearloop.estimation.motion_regression import TemporalFeatures
+from shearloop.estimation.motion_features import TemporalFeatures
 from shearloop.estimation.ridge import CensoredRidge, Ridge, is_one_sided
 from shearloop.estimation.twists import LOADED_FRACTION, find_twists
 

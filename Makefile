@@ -50,7 +50,7 @@ demo: demo-python $(VENV)/.installed
 # Test files run in parallel, the longest first (tests/conftest.py). Three parts:
 #   Tests that drive a robot in real time run by themselves, because a robot stops when its computer is busy. They mostly
 #   wait, so that more of them fit on two cores.
-#   Then the rest runs, which waits less.
+#   Then the rest runs, which waits a little less.
 #   Tests that only compute run beside both. The scheduler gives them what time the others leave of the cores, and takes
 #   it away at once (SCHED_IDLE). On a busy computer they get little time, so that their timeout is long.
 # Status 5: no test was selected.
@@ -61,6 +61,8 @@ LENGTH := not long
 # Not every container allows it.
 IN_IDLE_TIME := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 test: install-dev
+	# Once, not in each of the processes that begin together.
+	@$(BIN)/python -m compileall -q benchmarks src/shearloop $(wildcard src/shearloop/*/)
 	+$(MAKE) --no-print-directory --jobs=2 --keep-going test-computing test-waiting
 
 test-long: install-dev
@@ -74,7 +76,7 @@ test-computing: install-dev
 
 test-waiting: install-dev
 	$(PYTEST) -n 5 -m 'real_time and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
-	$(PYTEST) -n 3 -m 'not real_time and not computes and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -n 4 -m 'not real_time and not computes and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \

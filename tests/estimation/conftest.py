@@ -1,12 +1,12 @@
 """A rig that is played by formulas: fingertips with a pattern of their own, a gel that creeps, a one-sided lever."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.bank_file import Bank, BankDefinition, write_bank
@@ -51,7 +51,8 @@ def twisting(
     cycle = np.clip((fine - IDLE_S) // CYCLE_S, 0, cycles - 1)
     torque = np.maximum(angle(fine) - 0.9, 0.0) / 0.1 * peak_nm * (1 + 0.03 * cycle)
     follows = 0.09 / CREEP_S
-    crept = lfilter([follows], [1.0, follows - 1.0], angle(fine))
+    gel = itertools.accumulate(angle(fine).tolist(), lambda before, now: before + follows * (now - before), initial=0.0)
+    crept = np.array(list(gel)[1:])
     grip = ((t > IDLE_S) & (t < IDLE_S + gripped_s)).astype(float)
     at = {name: np.interp(t, fine, values) for name, values in (("torque", torque), ("crept", crept))}
     slow = np.cumsum(rng.normal(0, 0.02, len(t)))

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from shearloop.drivers.ur.client import LAST_WORDS_BYTES, UrRobot, WorkerConnection
-from shearloop.drivers.ur.messages import CommandReply, Held, RobotLostError, Stop, ZeroForceTorque
+from shearloop.drivers.ur.messages import CommandReply, Held, RobotLostError, Stop, Unlock, WristSpeed, ZeroForceTorque
 from tests import running as tasks
 from tests.drivers.ur.handler_bench import HandlerBench
 from tests.drivers.ur.robots import ROOT, running, settings_for
@@ -190,6 +190,21 @@ async def test_a_worker_gets_what_is_held_at_its_start_and_at_each_change(play, 
             robot.handle_message(0, bench.state)
             await asyncio.sleep(0)
     assert told == [Held(held=True, wrench_zero=RESTORED), Held(held=False), Held(held=True)]
+
+
+async def test_an_unlock_comes_after_what_is_held_now(play, told):
+    """It may start a program, which keeps the wrench's zero under a tool; a wrist speed starts none."""
+    play("exec cat")
+    holds = [True]
+    robot = UrRobot(settings_for("127.0.0.254"), holds=lambda: holds[0])
+    async with tasks.running(robot.run()):
+        await worker_told(told)
+        robot.handle_message(0, HandlerBench().state)
+        holds[0] = False
+        robot.send(WristSpeed(0.1, 1.0))
+        assert told[-1].held
+        robot.send(Unlock())
+        assert told[-1] == Held(held=False)
 
 
 async def test_a_restored_zero_that_is_taken_back_leaves_what_the_program_has_added(play, told):

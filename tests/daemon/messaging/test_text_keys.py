@@ -27,7 +27,8 @@ VALUES: dict[tuple[str, str], Iterable[str]] = {
 }
 # Names, sentences, and codes that another page lists.
 FREE = {
-    "activity", "blocked", "by", "cap", "cause", "command", "experiment", "fault_text", "faults", "host", "model",
+    "activity", "blocked", "by", "cap", "cause", "command", "experiment", "fault_text", "faults", "host", "instance",
+    "model",
     "reason", "reasons", "refusal", "release_refusal", "rig", "source", "start_refusal", "step_name", "subject",
     "request_id", "summary", "tare_refusal", "torque_note", "torque_source",
 }  # fmt: skip

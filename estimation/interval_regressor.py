@@ -65,14 +65,9 @@ class Predicted(NamedTuple):
     above: float
 
     @property
-    def low(self) -> float:
-        """The lower end of the interval."""
-        return self.value - self.below
-
-    @property
-    def high(self) -> float:
-        """The upper end of the interval."""
-        return self.value + self.above
+    def ends(self) -> tuple[float, float]:
+        """The lower and the upper end of the interval."""
+        return self.value - self.below, self.value + self.above
 
     def widened(self, error: float) -> "Predicted":
         """Return the value with a further 95 % error, which is independent of the others."""

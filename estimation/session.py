@@ -438,8 +438,8 @@ def _dead_channel_reasons(validators: tuple[FingertipValidator, ...], usable: Bo
 
 def estimate_of(values: Mapping[Quantity, Predicted], reasons: Iterable[str], match: "BankMatch | None") -> Estimate:
     """Return the estimate of values with the ends of their intervals."""
-    ends = {quantity: (one.value, one.low, one.high) for quantity, one in values.items()}
-    torque, diameter = ends.get("torque", _UNKNOWN), ends.get("diameter", _UNKNOWN)
+    known = {quantity: (predicted.value, *predicted.ends) for quantity, predicted in values.items()}
+    torque, diameter = known.get("torque", _UNKNOWN), known.get("diameter", _UNKNOWN)
     estimate = Estimate(bool(values), () if values else tuple(reasons), *torque, *diameter)
     if match is None:
         return estimate
